@@ -1,0 +1,170 @@
+//! The environment's configuration (spec 1): names, units, defaults, limits.
+
+use serde::{Deserialize, Serialize};
+
+use crate::invalid::{Invalid, in_range};
+
+/// A point in the plane, in units of the square's side.
+pub type Point = [f64; 2];
+
+/// What happens at the border of the unit square.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Boundary {
+    /// Each coordinate is clamped to [0, 1].
+    #[default]
+    Clamp,
+    /// UAVs may leave the square.
+    Free,
+}
+
+/// Where UAVs are at slot 0.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Start {
+    /// All at (0.5, 0.5).
+    #[default]
+    Center,
+    /// Uniform in the square, from the episode's seed.
+    Random,
+    /// These positions, one per UAV.
+    Given(Vec<Point>),
+}
+
+/// Where users are at slot 0.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Layout {
+    /// Uniform in the square, from the episode's seed.
+    #[default]
+    Random,
+    /// These positions, one per user.
+    Given(Vec<Point>),
+}
+
+/// Everything that fixes an environment but the episode's seed (spec 1). Lengths are in units of the square's side.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct EnvConfig {
+    /// M, the number of UAVs.
+    #[serde(alias = "M")]
+    pub uavs: usize,
+    /// N, the number of users.
+    #[serde(alias = "N")]
+    pub users: usize,
+    /// K, slots per episode.
+    #[serde(alias = "K")]
+    pub slots: usize,
+    /// v, distance flown per slot.
+    #[serde(alias = "v")]
+    pub speed: f64,
+    /// t, range within which a user's data is collected.
+    #[serde(alias = "t")]
+    pub transmission_range: f64,
+    /// d, range within which nodes see each other; at least t.
+    #[serde(alias = "d")]
+    pub detection_range: f64,
+    /// Adds a ninth action that stays in place.
+    pub hover: bool,
+    /// Rule at the border.
+    pub boundary: Boundary,
+    /// Factor of the reward -`reward_scale` * mean AoI; absent: 1/K.
+    pub reward_scale: Option<f64>,
+    /// UAV positions at slot 0.
+    pub start: Start,
+    /// User positions at slot 0.
+    pub layout: Layout,
+    /// Weight of each user in the reward and the mean AoI (scaled to mean 1); absent: all equal.
+    pub weights: Option<Vec<f64>>,
+    /// Distance a user walks per slot, in a direction that turns a little each slot; 0: users stay.
+    pub user_speed: f64,
+}
+
+impl Default for EnvConfig {
+    fn default() -> Self {
+        Self {
+            uavs: 3,
+            users: 5,
+            slots: 80,
+            speed: 0.04,
+            transmission_range: 0.12,
+            detection_range: 0.28,
+            hover: false,
+            boundary: Boundary::Clamp,
+            reward_scale: None,
+            start: Start::Center,
+            layout: Layout::Random,
+            weights: None,
+            user_speed: 0.0,
+        }
+    }
+}
+
+impl EnvConfig {
+    /// Number of headings spaced by 45 degrees.
+    pub const COMPASS: usize = 8;
+
+    /// A, the number of actions: 8 headings, and hovering where allowed.
+    pub fn headings(&self) -> usize {
+        Self::COMPASS + usize::from(self.hover)
+    }
+
+    /// V = M + N.
+    pub fn nodes(&self) -> usize {
+        self.uavs + self.users
+    }
+
+    /// The factor of the reward, its default 1/K filled in.
+    pub fn reward_factor(&self) -> f64 {
+        self.reward_scale.unwrap_or(1.0 / self.slots as f64)
+    }
+
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// The first field that is out of range, with its value and what is allowed.
+    pub fn validate(&self) -> Result<(), Invalid> {
+        in_range("uavs", self.uavs, 1..=4096)?;
+        in_range("users", self.users, 1..=65_536)?;
+        in_range("slots", self.slots, 1..=10_000)?;
+        in_range("speed", self.speed, 0.0..=1.0)?;
+        in_range("transmission_range", self.transmission_range, 0.0..=2.0)?;
+        in_range("detection_range", self.detection_range, 1e-6..=2.0)?;
+        in_range("user_speed", self.user_speed, 0.0..=1.0)?;
+        if self.detection_range < self.transmission_range {
+            let expected = format!("at least transmission_range ({})", self.transmission_range);
+            return Err(Invalid::new("detection_range", self.detection_range, expected));
+        }
+        if let Some(scale) = self.reward_scale {
+            in_range("reward_scale", scale, 1e-9..=1e9)?;
+        }
+        if let Start::Given(points) = &self.start {
+            check_points("start.given", points, self.uavs, "UAV")?;
+        }
+        if let Layout::Given(points) = &self.layout {
+            check_points("layout.given", points, self.users, "user")?;
+        }
+        let Some(weights) = &self.weights else { return Ok(()) };
+        if weights.len() != self.users {
+            return Err(Invalid::new("weights", format!("{} values", weights.len()), format!("{} values, one per user", self.users)));
+        }
+        for (i, &w) in weights.iter().enumerate() {
+            in_range(&format!("weights[{i}]"), w, 0.0..=1e6)?;
+        }
+        if weights.iter().sum::<f64>() <= 0.0 {
+            return Err(Invalid::new("weights", "all zero", "at least one positive weight"));
+        }
+        Ok(())
+    }
+}
+
+fn check_points(field: &str, points: &[Point], expected: usize, what: &str) -> Result<(), Invalid> {
+    if points.len() != expected {
+        return Err(Invalid::new(field, format!("{} positions", points.len()), format!("{expected} positions, one per {what}")));
+    }
+    for (i, p) in points.iter().enumerate() {
+        in_range(&format!("{field}[{i}].x"), p[0], 0.0..=1.0)?;
+        in_range(&format!("{field}[{i}].y"), p[1], 0.0..=1.0)?;
+    }
+    Ok(())
+}
