@@ -1,1 +1,25 @@
+//! Qedgix: trains and serves policies that fly UAV fleets for fresh data.
+//!
+//! Folders are layers; a file imports only from layers below it (`tests/architecture.rs` checks this).
+//!
+//! | layer | owns |
+//! | --- | --- |
+//! | [`cli`] | the command line |
+//! | `server` | listeners, background work, shutdown |
+//! | [`api`] | gRPC, REST, wire formats, the table of errors |
+//! | [`service`] | one function per use case |
+//! | [`serving`], [`jobs`] | answering now; running work later |
+//! | [`store`] | the only SQL |
+//! | [`learner`] | replay, rollout, update, training, evaluation |
+//! | [`checkpoint`] | parameters to and from safetensors |
+//! | [`policy`] | observations, agents, mixers, baselines |
+//! | [`nn`], [`env`] | mathematics; physics |
+//! | [`invalid`], [`rng`] | errors of input; random streams |
+//!
+//! Read `env`, then `policy`, then `learner`; then `service` and what it calls.
 
+pub mod env;
+pub mod invalid;
+pub mod learner;
+pub mod policy;
+pub mod rng;

@@ -47,22 +47,16 @@ pub enum Layout {
 #[serde(deny_unknown_fields, default)]
 pub struct EnvConfig {
     /// M, the number of UAVs.
-    #[serde(alias = "M")]
     pub uavs: usize,
     /// N, the number of users.
-    #[serde(alias = "N")]
     pub users: usize,
     /// K, slots per episode.
-    #[serde(alias = "K")]
     pub slots: usize,
     /// v, distance flown per slot.
-    #[serde(alias = "v")]
     pub speed: f64,
     /// t, range within which a user's data is collected.
-    #[serde(alias = "t")]
     pub transmission_range: f64,
     /// d, range within which nodes see each other; at least t.
-    #[serde(alias = "d")]
     pub detection_range: f64,
     /// Adds a ninth action that stays in place.
     pub hover: bool,
@@ -146,7 +140,11 @@ impl EnvConfig {
         }
         let Some(weights) = &self.weights else { return Ok(()) };
         if weights.len() != self.users {
-            return Err(Invalid::new("weights", format!("{} values", weights.len()), format!("{} values, one per user", self.users)));
+            return Err(Invalid::new(
+                "weights",
+                format!("{} values", weights.len()),
+                format!("{} values, one per user", self.users),
+            ));
         }
         for (i, &w) in weights.iter().enumerate() {
             in_range(&format!("weights[{i}]"), w, 0.0..=1e6)?;

@@ -1,0 +1,303 @@
+//! What a training run is made of (spec 5): algorithm, preset, and the resolved configuration that fixes every bit of it.
+
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
+use serde_json::{Map, Value};
+
+use crate::env::EnvConfig;
+use crate::invalid::{Invalid, in_range};
+use crate::policy::{AgentConfig, Aggregation, Gnn, Identity, Observation};
+
+/// The algorithms of the paper and its usual company.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Algorithm {
+    /// GRU agents, monotonic mixing.
+    Qmix,
+    /// GRU agents, summed values.
+    Vdn,
+    /// GRU agents that learn alone.
+    Iql,
+    /// GRU and `EdgeConv` agents, monotonic mixing: the paper's method.
+    #[default]
+    Qedgix,
+    /// The paper's Algorithm 3.
+    Agggnn,
+    /// The paper's Algorithm 4.
+    Rgcn,
+}
+
+/// Named starting points of a configuration (spec 5).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Preset {
+    /// What the paper writes.
+    Paper,
+    /// What the authors' code does.
+    Authors,
+    /// What measures best.
+    #[default]
+    Practical,
+}
+
+/// How the UAVs' values become one (spec 4).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum MixerKind {
+    /// Hypernetworks on the flat state.
+    Qmix,
+    /// Hypernetworks on a permutation-invariant summary.
+    Invariant,
+    /// The sum.
+    Vdn,
+    /// Each UAV has its own target (`iql`).
+    None,
+}
+
+/// Everything about learning that is not the environment. `steps` counts environment slots.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Training {
+    /// Observation of every node.
+    pub observation: Observation,
+    /// Identity of a UAV.
+    pub identity: Identity,
+    /// Aggregation of `edgeconv`.
+    pub aggregation: Aggregation,
+    /// Graph layers.
+    pub layers: usize,
+    /// Whether a UAV knows its own position.
+    pub self_position: bool,
+    /// Whether a node is its own neighbour.
+    pub self_loops: bool,
+    /// Mixer.
+    pub mixer: MixerKind,
+    /// Environment steps (slots) to train for.
+    pub steps: u64,
+    /// Adam's learning rate.
+    pub learning_rate: f64,
+    /// Discount.
+    pub gamma: f64,
+    /// lambda of TD(lambda).
+    pub lambda: f64,
+    /// Global L2 norm that gradients are clipped to.
+    pub clip: f64,
+    /// Exploration at the end.
+    pub epsilon_end: f64,
+    /// Environment steps over which exploration falls from 1 to its end.
+    pub epsilon_anneal: u64,
+    /// Episodes per update.
+    pub batch: usize,
+    /// Updates per iteration; an iteration collects `envs` episodes.
+    pub updates_per_iteration: usize,
+    /// Episodes collected together.
+    pub envs: usize,
+    /// Episodes held in replay.
+    pub buffer: usize,
+    /// Episodes between copies of the online networks to the targets.
+    pub target_every: u64,
+    /// Environment steps between evaluations.
+    pub eval_every: u64,
+    /// Episodes of an evaluation.
+    pub eval_episodes: usize,
+}
+
+/// A training run, resolved: (this, code, processor kind) fixes every metric and weight, bit for bit.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainConfig {
+    /// Algorithm.
+    pub algorithm: Algorithm,
+    /// Preset that `environment` and `training` started from.
+    pub preset: Preset,
+    /// Environment.
+    pub environment: EnvConfig,
+    /// Learning.
+    pub training: Training,
+    /// Seed of every random stream.
+    pub seed: u64,
+}
+
+impl Algorithm {
+    /// The graph layer of its agents.
+    pub fn gnn(self) -> Gnn {
+        match self {
+            Self::Qmix | Self::Vdn | Self::Iql => Gnn::None,
+            Self::Qedgix => Gnn::EdgeConv,
+            Self::Agggnn => Gnn::AggGnn,
+            Self::Rgcn => Gnn::Rgcn,
+        }
+    }
+}
+
+impl TrainConfig {
+    /// The configuration of `algorithm` in `preset`, nothing overridden (spec 5's table).
+    pub fn preset(algorithm: Algorithm, preset: Preset) -> Self {
+        let mut environment = EnvConfig::default();
+        let mut training = Training {
+            observation: Observation::Flat,
+            identity: Identity::Onehot,
+            aggregation: Aggregation::Mean,
+            layers: 2,
+            self_position: false,
+            self_loops: false,
+            mixer: MixerKind::Invariant,
+            steps: 2_050_000,
+            learning_rate: 5e-3,
+            gamma: 0.99,
+            lambda: 0.6,
+            clip: 10.0,
+            epsilon_end: 0.05,
+            epsilon_anneal: 100_000,
+            batch: 128,
+            updates_per_iteration: 1,
+            envs: 8,
+            buffer: 5000,
+            target_every: 200,
+            eval_every: 10_000,
+            eval_episodes: 64,
+        };
+        match preset {
+            Preset::Paper => training.aggregation = Aggregation::Sum,
+            Preset::Authors => {
+                training.mixer = MixerKind::Qmix;
+                training.clip = 20.0;
+                environment.hover = true;
+            }
+            Preset::Practical => {
+                training.observation = Observation::Set;
+                training.identity = Identity::Phase;
+                training.self_position = true;
+                training.learning_rate = 1e-3;
+                training.batch = 32;
+                training.updates_per_iteration = 4;
+            }
+        }
+        match algorithm {
+            Algorithm::Vdn => training.mixer = MixerKind::Vdn,
+            Algorithm::Iql => training.mixer = MixerKind::None,
+            _ => {}
+        }
+        Self { algorithm, preset, environment, training, seed: 1 }
+    }
+
+    /// A preset with fields of `environment` and `training` overridden by what was sent, checked as a whole.
+    ///
+    /// # Errors
+    /// An unknown field, a value of the wrong type, or one out of range; the field is named as `training.batch`.
+    pub fn resolve(
+        algorithm: Algorithm,
+        preset: Preset,
+        environment: &Map<String, Value>,
+        training: &Map<String, Value>,
+        seed: u64,
+    ) -> Result<Self, Invalid> {
+        let base = Self::preset(algorithm, preset);
+        let mut config = Self {
+            environment: overridden("environment", &base.environment, environment)?,
+            training: overridden("training", &base.training, training)?,
+            seed,
+            ..base
+        };
+        if config.environment.reward_scale.is_none() {
+            let env = &config.environment;
+            let scale = if preset == Preset::Authors { env.users as f64 } else { env.reward_factor() };
+            config.environment.reward_scale = Some(scale);
+        }
+        config.validate()?;
+        Ok(config)
+    }
+
+    /// The architecture of the agents.
+    pub fn agent(&self) -> AgentConfig {
+        let t = &self.training;
+        AgentConfig {
+            gnn: self.algorithm.gnn(),
+            layers: t.layers,
+            aggregation: t.aggregation,
+            observation: t.observation,
+            identity: t.identity,
+            self_position: t.self_position,
+            self_loops: t.self_loops,
+        }
+    }
+
+    /// Checks every field and how they fit together.
+    ///
+    /// # Errors
+    /// The first field that is wrong.
+    pub fn validate(&self) -> Result<(), Invalid> {
+        self.environment.validate().map_err(|e| e.within("environment"))?;
+        self.training.validate().map_err(|e| e.within("training"))?;
+        let mixes = self.training.mixer != MixerKind::None;
+        if mixes == (self.algorithm == Algorithm::Iql) {
+            let expected = if mixes { "none for iql, which mixes nothing" } else { "qmix, invariant or vdn" };
+            return Err(Invalid::new("training.mixer", if mixes { "a mixer" } else { "none" }, expected));
+        }
+        let (env, t) = (&self.environment, &self.training);
+        let episode = (env.slots + 1) * (env.uavs * 8 + env.users * 10) + env.slots * (env.uavs + 4);
+        let replay = episode.saturating_mul(t.buffer);
+        const LIMIT: usize = 8 << 30;
+        if replay > LIMIT {
+            let value = format!("{} (a replay of {} MiB at this size)", t.buffer, replay >> 20);
+            return Err(Invalid::new("training.buffer", value, format!("a replay of at most {} MiB", LIMIT >> 20)));
+        }
+        Ok(())
+    }
+}
+
+impl Training {
+    fn validate(&self) -> Result<(), Invalid> {
+        in_range("layers", self.layers, 1..=8)?;
+        in_range("steps", self.steps, 1..=1_000_000_000_000)?;
+        in_range("learning_rate", self.learning_rate, 1e-12..=1.0)?;
+        in_range("gamma", self.gamma, 0.0..=1.0)?;
+        in_range("lambda", self.lambda, 0.0..=1.0)?;
+        in_range("clip", self.clip, 1e-9..=1e9)?;
+        in_range("epsilon_end", self.epsilon_end, 0.0..=1.0)?;
+        in_range("epsilon_anneal", self.epsilon_anneal, 1..=1_000_000_000_000)?;
+        in_range("batch", self.batch, 1..=4096)?;
+        in_range("updates_per_iteration", self.updates_per_iteration, 1..=1024)?;
+        in_range("envs", self.envs, 1..=4096)?;
+        in_range("buffer", self.buffer, 1..=1_000_000)?;
+        in_range("target_every", self.target_every, 1..=1_000_000_000)?;
+        in_range("eval_every", self.eval_every, 1..=1_000_000_000_000)?;
+        in_range("eval_episodes", self.eval_episodes, 1..=4096)?;
+        if self.buffer < self.batch {
+            return Err(Invalid::new("buffer", self.buffer, format!("at least batch ({})", self.batch)));
+        }
+        Ok(())
+    }
+}
+
+/// The letters of the paper, accepted for the fields they stand for.
+const LETTERS: [(&str, &str); 9] = [
+    ("M", "uavs"),
+    ("N", "users"),
+    ("K", "slots"),
+    ("v", "speed"),
+    ("t", "transmission_range"),
+    ("d", "detection_range"),
+    ("lr", "learning_rate"),
+    ("eps_end", "epsilon_end"),
+    ("anneal", "epsilon_anneal"),
+];
+
+/// `base` with the fields of `patch` put over it, one at a time, so that a message names the field that is wrong.
+fn overridden<T: Serialize + DeserializeOwned>(section: &str, base: &T, patch: &Map<String, Value>) -> Result<T, Invalid> {
+    let mut fields = serde_json::to_value(base).expect("a configuration is plain data");
+    let known: Vec<String> = fields.as_object().into_iter().flatten().map(|(name, _)| name.clone()).collect();
+    for (key, value) in patch {
+        let name = LETTERS.iter().find(|(letter, _)| letter == key).map_or(key.as_str(), |(_, name)| name);
+        if !known.iter().any(|k| k == name) {
+            return Err(Invalid::new(format!("{section}.{key}"), "an unknown field", format!("one of {}", known.join(", "))));
+        }
+        if name != key && patch.contains_key(name) {
+            return Err(Invalid::new(format!("{section}.{key}"), "a second value", format!("either {key} or {name}, not both")));
+        }
+        fields[name] = value.clone();
+        if let Err(e) = T::deserialize(&fields) {
+            return Err(Invalid::new(format!("{section}.{key}"), value, e.to_string()));
+        }
+    }
+    Ok(serde_json::from_value(fields).expect("checked field by field"))
+}

@@ -1,0 +1,9 @@
+//! Learning (spec 5): replay, rollout, targets, the update, training as an iterator of events, evaluation.
+
+mod config;
+mod episodes;
+mod event;
+
+pub use config::{Algorithm, MixerKind, Preset, TrainConfig, Training};
+pub use episodes::Episodes;
+pub use event::{Event, Iteration};

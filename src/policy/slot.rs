@@ -1,0 +1,121 @@
+//! One slot of one fleet as its nodes see it (spec 2): who detects whom, where, and how old its data is.
+
+use crate::env::Point;
+
+/// Node `target` seen at `rel` = target position - own position.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Detection {
+    /// Node index: UAVs first, then users.
+    pub target: u32,
+    /// Relative coordinates, computed in f64, rounded once.
+    pub rel: [f32; 2],
+}
+
+/// The sparse graph of one slot. Nodes are UAVs 0..M, then users M..M+N. A node is never in its own list.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Slot {
+    uavs: usize,
+    users: usize,
+    /// `offsets[i]..offsets[i + 1]` are node i's detections.
+    offsets: Vec<u32>,
+    detections: Vec<Detection>,
+    aoi: Vec<f32>,
+    uav_positions: Option<Vec<Point>>,
+    user_positions: Option<Vec<Point>>,
+}
+
+impl Slot {
+    /// The slot of a scene: nodes within `range` (distance^2 <= range^2, in f64) detect each other.
+    ///
+    /// Work and memory grow with the nodes and the detections, not with the square of the nodes.
+    ///
+    /// # Panics
+    /// When `aoi` does not have one entry per user.
+    pub fn from_scene(uavs: &[Point], users: &[Point], aoi: &[f32], range: f64) -> Self {
+        let mut slot = Self::default();
+        slot.set_scene(uavs, users, aoi, range);
+        slot
+    }
+
+    /// The slot of a detection graph. `detections[i]` are node i's, in ascending order of target; the caller has checked
+    /// that targets exist, differ from i and do not repeat. `aoi` of a user that nobody detects is irrelevant; give 0.
+    ///
+    /// # Panics
+    /// When the lengths do not fit together.
+    pub fn from_detections(uav_positions: Option<Vec<Point>>, uavs: usize, aoi: Vec<f32>, detections: &[Vec<Detection>]) -> Self {
+        let users = aoi.len();
+        assert_eq!(detections.len(), uavs + users, "one list of detections per node");
+        let mut offsets = Vec::with_capacity(detections.len() + 1);
+        offsets.push(0);
+        let mut flat = Vec::with_capacity(detections.iter().map(Vec::len).sum());
+        for list in detections {
+            flat.extend_from_slice(list);
+            offsets.push(flat.len() as u32);
+        }
+        Self { uavs, users, offsets, detections: flat, aoi, uav_positions, user_positions: None }
+    }
+
+    /// Rebuilds this slot from a scene, keeping its allocations (see [`Slot::from_scene`]).
+    ///
+    /// # Panics
+    /// When `aoi` does not have one entry per user.
+    pub fn set_scene(&mut self, uavs: &[Point], users: &[Point], aoi: &[f32], range: f64) {
+        assert_eq!(aoi.len(), users.len(), "one AoI per user");
+        self.uavs = uavs.len();
+        self.users = users.len();
+        self.aoi.clear();
+        self.aoi.extend_from_slice(aoi);
+        let own = self.uav_positions.get_or_insert_default();
+        own.clear();
+        own.extend_from_slice(uavs);
+        let all = self.user_positions.get_or_insert_default();
+        all.clear();
+        all.extend_from_slice(users);
+        self.offsets.clear();
+        self.offsets.push(0);
+        self.detections.clear();
+        let at = |i: usize| if i < uavs.len() { uavs[i] } else { users[i - uavs.len()] };
+        let nodes = uavs.len() + users.len();
+        for i in 0..nodes {
+            let from = at(i);
+            for j in (0..nodes).filter(|&j| j != i) {
+                let to = at(j);
+                let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
+                if dx * dx + dy * dy <= range * range {
+                    self.detections.push(Detection { target: j as u32, rel: [dx as f32, dy as f32] });
+                }
+            }
+            self.offsets.push(self.detections.len() as u32);
+        }
+    }
+
+    /// M.
+    pub fn uavs(&self) -> usize {
+        self.uavs
+    }
+
+    /// N.
+    pub fn users(&self) -> usize {
+        self.users
+    }
+
+    /// What node `i` detects, in ascending order of target (UAVs before users).
+    pub fn detections(&self, i: usize) -> &[Detection] {
+        &self.detections[self.offsets[i] as usize..self.offsets[i + 1] as usize]
+    }
+
+    /// AoI of each user, in slots.
+    pub fn aoi(&self) -> &[f32] {
+        &self.aoi
+    }
+
+    /// Position of each UAV, where known.
+    pub fn uav_positions(&self) -> Option<&[Point]> {
+        self.uav_positions.as_deref()
+    }
+
+    /// Position of each user, known for a scene only.
+    pub fn user_positions(&self) -> Option<&[Point]> {
+        self.user_positions.as_deref()
+    }
+}
