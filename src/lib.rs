@@ -18,8 +18,12 @@
 //!
 //! Read `env`, then `policy`, then `learner`; then `service` and what it calls.
 
+pub mod api;
 pub mod env;
 pub mod invalid;
 pub mod learner;
 pub mod policy;
 pub mod rng;
+pub mod service;
+pub mod store;
+pub mod wire;

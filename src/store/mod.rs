@@ -1,0 +1,61 @@
+//! The only SQL: one SQLite file in WAL mode, one writer, embedded migrations. What was acknowledged survives `kill -9`.
+
+use std::path::Path;
+use std::time::Duration;
+
+use sqlx::SqlitePool;
+use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
+
+static MIGRATIONS: sqlx::migrate::Migrator = sqlx::migrate!("./migrations");
+
+/// Name of the database file inside the data directory.
+pub const FILE: &str = "qedgix.sqlite";
+
+/// Why the database did not do as told.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// SQLite or the disk.
+    #[error("database: {0}")]
+    Sqlx(#[from] sqlx::Error),
+    /// The file was written by another version.
+    #[error("database migration: {0}")]
+    Migrate(#[from] sqlx::migrate::MigrateError),
+    /// What is stored does not read as what was written.
+    #[error("database holds an unreadable {what}: {reason}")]
+    Corrupt {
+        /// Which record.
+        what: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+/// Handle to the database; cheap to clone.
+#[derive(Clone, Debug)]
+pub struct Store {
+    /// Readers; WAL lets them go on while somebody writes.
+    read: SqlitePool,
+    /// A single connection: writers queue here instead of meeting SQLITE_BUSY.
+    write: SqlitePool,
+}
+
+impl Store {
+    /// Opens (and creates or migrates) the database in `data_dir`, which exists.
+    ///
+    /// # Errors
+    /// The file cannot be opened or was migrated by a newer version.
+    pub async fn open(data_dir: &Path) -> Result<Self, Error> {
+        let options = SqliteConnectOptions::new()
+            .filename(data_dir.join(FILE))
+            .create_if_missing(true)
+            .journal_mode(SqliteJournalMode::Wal)
+            // FULL: a commit is on the disk before it is acknowledged.
+            .synchronous(SqliteSynchronous::Full)
+            .foreign_keys(true)
+            .busy_timeout(Duration::from_secs(10));
+        let write = SqlitePoolOptions::new().max_connections(1).connect_with(options.clone()).await?;
+        MIGRATIONS.run(&write).await?;
+        let read = SqlitePoolOptions::new().max_connections(4).connect_with(options.read_only(true)).await?;
+        Ok(Self { read, write })
+    }
+}
