@@ -41,3 +41,25 @@ pub struct Iteration {
     /// Mean chosen Q_tot over the updates.
     pub q_tot: Option<f64>,
 }
+
+impl Event {
+    /// The event as rows of a curve: (step, name, value). Names are those that servers and CSV files show.
+    pub fn rows(&self) -> Vec<(u64, &'static str, f64)> {
+        match self {
+            Self::Iteration(i) => {
+                let mut rows = vec![(i.step, "epsilon", i.epsilon), (i.step, "train/mean_aoi", i.mean_aoi)];
+                let optional = [("loss", i.loss), ("grad_norm", i.grad_norm), ("q_tot", i.q_tot)];
+                rows.extend(optional.into_iter().filter_map(|(name, value)| Some((i.step, name, value?))));
+                rows
+            }
+            Self::Evaluation { step, metrics: m } => vec![
+                (*step, "eval/mean_aoi", m.mean_aoi),
+                (*step, "eval/p95_aoi", m.p95_aoi),
+                (*step, "eval/peak_aoi", m.peak_aoi),
+                (*step, "eval/coverage", m.coverage),
+                (*step, "eval/fairness", m.fairness),
+            ],
+            Self::Finished { .. } => Vec::new(),
+        }
+    }
+}
