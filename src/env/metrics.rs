@@ -1,4 +1,4 @@
-//! What an episode is judged by (spec 1).
+//! What an episode is judged by (spec 1). Percentiles come from counting: AoI are small integers, nothing is sorted.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,10 +9,94 @@ pub struct EpisodeMetrics {
     pub mean_aoi: f64,
     /// Largest AoI of any user in any slot.
     pub peak_aoi: f64,
-    /// 95th percentile of AoI over users and slots.
+    /// 95th percentile of AoI over users and slots (nearest rank).
     pub p95_aoi: f64,
     /// Share of users ever visited.
     pub coverage: f64,
     /// Jain's fairness index of the users' mean AoI, (sum x)^2 / (N sum x^2); 1 when all are 0.
     pub fairness: f64,
+}
+
+impl EpisodeMetrics {
+    /// Mean of each figure over `episodes`; all 0 when there are none.
+    pub fn mean(episodes: &[Self]) -> Self {
+        let n = episodes.len().max(1) as f64;
+        let mean = |figure: fn(&Self) -> f64| episodes.iter().map(figure).sum::<f64>() / n;
+        Self {
+            mean_aoi: mean(|e| e.mean_aoi),
+            peak_aoi: mean(|e| e.peak_aoi),
+            p95_aoi: mean(|e| e.p95_aoi),
+            coverage: mean(|e| e.coverage),
+            fairness: mean(|e| e.fairness),
+        }
+    }
+}
+
+/// Counts that the figures of B running episodes are made of.
+#[derive(Clone, Debug)]
+pub(super) struct Tally {
+    users: usize,
+    /// K + 1, the number of values an AoI can take.
+    values: usize,
+    /// (B, K+1) how often each AoI occurred.
+    counts: Vec<u32>,
+    /// (B, N) sum of AoI over slots.
+    sums: Vec<u64>,
+    /// (B, N) whether the user was visited.
+    visited: Vec<bool>,
+}
+
+impl Tally {
+    pub(super) fn new(copies: usize, users: usize, slots: usize) -> Self {
+        let values = slots + 1;
+        Self {
+            users,
+            values,
+            counts: vec![0; copies * values],
+            sums: vec![0; copies * users],
+            visited: vec![false; copies * users],
+        }
+    }
+
+    pub(super) fn clear(&mut self) {
+        self.counts.fill(0);
+        self.sums.fill(0);
+        self.visited.fill(false);
+    }
+
+    /// Counts one slot of copy `b`.
+    pub(super) fn add(&mut self, b: usize, aoi: &[f32]) {
+        let counts = &mut self.counts[b * self.values..(b + 1) * self.values];
+        let first = b * self.users;
+        for (i, &age) in aoi.iter().enumerate() {
+            counts[age as usize] += 1;
+            self.sums[first + i] += age as u64;
+            self.visited[first + i] |= age == 0.0;
+        }
+    }
+
+    /// Figures of copy `b` after `slots` slots; all 0 (coverage, fairness: 0 and 1) before the first.
+    pub(super) fn metrics(&self, b: usize, slots: usize, weights: &[f64]) -> EpisodeMetrics {
+        let n = self.users as f64;
+        let slots = slots.max(1) as f64;
+        let counts = &self.counts[b * self.values..(b + 1) * self.values];
+        let sums = &self.sums[b * self.users..(b + 1) * self.users];
+        let visited = &self.visited[b * self.users..(b + 1) * self.users];
+        let total: u64 = counts.iter().map(|&c| u64::from(c)).sum();
+        let rank = (total * 95).div_ceil(100);
+        let mut seen = 0;
+        let p95 = counts.iter().position(|&c| {
+            seen += u64::from(c);
+            seen >= rank
+        });
+        let sum: f64 = sums.iter().map(|&s| s as f64).sum();
+        let squares: f64 = sums.iter().map(|&s| s as f64 * s as f64).sum();
+        EpisodeMetrics {
+            mean_aoi: sums.iter().zip(weights).map(|(&s, w)| w * s as f64).sum::<f64>() / (n * slots),
+            peak_aoi: counts.iter().rposition(|&c| c > 0).unwrap_or(0) as f64,
+            p95_aoi: p95.unwrap_or(0) as f64,
+            coverage: visited.iter().filter(|&&v| v).count() as f64 / n,
+            fairness: if squares > 0.0 { sum * sum / (n * squares) } else { 1.0 },
+        }
+    }
 }

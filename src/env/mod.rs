@@ -1,7 +1,18 @@
 //! The world: users whose data ages, UAVs that fly (spec 1). Pure and synchronous: no clock, no I/O, no global randomness.
 
+mod batch;
 mod config;
+mod episode;
 mod metrics;
+mod walk;
 
+pub use batch::{BatchEnv, StepError};
 pub use config::{Boundary, EnvConfig, Layout, Point, Start};
+pub use episode::Episode;
 pub use metrics::EpisodeMetrics;
+
+/// Unit vector of each action: headings 45 h degrees, counter-clockwise from +x, then hovering.
+pub const DIRECTIONS: [Point; EnvConfig::COMPASS + 1] = {
+    const D: f64 = std::f64::consts::FRAC_1_SQRT_2;
+    [[1.0, 0.0], [D, D], [0.0, 1.0], [-D, D], [-1.0, 0.0], [-D, -D], [0.0, -1.0], [D, -D], [0.0, 0.0]]
+};

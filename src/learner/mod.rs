@@ -2,8 +2,10 @@
 
 mod config;
 mod episodes;
+mod evaluation;
 mod event;
 
 pub use config::{Algorithm, MixerKind, Preset, TrainConfig, Training};
 pub use episodes::Episodes;
+pub use evaluation::{Difference, Interval, LAYOUTS, Summary, difference, evaluate, layouts, summarize};
 pub use event::{Event, Iteration};

@@ -1,5 +1,6 @@
 //! What a UAV knows and decides: observations, agents, mixers, baselines, and the trait that all policies share.
 
+pub mod baselines;
 mod config;
 mod slot;
 

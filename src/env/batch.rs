@@ -1,0 +1,241 @@
+//! The dynamics (spec 1): many copies of one environment stepped together, structure of arrays, no allocation per step.
+//!
+//! Positions are held as f32: each move is computed in f64 from the f32 position and rounded once, so what replay stores is
+//! exactly what was seen and collected. Range tests are in f64: distance^2 <= t^2. Policies and learning live elsewhere.
+
+use rand::RngExt;
+
+use super::metrics::{EpisodeMetrics, Tally};
+use super::walk::Walk;
+use super::{Boundary, DIRECTIONS, EnvConfig, Layout, Point, Start};
+use crate::invalid::Invalid;
+use crate::rng;
+
+/// Why a step was refused. The environment is as it was before.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum StepError {
+    /// The time limit K is reached; reset begins a new episode.
+    #[error("the episode is over after {slots} slots; reset begins a new one")]
+    Finished {
+        /// K.
+        slots: usize,
+    },
+    /// The actions do not fit.
+    #[error(transparent)]
+    Invalid(#[from] Invalid),
+}
+
+/// B copies of one environment in the same slot of their episodes.
+#[derive(Clone, Debug)]
+pub struct BatchEnv {
+    config: EnvConfig,
+    copies: usize,
+    slot: usize,
+    /// Displacement of each action.
+    moves: Vec<Point>,
+    /// Per-user weights, scaled to mean 1.
+    weights: Vec<f64>,
+    uav_xy: Vec<f32>,
+    user_xy: Vec<f32>,
+    aoi: Vec<f32>,
+    reward: Vec<f32>,
+    walks: Vec<Walk>,
+    tally: Tally,
+}
+
+impl BatchEnv {
+    /// `copies` environments, at slot 0 of the episodes with seeds 0, 1, ... until [`BatchEnv::reset`] says otherwise.
+    ///
+    /// # Errors
+    /// The first field of `config` that is out of range, or `copies` when it is 0.
+    pub fn new(config: &EnvConfig, copies: usize) -> Result<Self, Invalid> {
+        config.validate()?;
+        if copies == 0 {
+            return Err(Invalid::new("copies", copies, "at least 1"));
+        }
+        let (m, n) = (config.uavs, config.users);
+        let weights = config.weights.as_ref().map_or_else(
+            || vec![1.0; n],
+            |w| {
+                let mean = w.iter().sum::<f64>() / n as f64;
+                w.iter().map(|w| w / mean).collect()
+            },
+        );
+        let mut env = Self {
+            copies,
+            slot: 0,
+            moves: DIRECTIONS[..config.headings()].iter().map(|d| [d[0] * config.speed, d[1] * config.speed]).collect(),
+            weights,
+            uav_xy: vec![0.0; copies * m * 2],
+            user_xy: vec![0.0; copies * n * 2],
+            aoi: vec![0.0; copies * n],
+            reward: vec![0.0; copies],
+            walks: Vec::new(),
+            tally: Tally::new(copies, n, config.slots),
+            config: config.clone(),
+        };
+        let seeds: Vec<u64> = (0..copies as u64).collect();
+        env.reset(&seeds);
+        Ok(env)
+    }
+
+    /// Begins a new episode in every copy. The layout of an episode is a function of its seed and N only.
+    ///
+    /// # Panics
+    /// When there is not one seed per copy.
+    pub fn reset(&mut self, seeds: &[u64]) {
+        assert_eq!(seeds.len(), self.copies, "one seed per copy");
+        let (m, n) = (self.config.uavs, self.config.users);
+        self.slot = 0;
+        self.aoi.fill(0.0);
+        self.reward.fill(0.0);
+        self.tally.clear();
+        self.walks.clear();
+        for (b, &seed) in seeds.iter().enumerate() {
+            let users = &mut self.user_xy[b * n * 2..(b + 1) * n * 2];
+            match &self.config.layout {
+                Layout::Random => uniform(users, seed, "layout"),
+                Layout::Given(points) => given(users, points),
+            }
+            let uavs = &mut self.uav_xy[b * m * 2..(b + 1) * m * 2];
+            match &self.config.start {
+                Start::Center => uavs.fill(0.5),
+                Start::Random => uniform(uavs, seed, "start"),
+                Start::Given(points) => given(uavs, points),
+            }
+            if self.config.user_speed > 0.0 {
+                self.walks.push(Walk::new(seed, n, self.config.user_speed));
+            }
+        }
+    }
+
+    /// One slot: UAVs move, the boundary rule, users walk (where they do), data is collected, the reward (B).
+    ///
+    /// # Panics
+    /// When the episode is over, or `actions` (B, M) do not fit: see [`BatchEnv::try_step`] for actions from outside.
+    pub fn step(&mut self, actions: &[u8]) -> &[f32] {
+        assert!(self.slot < self.config.slots, "the episode is over");
+        assert_eq!(actions.len(), self.copies * self.config.uavs, "one action per UAV");
+        let clamp = self.config.boundary == Boundary::Clamp;
+        for (xy, &action) in self.uav_xy.chunks_exact_mut(2).zip(actions) {
+            let by = self.moves[action as usize];
+            for (x, by) in xy.iter_mut().zip(by) {
+                let to = f64::from(*x) + by;
+                *x = if clamp { to.clamp(0.0, 1.0) } else { to } as f32;
+            }
+        }
+        let n = self.config.users;
+        for (walk, users) in self.walks.iter_mut().zip(self.user_xy.chunks_exact_mut(n * 2)) {
+            walk.step(users);
+        }
+        self.collect();
+        self.slot += 1;
+        &self.reward
+    }
+
+    /// [`BatchEnv::step`] for actions from outside.
+    ///
+    /// # Errors
+    /// The episode is over, the number of actions is wrong, or a heading index does not exist.
+    pub fn try_step(&mut self, actions: &[u8]) -> Result<&[f32], StepError> {
+        if self.slot >= self.config.slots {
+            return Err(StepError::Finished { slots: self.config.slots });
+        }
+        let expected = self.copies * self.config.uavs;
+        if actions.len() != expected {
+            let expected = format!("{expected}, one per UAV");
+            return Err(Invalid::new("actions", format!("{} heading indices", actions.len()), expected).into());
+        }
+        if let Some(i) = actions.iter().position(|&a| usize::from(a) >= self.moves.len()) {
+            let expected = format!("a heading index from 0 to {}", self.moves.len() - 1);
+            return Err(Invalid::new(format!("actions[{i}]"), actions[i], expected).into());
+        }
+        Ok(self.step(actions))
+    }
+
+    /// AoI, tally and reward of the slot whose positions are set.
+    fn collect(&mut self) {
+        let (m, n) = (self.config.uavs, self.config.users);
+        let range = self.config.transmission_range * self.config.transmission_range;
+        let factor = self.config.reward_factor();
+        for b in 0..self.copies {
+            let uavs = &self.uav_xy[b * m * 2..(b + 1) * m * 2];
+            let users = &self.user_xy[b * n * 2..(b + 1) * n * 2];
+            let aoi = &mut self.aoi[b * n..(b + 1) * n];
+            let mut sum = 0.0;
+            for ((user, age), weight) in users.chunks_exact(2).zip(aoi.iter_mut()).zip(&self.weights) {
+                let (x, y) = (f64::from(user[0]), f64::from(user[1]));
+                let collected = uavs.chunks_exact(2).any(|uav| {
+                    let (dx, dy) = (f64::from(uav[0]) - x, f64::from(uav[1]) - y);
+                    dx * dx + dy * dy <= range
+                });
+                *age = if collected { 0.0 } else { *age + 1.0 };
+                sum += weight * f64::from(*age);
+            }
+            self.tally.add(b, aoi);
+            self.reward[b] = (-factor * sum / n as f64) as f32;
+        }
+    }
+
+    /// Figures of copy `b` over the slots flown so far.
+    ///
+    /// # Panics
+    /// When `b` is not a copy.
+    pub fn metrics(&self, b: usize) -> EpisodeMetrics {
+        self.tally.metrics(b, self.slot, &self.weights)
+    }
+
+    /// The configuration.
+    pub fn config(&self) -> &EnvConfig {
+        &self.config
+    }
+
+    /// B.
+    pub fn copies(&self) -> usize {
+        self.copies
+    }
+
+    /// Slots flown since the reset.
+    pub fn slot(&self) -> usize {
+        self.slot
+    }
+
+    /// Whether the time limit K is reached.
+    pub fn done(&self) -> bool {
+        self.slot >= self.config.slots
+    }
+
+    /// (B, M, 2) UAV positions.
+    pub fn uav_xy(&self) -> &[f32] {
+        &self.uav_xy
+    }
+
+    /// (B, N, 2) user positions.
+    pub fn user_xy(&self) -> &[f32] {
+        &self.user_xy
+    }
+
+    /// (B, N) AoI in slots.
+    pub fn aoi(&self) -> &[f32] {
+        &self.aoi
+    }
+
+    /// (B) rewards of the last step; 0 after a reset.
+    pub fn reward(&self) -> &[f32] {
+        &self.reward
+    }
+}
+
+/// Coordinates uniform in the unit square from the episode's stream `name`.
+fn uniform(xy: &mut [f32], seed: u64, name: &str) {
+    let mut rng = rng::stream(seed, name, 0);
+    for x in xy {
+        *x = rng.random::<f64>() as f32;
+    }
+}
+
+fn given(xy: &mut [f32], points: &[Point]) {
+    for (x, from) in xy.iter_mut().zip(points.as_flattened()) {
+        *x = *from as f32;
+    }
+}
