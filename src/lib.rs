@@ -12,6 +12,7 @@
 //! | [`store`] | the only SQL |
 //! | [`learner`] | replay, rollout, update, training, evaluation |
 //! | [`checkpoint`] | parameters to and from safetensors |
+//! | [`recipe`] | what a training run is made of: algorithm, preset, resolved configuration |
 //! | [`policy`] | observations, agents, mixers, baselines |
 //! | [`nn`], [`env`] | mathematics; physics |
 //! | [`invalid`], [`rng`] | errors of input; random streams |
@@ -23,6 +24,7 @@ pub mod env;
 pub mod invalid;
 pub mod learner;
 pub mod policy;
+pub mod recipe;
 pub mod rng;
 pub mod service;
 pub mod store;

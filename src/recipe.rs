@@ -1,4 +1,6 @@
 //! What a training run is made of (spec 5): algorithm, preset, and the resolved configuration that fixes every bit of it.
+//!
+//! Below `checkpoint`, which carries it, and `learner`, which follows it.
 
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use serde_json::{Map, Value};
