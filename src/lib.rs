@@ -27,5 +27,6 @@ pub mod policy;
 pub mod recipe;
 pub mod rng;
 pub mod service;
+pub mod serving;
 pub mod store;
 pub mod wire;

@@ -73,23 +73,37 @@ pub struct Problem {
     pub field: Option<String>,
 }
 
+/// A problem that is none of the use cases: an unknown method of a path.
+pub(super) fn problem(status: StatusCode, code: &'static str, detail: String) -> Response {
+    Problem::new(status, code, detail).into_response()
+}
+
+impl Problem {
+    fn new(status: StatusCode, code: &'static str, detail: String) -> Self {
+        let title = status.canonical_reason().unwrap_or("Error");
+        Self { r#type: "about:blank", title, status: status.as_u16(), code, detail, field: None }
+    }
+}
+
+impl IntoResponse for Problem {
+    fn into_response(self) -> Response {
+        let status = StatusCode::from_u16(self.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
+        let mut response = (status, Json(self)).into_response();
+        response.headers_mut().insert(header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
+        response
+    }
+}
+
 impl IntoResponse for Error {
     fn into_response(self) -> Response {
         log_internal(&self);
-        let status = row(&self).1;
-        let problem = Problem {
-            r#type: "about:blank",
-            title: status.canonical_reason().unwrap_or("Error"),
-            status: status.as_u16(),
-            code: self.code(),
-            detail: self.to_string(),
-            field: if let Self::Invalid(e) = &self { Some(e.field.clone()) } else { None },
-        };
-        let mut response = (status, Json(problem)).into_response();
-        let headers = response.headers_mut();
-        headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
+        let mut problem = Problem::new(row(&self).1, self.code(), self.to_string());
+        if let Self::Invalid(e) = &self {
+            problem.field = Some(e.field.clone());
+        }
+        let mut response = problem.into_response();
         if let Some(seconds) = retry_after_seconds(&self) {
-            headers.insert(header::RETRY_AFTER, seconds.into());
+            response.headers_mut().insert(header::RETRY_AFTER, seconds.into());
         }
         response
     }

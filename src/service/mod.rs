@@ -1,13 +1,81 @@
 //! Use cases: one function each, one error type. Both transports call only this.
 
+pub mod act;
 mod error;
+pub mod policies;
+pub mod sessions;
+
+use std::sync::atomic::{AtomicBool, Ordering};
 
 pub use error::Error;
 
+use crate::serving::{Engine, Registry, Sessions};
 use crate::store::Store;
 
 /// What use cases work with; shared by all connections behind an `Arc`.
 pub struct App {
     /// Durable state.
     pub store: Store,
+    /// Policies that can be asked.
+    pub registry: Registry,
+    /// Fleets whose memory the server keeps.
+    pub sessions: Sessions,
+    /// Where headings are computed.
+    pub engine: Engine,
+    /// Whether the server is shutting down.
+    pub draining: Draining,
+}
+
+/// Whether the server is shutting down: new work is refused, work in flight goes on.
+#[derive(Debug, Default)]
+pub struct Draining(AtomicBool);
+
+impl Draining {
+    /// From now on new work is refused.
+    pub fn begin(&self) {
+        self.0.store(true, Ordering::SeqCst);
+    }
+
+    /// Whether [`Draining::begin`] was called.
+    pub fn begun(&self) -> bool {
+        self.0.load(Ordering::SeqCst)
+    }
+}
+
+impl App {
+    /// Lets new work in.
+    ///
+    /// # Errors
+    /// [`Error::Draining`].
+    pub fn admit(&self) -> Result<(), Error> {
+        if self.draining.begun() { Err(Error::Draining) } else { Ok(()) }
+    }
+
+    /// Checks that the server can do its work: the database answers, there is something to serve, and it is not draining.
+    ///
+    /// # Errors
+    /// The first of these that is not the case.
+    pub async fn ready(&self) -> Result<(), Error> {
+        self.admit()?;
+        if self.registry.is_empty() {
+            return Err(Error::internal("no policy is loaded"));
+        }
+        Ok(self.store.ping().await?)
+    }
+}
+
+impl From<crate::serving::Error> for Error {
+    fn from(error: crate::serving::Error) -> Self {
+        use crate::serving::Error as E;
+        match error {
+            E::Invalid(e) => Self::Invalid(e),
+            E::UnknownPolicy(id) => Self::not_found("policy", id),
+            E::UnknownSession(id) => Self::not_found("session", id),
+            E::Precondition { code, message } => Self::Precondition { code, message },
+            E::Exists(message) => Self::Conflict { code: "already_exists", message },
+            E::Busy(message) => Self::Busy { message, retry_after: std::time::Duration::from_secs(1) },
+            E::Deadline(place) => Self::Deadline(place),
+            E::Fault(cause) => Self::internal(cause),
+        }
+    }
 }

@@ -1,5 +1,9 @@
 //! The only SQL: one SQLite file in WAL mode, one writer, embedded migrations. What was acknowledged survives `kill -9`.
 
+mod policies;
+
+pub use policies::{NewPolicyVersion, PolicyAlias, PolicyVersion};
+
 use std::path::Path;
 use std::time::Duration;
 

@@ -1,0 +1,127 @@
+//! Answers of `PolicyService`.
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+use serde_json::Value;
+
+use crate::policy::Needs;
+use crate::service::{act, policies};
+use crate::serving::{Kind, PolicyRef, SessionInfo};
+use crate::wire::v1;
+
+/// Degrees between two headings.
+const DEGREES: f64 = 45.0;
+/// Headings of the compass; the ninth action hovers.
+const COMPASS: u8 = 8;
+
+/// The answer, with Q-values if `values` were asked for and the policy has them.
+pub fn act_response(answer: act::Answer, values: bool) -> v1::ActResponse {
+    let act::Answer { policy, uavs, order, step, headings, q_values, state, timings } = answer;
+    let actions = policy.policy.actions();
+    let mut ids = uavs;
+    let actions = order
+        .iter()
+        .map(|&uav| {
+            let uav = uav as usize;
+            let heading = headings[uav];
+            let q = q_values.get(uav * actions..(uav + 1) * actions).unwrap_or_default();
+            v1::Action {
+                uav_id: std::mem::take(&mut ids[uav]),
+                heading_index: u32::from(heading),
+                heading_deg: (heading < COMPASS).then(|| DEGREES * f64::from(heading)),
+                q_values: if values && q.iter().all(|q| !q.is_nan()) { q.to_vec() } else { Vec::new() },
+            }
+        })
+        .collect();
+    v1::ActResponse {
+        actions,
+        policy: Some((&policy.reference).into()),
+        step,
+        recurrent_state: state.unwrap_or_default(),
+        timings: Some(v1::Timings {
+            queue: Some(duration(timings.queue)),
+            compute: Some(duration(timings.compute)),
+            batch_size: timings.batch_size,
+        }),
+    }
+}
+
+impl From<&PolicyRef> for v1::PolicyRef {
+    fn from(policy: &PolicyRef) -> Self {
+        Self { name: policy.name.clone(), version: policy.version, digest: policy.digest_hex() }
+    }
+}
+
+impl From<SessionInfo> for v1::Session {
+    fn from(session: SessionInfo) -> Self {
+        Self {
+            session_id: session.id,
+            policy: Some((&session.policy).into()),
+            steps: session.steps,
+            opened_at: Some(timestamp(session.opened_at)),
+            ttl: Some(duration(session.ttl)),
+        }
+    }
+}
+
+impl From<policies::Described> for v1::Policy {
+    fn from(described: policies::Described) -> Self {
+        let policies::Described { policy, aliases, versions } = described;
+        let needs = match policy.policy.needs() {
+            Needs::Detections => v1::Needs::Detections,
+            Needs::OwnPositions => v1::Needs::OwnPositions,
+            Needs::FullScene => v1::Needs::FullScene,
+        };
+        let kind = match policy.kind {
+            Kind::Checkpoint => v1::PolicyKind::Checkpoint,
+            Kind::Baseline => v1::PolicyKind::Baseline,
+        };
+        Self {
+            r#ref: Some((&policy.reference).into()),
+            kind: kind.into(),
+            description: policy.description.clone(),
+            uavs: policy.uavs,
+            users: policy.users,
+            headings: policy.policy.actions() as u32,
+            needs: needs.into(),
+            detection_range: policy.policy.detection_range(),
+            aliases,
+            versions,
+            config: document(&policy.config),
+            metrics: document(&policy.metrics),
+            created_at: Some(timestamp(policy.created_at)),
+        }
+    }
+}
+
+fn duration(duration: Duration) -> prost_types::Duration {
+    prost_types::Duration { seconds: duration.as_secs() as i64, nanos: duration.subsec_nanos() as i32 }
+}
+
+fn timestamp(time: Timestamp) -> prost_types::Timestamp {
+    prost_types::Timestamp { seconds: time.as_second(), nanos: time.subsec_nanosecond() }
+}
+
+fn document(value: &Value) -> Option<prost_types::Struct> {
+    match struct_value(value).kind {
+        Some(prost_types::value::Kind::StructValue(document)) => Some(document),
+        _ => None,
+    }
+}
+
+fn struct_value(value: &Value) -> prost_types::Value {
+    use prost_types::value::Kind;
+    let kind = match value {
+        Value::Null => Kind::NullValue(0),
+        Value::Bool(b) => Kind::BoolValue(*b),
+        Value::Number(n) => Kind::NumberValue(n.as_f64().unwrap_or(f64::NAN)),
+        Value::String(s) => Kind::StringValue(s.clone()),
+        Value::Array(values) => Kind::ListValue(prost_types::ListValue { values: values.iter().map(struct_value).collect() }),
+        Value::Object(fields) => {
+            let fields = fields.iter().map(|(name, value)| (name.clone(), struct_value(value))).collect();
+            Kind::StructValue(prost_types::Struct { fields })
+        }
+    };
+    prost_types::Value { kind: Some(kind) }
+}

@@ -1,0 +1,113 @@
+//! What happens around every gRPC call: its deadline, its id, panics caught, statuses brought in line with the table of
+//! errors, and its count.
+
+use std::panic::AssertUnwindSafe;
+use std::time::{Duration, Instant};
+
+use axum::extract::Request;
+use axum::middleware::Next;
+use axum::response::Response;
+use futures::FutureExt;
+use tonic::{Code, Status};
+use tracing::Instrument;
+
+use super::Deadline;
+use crate::api::observe::{Observed, REQUEST_ID, request_id};
+use crate::invalid::Invalid;
+use crate::service::Error;
+
+pub(super) async fn around(mut request: Request, next: Next) -> Response {
+    let observed = Observed::begin("grpc");
+    let method = request.uri().path().trim_start_matches('/').to_owned();
+    let id = request_id(request.headers());
+    let deadline = request.headers().get("grpc-timeout").and_then(|v| timeout(v.to_str().ok()?)).map(|t| Instant::now() + t);
+    if let Some(deadline) = deadline {
+        request.extensions_mut().insert(Deadline(deadline));
+    }
+    let span = tracing::info_span!("grpc", method, request_id = ?id);
+    let work = AssertUnwindSafe(next.run(request).instrument(span.clone())).catch_unwind();
+    let answered = match deadline {
+        None => work.await,
+        Some(deadline) => tokio::time::timeout_at(deadline.into(), work)
+            .await
+            .unwrap_or_else(|_| Ok(Status::from(Error::Deadline("before the answer was ready")).into_http())),
+    };
+    let _inside = span.enter();
+    let response = answered.unwrap_or_else(|_| Status::from(Error::internal("a handler panicked")).into_http());
+    let (mut response, code) = in_line(response);
+    response.headers_mut().insert(REQUEST_ID, id);
+    // Paths are the caller's; only those that exist become labels.
+    let method = if code == Code::Unimplemented { "unknown".to_owned() } else { method };
+    observed.end(method, name(code).to_owned());
+    response
+}
+
+/// The transport has its own statuses for messages that are too large or do not decode; the table of errors has others.
+fn in_line(response: Response) -> (Response, Code) {
+    let Some(status) = response.extensions().get::<Status>() else { return (response, Code::Ok) };
+    let ours = status.metadata().contains_key("qedgix-code");
+    let error = match status.code() {
+        Code::OutOfRange if !ours => Error::TooLarge(status.message().to_owned()),
+        Code::Internal if !ours => Invalid::new("message", status.message(), "one message of the method's request type").into(),
+        code => return (response, code),
+    };
+    let status = Status::from(error);
+    let code = status.code();
+    (status.into_http(), code)
+}
+
+/// A `grpc-timeout`: up to 8 digits and a unit.
+fn timeout(value: &str) -> Option<Duration> {
+    let (digits, unit) = value.split_at_checked(value.len().checked_sub(1)?)?;
+    if digits.is_empty() || digits.len() > 8 || !digits.bytes().all(|b| b.is_ascii_digit()) {
+        return None;
+    }
+    let n: u64 = digits.parse().ok()?;
+    Some(match unit {
+        "H" => Duration::from_secs(n * 3600),
+        "M" => Duration::from_secs(n * 60),
+        "S" => Duration::from_secs(n),
+        "m" => Duration::from_millis(n),
+        "u" => Duration::from_micros(n),
+        "n" => Duration::from_nanos(n),
+        _ => return None,
+    })
+}
+
+/// The status code as gRPC's documents write it.
+fn name(code: Code) -> &'static str {
+    match code {
+        Code::Ok => "OK",
+        Code::Cancelled => "CANCELLED",
+        Code::Unknown => "UNKNOWN",
+        Code::InvalidArgument => "INVALID_ARGUMENT",
+        Code::DeadlineExceeded => "DEADLINE_EXCEEDED",
+        Code::NotFound => "NOT_FOUND",
+        Code::AlreadyExists => "ALREADY_EXISTS",
+        Code::PermissionDenied => "PERMISSION_DENIED",
+        Code::ResourceExhausted => "RESOURCE_EXHAUSTED",
+        Code::FailedPrecondition => "FAILED_PRECONDITION",
+        Code::Aborted => "ABORTED",
+        Code::OutOfRange => "OUT_OF_RANGE",
+        Code::Unimplemented => "UNIMPLEMENTED",
+        Code::Internal => "INTERNAL",
+        Code::Unavailable => "UNAVAILABLE",
+        Code::DataLoss => "DATA_LOSS",
+        Code::Unauthenticated => "UNAUTHENTICATED",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn timeouts_as_the_protocol_writes_them() {
+        assert_eq!(timeout("100m"), Some(Duration::from_millis(100)));
+        assert_eq!(timeout("99999999H"), Some(Duration::from_secs(99_999_999 * 3600)));
+        assert_eq!(timeout("0n"), Some(Duration::ZERO));
+        for wrong in ["", "m", "5", "123456789S", "-1S", "1x", "1é"] {
+            assert_eq!(timeout(wrong), None, "{wrong}");
+        }
+    }
+}

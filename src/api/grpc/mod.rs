@@ -1,0 +1,46 @@
+//! gRPC: all services on one router, health and reflection included.
+
+mod envelope;
+mod policy;
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use tonic::Extensions;
+use tonic::service::Routes;
+use tonic_health::pb::health_server::{Health, HealthServer};
+
+use crate::service::App;
+use crate::wire::{DESCRIPTORS, v1};
+
+/// Names of the services that health tells about.
+pub const SERVICES: &[&str] = &[v1::policy_service_server::SERVICE_NAME];
+
+/// All services. A message larger than `max_message` bytes is refused.
+///
+/// # Panics
+/// When the descriptor set built into the program does not decode; a test would have failed before.
+pub fn routes<H: Health>(app: &Arc<App>, health: HealthServer<H>, max_message: usize) -> Routes {
+    let reflection = || {
+        let builder = tonic_reflection::server::Builder::configure().register_encoded_file_descriptor_set(DESCRIPTORS);
+        builder.register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+    };
+    const BUILT_IN: &str = "the descriptors are built into the program";
+    let mut routes = Routes::builder();
+    routes
+        .add_service(policy::service(app.clone()).max_decoding_message_size(max_message))
+        .add_service(health)
+        .add_service(reflection().build_v1().expect(BUILT_IN))
+        .add_service(reflection().build_v1alpha().expect(BUILT_IN));
+    let router = routes.routes().into_axum_router().layer(axum::middleware::from_fn(envelope::around));
+    Routes::from(router)
+}
+
+/// The moment after which the caller no longer waits.
+#[derive(Clone, Copy, Debug)]
+pub struct Deadline(pub Instant);
+
+/// The deadline of a request, from its `grpc-timeout`.
+pub fn deadline(extensions: &Extensions) -> Option<Instant> {
+    extensions.get::<Deadline>().map(|deadline| deadline.0)
+}

@@ -1,0 +1,132 @@
+//! Bodies, paths and queries, with the errors of the one table.
+
+use axum::body::{Body, BodyDataStream, HttpBody};
+use axum::extract::{FromRequest, FromRequestParts, Request};
+use axum::http::request::Parts;
+use bytes::Bytes;
+use futures::StreamExt;
+use serde::de::DeserializeOwned;
+
+use crate::invalid::Invalid;
+use crate::service::Error;
+
+/// Largest body, in bytes.
+#[derive(Clone, Copy, Debug)]
+pub struct MaxBody(pub usize);
+
+/// A body that is too large is read on for this many bytes and thrown away, so that a caller that is still sending gets
+/// the answer instead of a broken connection.
+const DISCARDED: usize = 64 << 20;
+
+/// A body that is a JSON document of type `T`.
+#[derive(Debug)]
+pub struct Json<T>(pub T);
+
+impl<S: Sync, T: DeserializeOwned> FromRequest<S> for Json<T> {
+    type Rejection = Error;
+
+    async fn from_request(request: Request, _: &S) -> Result<Self, Error> {
+        parse(&read(request).await?).map(Self)
+    }
+}
+
+/// A body as it comes.
+#[derive(Debug)]
+pub struct Raw(pub Bytes);
+
+impl<S: Sync> FromRequest<S> for Raw {
+    type Rejection = Error;
+
+    async fn from_request(request: Request, _: &S) -> Result<Self, Error> {
+        read(request).await.map(Self)
+    }
+}
+
+async fn read(request: Request) -> Result<Bytes, Error> {
+    let MaxBody(limit) = request.extensions().get().copied().unwrap_or(MaxBody(4 << 20));
+    let too_large = || Error::TooLarge(format!("the body is larger than the limit of {limit} bytes"));
+    let body = request.into_body();
+    let announced = announced_size(&body);
+    if announced > limit as u64 {
+        discard(body.into_data_stream()).await;
+        return Err(too_large());
+    }
+    let mut body = body.into_data_stream();
+    let mut received = bytes::BytesMut::with_capacity(announced as usize);
+    while let Some(part) = body.next().await {
+        let part = part.map_err(|e| Invalid::new("body", e, "a complete body"))?;
+        if received.len() + part.len() > limit {
+            discard(body).await;
+            return Err(too_large());
+        }
+        received.extend_from_slice(&part);
+    }
+    Ok(received.freeze())
+}
+
+/// Bytes that the body is known to have at least.
+fn announced_size(body: &Body) -> u64 {
+    body.size_hint().lower()
+}
+
+async fn discard(mut parts: BodyDataStream) {
+    let mut left = DISCARDED;
+    while let Some(Ok(part)) = parts.next().await {
+        match left.checked_sub(part.len()) {
+            Some(less) => left = less,
+            None => return,
+        }
+    }
+}
+
+/// Reads a JSON document.
+///
+/// # Errors
+/// [`Error::Invalid`] where it is not JSON, [`Error::Schema`] with the path where it does not fit `T`.
+pub fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, Error> {
+    let mut deserializer = serde_json::Deserializer::from_slice(body);
+    let document = serde_path_to_error::deserialize(&mut deserializer).map_err(|e| {
+        let path = e.path().to_string();
+        let e = e.into_inner();
+        if e.is_data() {
+            let place = if path == "." { String::new() } else { format!("{path}: ") };
+            Error::Schema(format!("{place}{e}"))
+        } else {
+            Invalid::new("body", format!("{} bytes that are not JSON ({e})", body.len()), "a JSON document").into()
+        }
+    })?;
+    deserializer.end().map_err(|e| Invalid::new("body", format!("more than one document ({e})"), "one JSON document"))?;
+    Ok(document)
+}
+
+/// The parts of a path.
+#[derive(Debug)]
+pub struct Path<T>(pub T);
+
+impl<S: Send + Sync, T: DeserializeOwned + Send> FromRequestParts<S> for Path<T> {
+    type Rejection = Error;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, Error> {
+        let read = axum::extract::Path::<T>::from_request_parts(parts, state).await;
+        match read {
+            Ok(path) => Ok(Self(path.0)),
+            Err(e) => Err(Invalid::new("path", parts.uri.path(), e.body_text()).into()),
+        }
+    }
+}
+
+/// The query.
+#[derive(Debug)]
+pub struct Query<T>(pub T);
+
+impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for Query<T> {
+    type Rejection = Error;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, Error> {
+        let read = axum::extract::Query::<T>::from_request_parts(parts, state).await;
+        match read {
+            Ok(query) => Ok(Self(query.0)),
+            Err(e) => Err(Invalid::new("query", parts.uri.query().unwrap_or(""), e.body_text()).into()),
+        }
+    }
+}

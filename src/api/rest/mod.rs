@@ -1,0 +1,65 @@
+//! REST: JSON under `/v1`, probes, metrics. Every error is a problem of RFC 9457, also those of paths and methods.
+
+mod act;
+pub mod extract;
+mod ops;
+mod policies;
+mod sessions;
+mod wording;
+
+use std::panic::AssertUnwindSafe;
+use std::sync::Arc;
+
+use axum::Router;
+use axum::extract::{MatchedPath, Request};
+use axum::http::StatusCode;
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+use axum::routing::{get, post};
+use futures::FutureExt;
+use metrics_exporter_prometheus::PrometheusHandle;
+use tracing::Instrument;
+
+use super::errors::problem;
+use super::observe::{Observed, REQUEST_ID, request_id};
+use crate::service::{App, Error};
+
+/// All of REST. A body larger than `max_body` bytes is refused.
+pub fn router(app: Arc<App>, metrics: PrometheusHandle, max_body: usize) -> Router {
+    Router::new()
+        .route("/", get(ops::index))
+        .route("/livez", get(ops::live))
+        .route("/readyz", get(ops::ready))
+        .route("/metrics", get(move |app| ops::metrics(metrics.clone(), app)))
+        .route("/v1/act", post(act::act))
+        .route("/v1/sessions", post(sessions::open).get(sessions::list))
+        .route("/v1/sessions/{id}", get(sessions::get).delete(sessions::close))
+        .route("/v1/policies", get(policies::list))
+        .route("/v1/policies/{policy}", get(policies::get))
+        .fallback(|request: Request| async move { Error::not_found("endpoint", request.uri().path()).into_response() })
+        .method_not_allowed_fallback(|request: Request| async move {
+            let detail = format!("{} does not answer {}", request.uri().path(), request.method());
+            problem(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", detail)
+        })
+        .layer(axum::Extension(extract::MaxBody(max_body)))
+        .layer(axum::middleware::from_fn(around))
+        .with_state(app)
+}
+
+/// What happens around every request: its id, panics caught, and its count.
+async fn around(request: Request, next: Next) -> Response {
+    let observed = Observed::begin("http");
+    let verb = request.method().clone();
+    let path = request.extensions().get::<MatchedPath>().map_or("unknown", MatchedPath::as_str).to_owned();
+    let id = request_id(request.headers());
+    let span = tracing::info_span!("http", %verb, path, request_id = ?id);
+    let work = AssertUnwindSafe(next.run(request).instrument(span.clone())).catch_unwind();
+    let answered = work.await;
+    let _inside = span.enter();
+    let mut response = answered.unwrap_or_else(|_| Error::internal("a handler panicked").into_response());
+    response.headers_mut().insert(REQUEST_ID, id);
+    // Made-up verbs are the caller's; they do not become labels.
+    let verb = if response.status() == StatusCode::METHOD_NOT_ALLOWED { "other" } else { verb.as_str() };
+    observed.end(format!("{verb} {path}"), response.status().as_u16().to_string());
+    response
+}

@@ -1,0 +1,179 @@
+//! Answers of `PolicyService` as JSON: names of the protocol, bytes in base64, times as RFC 3339, durations as seconds
+//! with an `s` (`"0.000021s"`), whole numbers as numbers.
+
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
+use bytes::Bytes;
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde_json::Value;
+
+use crate::wire::v1;
+
+/// Bytes, written in base64.
+#[derive(Debug)]
+pub(super) struct Base64(pub(super) Bytes);
+
+impl<'de> Deserialize<'de> for Base64 {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let text = String::deserialize(deserializer)?;
+        let bytes = BASE64_STANDARD.decode(text).map_err(|e| D::Error::custom(format!("not base64: {e}")))?;
+        Ok(Self(bytes.into()))
+    }
+}
+
+impl Serialize for Base64 {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(&BASE64_STANDARD.encode(&self.0))
+    }
+}
+
+#[derive(Debug, Serialize)]
+pub(super) struct ActReply {
+    actions: Vec<Action>,
+    policy: Option<PolicyRef>,
+    step: u64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    recurrent_state: Option<Base64>,
+    timings: Option<Timings>,
+}
+
+#[derive(Debug, Serialize)]
+struct Action {
+    uav_id: String,
+    heading_index: u32,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    heading_deg: Option<f64>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    q_values: Vec<f32>,
+}
+
+#[derive(Debug, Serialize)]
+struct PolicyRef {
+    name: String,
+    version: u64,
+    digest: String,
+}
+
+#[derive(Debug, Serialize)]
+struct Timings {
+    queue: Option<String>,
+    compute: Option<String>,
+    batch_size: u32,
+}
+
+#[derive(Debug, Serialize)]
+pub(super) struct Session {
+    session_id: String,
+    policy: Option<PolicyRef>,
+    steps: u64,
+    opened_at: Option<String>,
+    ttl: Option<String>,
+}
+
+#[derive(Debug, Serialize)]
+pub(super) struct Policy {
+    r#ref: Option<PolicyRef>,
+    kind: &'static str,
+    description: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    uavs: Option<u32>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    users: Option<u32>,
+    headings: u32,
+    needs: &'static str,
+    detection_range: f64,
+    aliases: Vec<String>,
+    versions: Vec<u64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    config: Option<Value>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    metrics: Option<Value>,
+    created_at: Option<String>,
+}
+
+impl From<v1::ActResponse> for ActReply {
+    fn from(answer: v1::ActResponse) -> Self {
+        let action = |a: v1::Action| Action {
+            uav_id: a.uav_id,
+            heading_index: a.heading_index,
+            heading_deg: a.heading_deg,
+            q_values: a.q_values,
+        };
+        Self {
+            actions: answer.actions.into_iter().map(action).collect(),
+            policy: answer.policy.map(Into::into),
+            step: answer.step,
+            recurrent_state: Some(answer.recurrent_state).filter(|state| !state.is_empty()).map(Base64),
+            timings: answer.timings.map(|t| Timings {
+                queue: t.queue.map(|d| seconds(&d)),
+                compute: t.compute.map(|d| seconds(&d)),
+                batch_size: t.batch_size,
+            }),
+        }
+    }
+}
+
+impl From<v1::PolicyRef> for PolicyRef {
+    fn from(r: v1::PolicyRef) -> Self {
+        Self { name: r.name, version: r.version, digest: r.digest }
+    }
+}
+
+impl From<v1::Session> for Session {
+    fn from(session: v1::Session) -> Self {
+        Self {
+            session_id: session.session_id,
+            policy: session.policy.map(Into::into),
+            steps: session.steps,
+            opened_at: session.opened_at.and_then(|t| time(&t)),
+            ttl: session.ttl.map(|d| seconds(&d)),
+        }
+    }
+}
+
+impl From<v1::Policy> for Policy {
+    fn from(policy: v1::Policy) -> Self {
+        Self {
+            kind: policy.kind().as_str_name(),
+            needs: policy.needs().as_str_name(),
+            r#ref: policy.r#ref.map(Into::into),
+            description: policy.description,
+            uavs: policy.uavs,
+            users: policy.users,
+            headings: policy.headings,
+            detection_range: policy.detection_range,
+            aliases: policy.aliases,
+            versions: policy.versions,
+            config: policy.config.map(document),
+            metrics: policy.metrics.map(document),
+            created_at: policy.created_at.and_then(|t| time(&t)),
+        }
+    }
+}
+
+fn seconds(duration: &prost_types::Duration) -> String {
+    format!("{}.{:09}s", duration.seconds, duration.nanos)
+}
+
+fn time(time: &prost_types::Timestamp) -> Option<String> {
+    jiff::Timestamp::new(time.seconds, time.nanos).ok().map(|time| time.to_string())
+}
+
+fn document(document: prost_types::Struct) -> Value {
+    Value::Object(document.fields.into_iter().map(|(name, value)| (name, json(value))).collect())
+}
+
+fn json(value: prost_types::Value) -> Value {
+    use prost_types::value::Kind;
+    match value.kind {
+        None | Some(Kind::NullValue(_)) => Value::Null,
+        Some(Kind::BoolValue(b)) => b.into(),
+        // A whole number was one before it travelled as a double.
+        Some(Kind::NumberValue(n)) if n.fract() == 0.0 && n.abs() < 9e15 => (n as i64).into(),
+        Some(Kind::NumberValue(n)) => n.into(),
+        Some(Kind::StringValue(s)) => s.into(),
+        Some(Kind::ListValue(list)) => list.values.into_iter().map(json).collect(),
+        Some(Kind::StructValue(fields)) => document(fields),
+    }
+}

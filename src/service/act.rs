@@ -1,0 +1,192 @@
+//! One slot of one fleet: an observation in, a heading per UAV out.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use bytes::Bytes;
+
+use super::{App, Error};
+use crate::invalid::Invalid;
+use crate::policy::Slot;
+use crate::serving::{
+    Answered, Fleet, HeldState, LoadedPolicy, Observation, PolicySpec, Session, Task, Timings, Turn, Which,
+};
+
+/// Observations of more nodes are prepared away from the threads that serve connections.
+const LARGE: usize = 256;
+
+/// What is asked.
+#[derive(Clone, Debug)]
+pub struct Request {
+    /// Which policy; a session knows its own.
+    pub policy: Option<PolicySpec>,
+    /// What the fleet sees.
+    pub observation: Observation,
+    /// What it remembers.
+    pub memory: Memory,
+    /// The step, where the caller counts.
+    pub step: Option<u64>,
+    /// The run of a session; without meaning for memory that the caller keeps.
+    pub run_id: Option<String>,
+    /// Fixes what is random about the policy, at slot 0 of memory that the caller keeps.
+    pub seed: Option<u64>,
+}
+
+/// Who keeps the memory.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Memory {
+    /// The server, in this session.
+    Session(String),
+    /// The caller: the bytes of the last answer, empty at slot 0.
+    Held(Bytes),
+}
+
+/// What is answered. Headings and values are in canonical order of UAVs; `order` is the request's.
+#[derive(Clone, Debug)]
+pub struct Answer {
+    /// Who decided.
+    pub policy: Arc<LoadedPolicy>,
+    /// Ids of UAVs in canonical order.
+    pub uavs: Vec<String>,
+    /// Canonical index of each UAV in the order of the request.
+    pub order: Vec<u32>,
+    /// The step that was answered.
+    pub step: u64,
+    /// Heading index of each UAV.
+    pub headings: Vec<u8>,
+    /// A values per UAV; NaN where the policy has none.
+    pub q_values: Vec<f32>,
+    /// Memory for the next slot, where the caller keeps it.
+    pub state: Option<Bytes>,
+    /// How long it took.
+    pub timings: Timings,
+}
+
+/// Answers one slot.
+///
+/// # Errors
+/// Everything in the table of errors that concerns policies and sessions.
+pub async fn act(app: &App, request: Request, deadline: Option<Instant>) -> Result<Answer, Error> {
+    app.admit()?;
+    match &request.memory {
+        Memory::Session(id) => {
+            let session = app.sessions.get(id)?;
+            let answer = in_session(app, &session, request, deadline);
+            match deadline {
+                None => answer.await,
+                // The engine watches its own queue; this is for the wait behind another slot of the same session.
+                Some(deadline) => {
+                    let passed = || Error::Deadline("behind another slot of the session");
+                    tokio::time::timeout_at(deadline.into(), answer).await.unwrap_or_else(|_| Err(passed()))
+                }
+            }
+        }
+        Memory::Held(state) => {
+            let state = state.clone();
+            with_held_state(app, &state, request, deadline).await
+        }
+    }
+}
+
+async fn in_session(app: &App, session: &Session, request: Request, deadline: Option<Instant>) -> Result<Answer, Error> {
+    let policy = session.policy().clone();
+    if let Some(spec) = &request.policy {
+        check_pinned(&policy, spec)?;
+    }
+    if let Some(seed) = request.seed {
+        return Err(Invalid::new("seed", seed, "nothing: a session is given its seed when it is opened").into());
+    }
+    let Observation { fleet, uav_order: order, .. } = &request.observation;
+    let (fleet, order) = (fleet.clone(), order.clone());
+    let slot = slot_of(request.observation, &policy).await?;
+    let uavs = fleet.uavs.clone();
+    let answered = match session.turn(fleet, request.step, request.run_id.as_deref()).await? {
+        Turn::Repeat(answered) => answered,
+        Turn::Next(mut turn) => {
+            let memory = std::mem::take(&mut turn.memory);
+            let outcome = app.engine.run(Task { policy: policy.clone(), slot, step: turn.step, memory }, deadline).await?;
+            turn.commit(outcome)
+        }
+    };
+    let Answered { step, headings, q_values, timings } = answered;
+    Ok(Answer { policy, uavs, order, step, headings, q_values, state: None, timings })
+}
+
+async fn with_held_state(app: &App, state: &[u8], request: Request, deadline: Option<Instant>) -> Result<Answer, Error> {
+    let Some(spec) = &request.policy else {
+        return Err(Invalid::new("policy", "nothing", "NAME, NAME@ALIAS or NAME:VERSION, where there is no session").into());
+    };
+    let held = if state.is_empty() { None } else { Some(HeldState::decode(state)?) };
+    let mut policy = app.registry.resolve(spec)?;
+    if let Some(held) = &held {
+        policy = version_of(app, policy, spec, held)?;
+    }
+    let Observation { fleet, uav_order: order, .. } = &request.observation;
+    let (fleet, order) = (fleet.clone(), order.clone());
+    let slot = slot_of(request.observation, &policy).await?;
+    let step = held.as_ref().map_or(0, |held| held.step);
+    if let Some(sent) = request.step.filter(|&sent| sent != step) {
+        let message = format!("step {sent} does not go with this recurrent_state, which is of step {step}");
+        return Err(Error::Precondition { code: "wrong_step", message });
+    }
+    let memory = match held {
+        Some(held) => memory_of(held, &fleet, &policy)?,
+        None => {
+            let mut memory = vec![0.0; policy.policy.memory_len(slot.uavs(), slot.users())];
+            policy.policy.start(slot.uavs(), slot.users(), request.seed.unwrap_or(0), &mut memory);
+            memory
+        }
+    };
+    let outcome = app.engine.run(Task { policy: policy.clone(), slot, step, memory }, deadline).await?;
+    let next = HeldState::new(policy.reference.digest, step.saturating_add(1), &fleet, outcome.memory);
+    let (headings, q_values, timings) = (outcome.headings, outcome.q_values, outcome.timings);
+    Ok(Answer { policy, uavs: fleet.uavs, order, step, headings, q_values, state: Some(next.encode()), timings })
+}
+
+/// A session stays with its version, so an alias that moved meanwhile still means it; another name or version does not.
+fn check_pinned(pinned: &LoadedPolicy, spec: &PolicySpec) -> Result<(), Invalid> {
+    let same_version = !matches!(spec.which, Which::Version(version) if version != pinned.reference.version);
+    if spec.name == pinned.reference.name && same_version {
+        return Ok(());
+    }
+    Err(Invalid::new("policy", spec, format!("{}, which the session is pinned to, or nothing", pinned.reference)))
+}
+
+/// The version that wrote `held`: an episode stays with its version even if a newer one was published since.
+fn version_of(app: &App, asked: Arc<LoadedPolicy>, spec: &PolicySpec, held: &HeldState) -> Result<Arc<LoadedPolicy>, Invalid> {
+    if asked.reference.digest == held.digest {
+        return Ok(asked);
+    }
+    let pinned = app.registry.with_digest(&spec.name, &held.digest);
+    pinned.filter(|_| !matches!(spec.which, Which::Version(_))).ok_or_else(|| {
+        let expected = format!("the recurrent_state of an earlier answer of {spec}");
+        Invalid::new("recurrent_state", "the memory of another policy or version", expected)
+    })
+}
+
+fn memory_of(held: HeldState, fleet: &Fleet, policy: &LoadedPolicy) -> Result<Vec<f32>, Invalid> {
+    let wrong = |value: &str| {
+        let expected = "the recurrent_state of an earlier answer to the same UAVs and users";
+        Invalid::new("recurrent_state", value, expected)
+    };
+    let (uavs, users) = (fleet.uavs.len(), fleet.users.len());
+    if (held.uavs as usize, held.users as usize) != (uavs, users) {
+        return Err(wrong(&format!("the memory of {} UAVs and {} users", held.uavs, held.users)));
+    }
+    if held.fleet != fleet.fingerprint() {
+        return Err(wrong("the memory of other ids"));
+    }
+    if held.memory.len() != policy.policy.memory_len(uavs, users) {
+        return Err(wrong("a memory of another length"));
+    }
+    Ok(held.memory)
+}
+
+async fn slot_of(observation: Observation, policy: &Arc<LoadedPolicy>) -> Result<Slot, Error> {
+    if observation.uavs() + observation.users() < LARGE {
+        return Ok(observation.into_slot(&*policy.policy)?);
+    }
+    let policy = policy.clone();
+    let prepared = tokio::task::spawn_blocking(move || observation.into_slot(&*policy.policy));
+    Ok(prepared.await.map_err(Error::internal)??)
+}

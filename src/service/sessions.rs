@@ -1,0 +1,47 @@
+//! Opening, showing and ending sessions.
+
+use super::{App, Error};
+use crate::invalid::{Invalid, in_range};
+use crate::serving::{Opened, PolicySpec, SessionInfo};
+
+/// Opens a session pinned to what `policy` names now.
+///
+/// # Errors
+/// An unknown policy, a name that is taken, a fenced run, too many sessions, draining.
+pub async fn open(app: &App, policy: &PolicySpec, how: Opened) -> Result<SessionInfo, Error> {
+    app.admit()?;
+    let policy = app.registry.resolve(policy)?;
+    Ok(app.sessions.open(policy, how).await?)
+}
+
+/// Shows a session.
+///
+/// # Errors
+/// It expired, or there is none.
+pub fn get(app: &App, id: &str) -> Result<SessionInfo, Error> {
+    Ok(app.sessions.describe(id)?)
+}
+
+/// Ends a session after its slot in flight.
+///
+/// # Errors
+/// It expired, or there is none.
+pub async fn close(app: &App, id: &str) -> Result<SessionInfo, Error> {
+    Ok(app.sessions.close(id).await?)
+}
+
+/// A page of open sessions in order of names, and the token of the next page.
+///
+/// # Errors
+/// A page size out of range.
+pub fn list(app: &App, size: u32, token: &str) -> Result<(Vec<SessionInfo>, Option<String>), Error> {
+    let (page, more) = app.sessions.list(token, page_size(size)?);
+    let next = page.last().filter(|_| more).map(|last| last.id.clone());
+    Ok((page, next))
+}
+
+/// The size of a page: 100 unless said otherwise.
+pub(super) fn page_size(size: u32) -> Result<usize, Invalid> {
+    in_range("page_size", size, 0..=1000)?;
+    Ok(if size == 0 { 100 } else { size as usize })
+}

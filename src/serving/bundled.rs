@@ -1,0 +1,6 @@
+//! Checkpoints that are part of the program, so that an empty data directory has something learned to serve.
+//!
+//! They are published into the store at start like any other checkpoint; publishing equal bytes twice changes nothing.
+
+/// Name and bytes (safetensors) of each bundled policy; the files live in `policies/`.
+pub const BUNDLED: &[(&str, &[u8])] = &[];

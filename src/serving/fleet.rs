@@ -1,0 +1,60 @@
+//! Who flies: the ids of a fleet in the one order that all slots of an episode share.
+
+use std::cmp::Ordering;
+
+use sha2::{Digest, Sha256};
+
+use crate::invalid::Invalid;
+
+/// Ids of UAVs and users in canonical order: shorter first, then bytewise, so that `uav-2` comes before `uav-10`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Fleet {
+    /// M ids.
+    pub uavs: Vec<String>,
+    /// N ids.
+    pub users: Vec<String>,
+}
+
+impl Fleet {
+    /// Longest id, in bytes.
+    pub const LONGEST_ID: usize = 128;
+
+    /// The canonical order of ids.
+    pub fn order(a: &str, b: &str) -> Ordering {
+        a.len().cmp(&b.len()).then_with(|| a.as_bytes().cmp(b.as_bytes()))
+    }
+
+    /// A fingerprint of the ids: equal fleets, equal fingerprints.
+    pub fn fingerprint(&self) -> [u8; 16] {
+        let mut hash = Sha256::new();
+        for ids in [&self.uavs, &self.users] {
+            hash.update((ids.len() as u64).to_le_bytes());
+            for id in ids {
+                hash.update((id.len() as u64).to_le_bytes());
+                hash.update(id);
+            }
+        }
+        let mut fingerprint = [0; 16];
+        fingerprint.copy_from_slice(&hash.finalize()[..16]);
+        fingerprint
+    }
+
+    /// Checks that `now` has the ids of `self`, and says which id is new or gone.
+    ///
+    /// # Errors
+    /// The ids differ.
+    pub fn check_same(&self, now: &Self) -> Result<(), Invalid> {
+        for (what, before, after) in [("UAVs", &self.uavs, &now.uavs), ("users", &self.users, &now.users)] {
+            if before == after {
+                continue;
+            }
+            let lacks = |ids: &[String], id: &String| ids.binary_search_by(|probe| Self::order(probe, id)).is_err();
+            let new = after.iter().find(|id| lacks(before, id)).map(|id| format!("{id:?} is new"));
+            let gone = before.iter().find(|id| lacks(after, id)).map(|id| format!("{id:?} is missing"));
+            let value: Vec<String> = new.into_iter().chain(gone).collect();
+            let expected = format!("the same {} {what} as in the episode's first slot", before.len());
+            return Err(Invalid::new(format!("ids of {what}"), value.join(", "), expected));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,112 @@
+//! Memory that callers keep: the bytes of `recurrent_state`, sealed so that a mistake is told apart from an answer.
+//!
+//! Layout (little endian): `QXRS`, format version (1 byte), policy digest (32), step (8), M (4), N (4), fingerprint of
+//! the ids (16), memory (4 each), first 8 bytes of the SHA-256 of all that. A checksum, not a signature: it finds
+//! accidents; whoever forges a state harms only the fleet that flies with it.
+
+use bytes::{BufMut, Bytes, BytesMut};
+use sha2::{Digest, Sha256};
+
+use super::Fleet;
+use crate::invalid::Invalid;
+
+const MAGIC: &[u8; 4] = b"QXRS";
+const FORMAT: u8 = 1;
+const HEADER: usize = 4 + 1 + 32 + 8 + 4 + 4 + 16;
+const CHECKSUM: usize = 8;
+
+/// The memory of a fleet between two slots.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HeldState {
+    /// Policy version that wrote it.
+    pub digest: [u8; 32],
+    /// The next step.
+    pub step: u64,
+    /// M.
+    pub uavs: u32,
+    /// N.
+    pub users: u32,
+    /// Fingerprint of the ids.
+    pub fleet: [u8; 16],
+    /// The policy's memory.
+    pub memory: Vec<f32>,
+}
+
+impl HeldState {
+    /// Seals the memory of `fleet` before `step`.
+    pub fn new(digest: [u8; 32], step: u64, fleet: &Fleet, memory: Vec<f32>) -> Self {
+        let (uavs, users) = (fleet.uavs.len() as u32, fleet.users.len() as u32);
+        Self { digest, step, uavs, users, fleet: fleet.fingerprint(), memory }
+    }
+
+    /// The bytes handed to the caller.
+    pub fn encode(&self) -> Bytes {
+        let mut bytes = BytesMut::with_capacity(HEADER + 4 * self.memory.len() + CHECKSUM);
+        bytes.put_slice(MAGIC);
+        bytes.put_u8(FORMAT);
+        bytes.put_slice(&self.digest);
+        bytes.put_u64_le(self.step);
+        bytes.put_u32_le(self.uavs);
+        bytes.put_u32_le(self.users);
+        bytes.put_slice(&self.fleet);
+        for &value in &self.memory {
+            bytes.put_f32_le(value);
+        }
+        let sum = Sha256::digest(&bytes);
+        bytes.put_slice(&sum[..CHECKSUM]);
+        bytes.freeze()
+    }
+
+    /// Reads bytes handed back by a caller.
+    ///
+    /// # Errors
+    /// They are not the unchanged bytes of an earlier answer.
+    pub fn decode(bytes: &[u8]) -> Result<Self, Invalid> {
+        let wrong = |value: String| {
+            let expected = "the unchanged recurrent_state of the previous answer, or nothing at slot 0";
+            Invalid::new("recurrent_state", value, expected)
+        };
+        let inside = bytes.len().checked_sub(HEADER + CHECKSUM);
+        if inside.is_none_or(|len| len % 4 != 0) || !bytes.starts_with(MAGIC) {
+            return Err(wrong(format!("{} bytes of another kind", bytes.len())));
+        }
+        let (body, sum) = bytes.split_at(bytes.len() - CHECKSUM);
+        if Sha256::digest(body)[..CHECKSUM] != *sum {
+            return Err(wrong(format!("{} bytes, damaged,", bytes.len())));
+        }
+        if body[4] != FORMAT {
+            return Err(wrong(format!("format {}", body[4])));
+        }
+        let array = |at: usize| -> [u8; 4] { body[at..at + 4].try_into().expect("four bytes") };
+        let (header, memory) = body.split_at(HEADER);
+        Ok(Self {
+            digest: header[5..37].try_into().expect("32 bytes"),
+            step: u64::from_le_bytes(header[37..45].try_into().expect("8 bytes")),
+            uavs: u32::from_le_bytes(array(45)),
+            users: u32::from_le_bytes(array(49)),
+            fleet: header[53..69].try_into().expect("16 bytes"),
+            memory: memory.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().expect("4 bytes"))).collect(),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn any_changed_or_missing_byte_is_found() {
+        let fleet = Fleet { uavs: vec!["a".into(), "b".into()], users: vec!["u".into()] };
+        let state = HeldState::new([7; 32], 3, &fleet, vec![0.5, -1.0, f32::NAN]);
+        let bytes = state.encode();
+        let back = HeldState::decode(&bytes).unwrap();
+        assert_eq!((back.step, back.uavs, back.users, back.fleet), (3, 2, 1, fleet.fingerprint()));
+        assert!(back.memory[2].is_nan());
+        for i in 0..bytes.len() {
+            let mut changed = bytes.to_vec();
+            changed[i] ^= 1;
+            assert!(HeldState::decode(&changed).is_err(), "byte {i}");
+            assert!(HeldState::decode(&bytes[..i]).is_err(), "length {i}");
+        }
+    }
+}

@@ -1,0 +1,25 @@
+//! Answering now: which policies there are, who flies with which memory, and the engine that computes headings.
+//!
+//! Knows neither wire formats nor SQL; `service` brings policies out of the store and puts answers together.
+
+mod bundled;
+mod clock;
+mod engine;
+mod error;
+mod fleet;
+mod memory;
+mod observation;
+mod reference;
+mod registry;
+mod sessions;
+
+pub use bundled::BUNDLED;
+pub use clock::Clock;
+pub use engine::{Engine, Outcome, Task, Timings};
+pub use error::Error;
+pub use fleet::Fleet;
+pub use memory::HeldState;
+pub use observation::{Graph, MAX_DETECTIONS, MAX_NODES, Observation, Seen, Sighting};
+pub use reference::{PolicyRef, PolicySpec, Which, check_name};
+pub use registry::{Kind, LoadedPolicy, Registry};
+pub use sessions::{Answered, Opened, Session, SessionInfo, Sessions, SessionsConfig, Turn};
