@@ -5,7 +5,7 @@
 //! | layer | owns |
 //! | --- | --- |
 //! | [`cli`] | the command line |
-//! | `server` | listeners, background work, shutdown |
+//! | [`server`], [`config`], [`telemetry`] | listeners, background work, shutdown; settings; logs and metrics |
 //! | [`api`] | gRPC, REST, wire formats, the table of errors |
 //! | [`service`] | one function per use case |
 //! | [`serving`], [`jobs`] | answering now; running work later |
@@ -20,13 +20,17 @@
 //! Read `env`, then `policy`, then `learner`; then `service` and what it calls.
 
 pub mod api;
+pub mod cli;
+pub mod config;
 pub mod env;
 pub mod invalid;
 pub mod learner;
 pub mod policy;
 pub mod recipe;
 pub mod rng;
+pub mod server;
 pub mod service;
 pub mod serving;
 pub mod store;
+pub mod telemetry;
 pub mod wire;

@@ -34,6 +34,7 @@ impl Observed {
         let seconds = self.begun.elapsed().as_secs_f64();
         tracing::debug!(method, code, seconds, "answered");
         metrics::histogram!("qedgix_request_seconds", "transport" => self.transport, "method" => method.clone()).record(seconds);
-        metrics::counter!("qedgix_requests_total", "transport" => self.transport, "method" => method, "code" => code).increment(1);
+        metrics::counter!("qedgix_requests_total", "transport" => self.transport, "method" => method, "code" => code)
+            .increment(1);
     }
 }

@@ -9,7 +9,7 @@ use super::{App, Error};
 use crate::invalid::Invalid;
 use crate::policy::Slot;
 use crate::serving::{
-    Answered, Fleet, HeldState, LoadedPolicy, Observation, PolicySpec, Session, Task, Timings, Turn, Which,
+    Answered, Fleet, HeldState, LoadedPolicy, Observation, Outcome, PolicySpec, Session, Task, Timings, Turn, Which,
 };
 
 /// Observations of more nodes are prepared away from the threads that serve connections.
@@ -104,7 +104,7 @@ async fn in_session(app: &App, session: &Session, request: Request, deadline: Op
         Turn::Repeat(answered) => answered,
         Turn::Next(mut turn) => {
             let memory = std::mem::take(&mut turn.memory);
-            let outcome = app.engine.run(Task { policy: policy.clone(), slot, step: turn.step, memory }, deadline).await?;
+            let outcome = compute(app, Task { policy: policy.clone(), slot, step: turn.step, memory }, deadline).await?;
             turn.commit(outcome)
         }
     };
@@ -137,7 +137,7 @@ async fn with_held_state(app: &App, state: &[u8], request: Request, deadline: Op
             memory
         }
     };
-    let outcome = app.engine.run(Task { policy: policy.clone(), slot, step, memory }, deadline).await?;
+    let outcome = compute(app, Task { policy: policy.clone(), slot, step, memory }, deadline).await?;
     let next = HeldState::new(policy.reference.digest, step.saturating_add(1), &fleet, outcome.memory);
     let (headings, q_values, timings) = (outcome.headings, outcome.q_values, outcome.timings);
     Ok(Answer { policy, uavs: fleet.uavs, order, step, headings, q_values, state: Some(next.encode()), timings })
@@ -189,4 +189,11 @@ async fn slot_of(observation: Observation, policy: &Arc<LoadedPolicy>) -> Result
     let policy = policy.clone();
     let prepared = tokio::task::spawn_blocking(move || observation.into_slot(&*policy.policy));
     Ok(prepared.await.map_err(Error::internal)??)
+}
+
+async fn compute(app: &App, task: Task, deadline: Option<Instant>) -> Result<Outcome, Error> {
+    let outcome = app.engine.run(task, deadline).await?;
+    metrics::histogram!("qedgix_act_queue_seconds").record(outcome.timings.queue.as_secs_f64());
+    metrics::histogram!("qedgix_act_compute_seconds").record(outcome.timings.compute.as_secs_f64());
+    Ok(outcome)
 }

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 pub use error::Error;
 
-use crate::serving::{Engine, Registry, Sessions};
+use crate::serving::{Clock, Engine, Registry, Sessions};
 use crate::store::Store;
 
 /// What use cases work with; shared by all connections behind an `Arc`.
@@ -22,6 +22,8 @@ pub struct App {
     pub sessions: Sessions,
     /// Where headings are computed.
     pub engine: Engine,
+    /// The time of day.
+    pub clock: Clock,
     /// Whether the server is shutting down.
     pub draining: Draining,
 }

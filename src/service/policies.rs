@@ -2,9 +2,12 @@
 
 use std::sync::Arc;
 
+use sha2::{Digest, Sha256};
+
 use super::sessions::page_size;
 use super::{App, Error};
-use crate::serving::{LoadedPolicy, PolicySpec};
+use crate::policy::baselines::{self, World};
+use crate::serving::{Kind, LoadedPolicy, PolicyRef, PolicySpec};
 
 /// A policy version with what surrounds it.
 #[derive(Clone, Debug)]
@@ -38,4 +41,29 @@ pub fn get(app: &App, spec: &PolicySpec) -> Result<Described, Error> {
 fn describe(app: &App, policy: Arc<LoadedPolicy>) -> Described {
     let (aliases, versions) = app.registry.neighbours(&policy.reference);
     Described { policy, aliases, versions }
+}
+
+/// Fills the registry: the baselines.
+///
+/// # Errors
+/// The store cannot be read.
+pub async fn load(app: &App) -> Result<(), Error> {
+    let world = World::default();
+    for baseline in &baselines::LIST {
+        let Some(policy) = baselines::by_name(baseline.name, world) else { continue };
+        // The digest says what a checkpoint's does: equal digests, equal answers.
+        let digest = Sha256::digest(format!("baseline {} {world:?}", baseline.name)).into();
+        app.registry.insert(LoadedPolicy {
+            reference: PolicyRef { name: baseline.name.to_owned(), version: 1, digest },
+            policy,
+            kind: Kind::Baseline,
+            description: baseline.text.to_owned(),
+            uavs: None,
+            users: None,
+            config: serde_json::Value::Null,
+            metrics: serde_json::Value::Null,
+            created_at: app.clock.now(),
+        });
+    }
+    Ok(())
 }

@@ -125,7 +125,8 @@ impl Store {
     /// # Errors
     /// The database fails.
     pub async fn policy_aliases(&self) -> Result<Vec<PolicyAlias>, Error> {
-        let rows = sqlx::query("SELECT name, alias, version FROM policy_aliases ORDER BY name, alias").fetch_all(&self.read).await?;
+        let rows =
+            sqlx::query("SELECT name, alias, version FROM policy_aliases ORDER BY name, alias").fetch_all(&self.read).await?;
         let read = |row: &SqliteRow| -> Result<PolicyAlias, Error> {
             Ok(PolicyAlias { name: row.try_get(0)?, alias: row.try_get(1)?, version: row.try_get::<i64, _>(2)? as u64 })
         };

@@ -87,7 +87,11 @@ impl Builder {
         for (i, detection) in sent.detections.into_iter().enumerate() {
             let field = |name: &str| format!("{}.detections[{i}].{name}", at());
             let Some(&target) = by_id.get(detection.target_id.as_str()) else {
-                return Err(Invalid::new(field("target_id"), format!("{:?}", detection.target_id), "the id of a node of this graph"));
+                return Err(Invalid::new(
+                    field("target_id"),
+                    format!("{:?}", detection.target_id),
+                    "the id of a node of this graph",
+                ));
             };
             if target as usize == node {
                 return Err(Invalid::new(field("target_id"), format!("{:?}", detection.target_id), "another node than itself"));

@@ -95,10 +95,7 @@ struct User {
     aoi: f64,
 }
 
-pub(super) async fn act(
-    State(app): State<Arc<App>>,
-    extract::Json(body): extract::Json<Body>,
-) -> Result<Json<ActReply>, Error> {
+pub(super) async fn act(State(app): State<Arc<App>>, extract::Json(body): extract::Json<Body>) -> Result<Json<ActReply>, Error> {
     let values = body.return_q_values;
     let request = service::Request::try_from(message(body)?)?;
     let answer = service::act(&app, request, None).await?;

@@ -154,7 +154,10 @@ impl Sessions {
             table.bury(id.to_owned(), self.config.max);
         }
         let idle = self.config.ttl.as_secs_f64();
-        Err(Error::precondition("session_expired", format!("session {id:?} expired after {idle} s without a request; open a new one")))
+        Err(Error::precondition(
+            "session_expired",
+            format!("session {id:?} expired after {idle} s without a request; open a new one"),
+        ))
     }
 
     /// What a caller is told of session `id`; asking keeps it alive.

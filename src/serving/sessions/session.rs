@@ -205,7 +205,8 @@ impl State {
     fn judge_run(&self, id: &str, run_id: Option<&str>) -> Result<Option<String>, Error> {
         let Some(run_id) = run_id.filter(|run_id| self.run_id.as_deref() != Some(run_id)) else { return Ok(None) };
         if self.former.contains(&hash(&run_id)) {
-            let message = format!("run {run_id:?} of session {id:?} was replaced by run {:?}", self.run_id.as_deref().unwrap_or(""));
+            let message =
+                format!("run {run_id:?} of session {id:?} was replaced by run {:?}", self.run_id.as_deref().unwrap_or(""));
             return Err(Error::precondition("run_fenced", message));
         }
         Ok(Some(run_id.to_owned()))

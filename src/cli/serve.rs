@@ -1,0 +1,139 @@
+//! `qedgix serve`.
+
+use std::net::{SocketAddr, ToSocketAddrs};
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::{Args, ValueEnum};
+use tokio::signal::unix::{SignalKind, signal};
+
+use crate::config::Config;
+use crate::server::{self, DataDir, Listeners};
+use crate::serving::Clock;
+use crate::telemetry;
+
+/// Flags of `serve`.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  qedgix serve
+  qedgix serve --grpc-addr 127.0.0.1:0 --http-addr 127.0.0.1:0 --data-dir /var/lib/qedgix   # free ports, see endpoints.json
+  QEDGIX_CPU_BUDGET=2 QEDGIX_LOG=debug qedgix serve --log-format json")]
+pub struct ServeArgs {
+    /// Where gRPC listens; port 0 picks a free one
+    #[arg(long, env = "QEDGIX_GRPC_ADDR", default_value = "127.0.0.1:50051", value_parser = address, value_name = "HOST:PORT")]
+    grpc_addr: SocketAddr,
+    /// Where REST listens; port 0 picks a free one
+    #[arg(long, env = "QEDGIX_HTTP_ADDR", default_value = "127.0.0.1:8080", value_parser = address, value_name = "HOST:PORT")]
+    http_addr: SocketAddr,
+    /// Where everything durable is; created if need be
+    #[arg(long, env = "QEDGIX_DATA_DIR", default_value = "./qedgix-data", value_name = "DIR")]
+    data_dir: PathBuf,
+    /// Cores that training jobs may use together [default: all]
+    #[arg(long, env = "QEDGIX_CPU_BUDGET", value_name = "CORES")]
+    cpu_budget: Option<usize>,
+    /// A session idle for longer expires: seconds, or 90s, 10m, 2h
+    #[arg(long, env = "QEDGIX_SESSION_TTL", default_value = "10m", value_parser = duration)]
+    session_ttl: Duration,
+    /// Most open sessions
+    #[arg(long, env = "QEDGIX_MAX_SESSIONS", default_value_t = 100_000)]
+    max_sessions: usize,
+    /// Largest gRPC message and HTTP body, in bytes
+    #[arg(long, env = "QEDGIX_MAX_MESSAGE_SIZE", default_value_t = 4 << 20, value_name = "BYTES")]
+    max_message_size: usize,
+    /// Threads that compute headings [default: all cores, at most 4]
+    #[arg(long, env = "QEDGIX_ENGINE_THREADS", value_name = "THREADS")]
+    engine_threads: Option<usize>,
+    /// Fleets that may wait to be computed; more are refused
+    #[arg(long, env = "QEDGIX_ENGINE_QUEUE", default_value_t = 4096, value_name = "FLEETS")]
+    engine_queue: usize,
+    /// Time that requests in flight are given when the server stops
+    #[arg(long, env = "QEDGIX_DRAIN_TIMEOUT", default_value = "20s", value_parser = duration)]
+    drain_timeout: Duration,
+    /// Listen on addresses that others can reach, although nobody has to say who they are
+    #[arg(long, env = "QEDGIX_INSECURE")]
+    insecure: bool,
+    /// How logs are written to standard error
+    #[arg(long, env = "QEDGIX_LOG_FORMAT", default_value = "text", value_enum)]
+    log_format: LogFormat,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum LogFormat {
+    Text,
+    Json,
+}
+
+/// Serves until ctrl-c or SIGTERM.
+///
+/// # Errors
+/// A setting that cannot be used, an address or data directory that is taken, a database that cannot be read.
+pub async fn run(args: ServeArgs) -> anyhow::Result<()> {
+    telemetry::logs(matches!(args.log_format, LogFormat::Json));
+    let config = args.config();
+    config.validate()?;
+    let data = DataDir::take(&config.data_dir)?;
+    let listeners = Listeners::bind(&config).await?;
+    // Signals are caught before anybody is told that the server is there.
+    let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    let app = server::open(&config, &data, Clock::system()).await?;
+    let endpoints = listeners.endpoints()?;
+    println!("qedgix {}", env!("CARGO_PKG_VERSION"));
+    println!("gRPC  {}", endpoints.grpc);
+    println!("REST  http://{}", endpoints.http);
+    println!("data  {}", config.data_dir.display());
+    let shutdown = async move {
+        tokio::select! {
+            _ = interrupt.recv() => {}
+            _ = terminate.recv() => {}
+        }
+    };
+    Ok(server::run(&config, &data, app, listeners, shutdown).await?)
+}
+
+impl ServeArgs {
+    fn config(&self) -> Config {
+        let default = Config::new(&self.data_dir);
+        Config {
+            grpc_addr: self.grpc_addr,
+            http_addr: self.http_addr,
+            cpu_budget: self.cpu_budget.unwrap_or(default.cpu_budget),
+            session_ttl: self.session_ttl,
+            max_sessions: self.max_sessions,
+            max_message_size: self.max_message_size,
+            engine_threads: self.engine_threads.unwrap_or(default.engine_threads),
+            engine_queue: self.engine_queue,
+            drain_timeout: self.drain_timeout,
+            insecure: self.insecure,
+            ..default
+        }
+    }
+}
+
+fn address(text: &str) -> Result<SocketAddr, String> {
+    let mut found = text.to_socket_addrs().map_err(|e| format!("{e}; expected HOST:PORT, such as 127.0.0.1:0"))?;
+    found.next().ok_or_else(|| "the host has no address".to_owned())
+}
+
+fn duration(text: &str) -> Result<Duration, String> {
+    let seconds = text.parse::<f64>().ok().and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
+    let friendly = || text.parse::<jiff::SignedDuration>().ok().and_then(|duration| Duration::try_from(duration).ok());
+    seconds.or_else(friendly).ok_or_else(|| "expected seconds, or a number with a unit: 500ms, 90s, 10m, 2h".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn durations_and_addresses_as_people_write_them() {
+        assert_eq!(duration("90"), Ok(Duration::from_secs(90)));
+        assert_eq!(duration("0.5"), Ok(Duration::from_millis(500)));
+        assert_eq!(duration("10m"), Ok(Duration::from_secs(600)));
+        assert_eq!(duration("500ms"), Ok(Duration::from_millis(500)));
+        for wrong in ["", "-1", "-5s", "soon", "nan", "1e300"] {
+            assert!(duration(wrong).is_err(), "{wrong}");
+        }
+        assert_eq!(address("127.0.0.1:0").unwrap().port(), 0);
+        assert!(address("127.0.0.1").is_err());
+    }
+}

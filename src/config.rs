@@ -1,0 +1,74 @@
+//! A server's settings, checked once.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use crate::invalid::{Invalid, in_range};
+
+/// Everything that a server is told when it starts.
+#[derive(Clone, Debug)]
+pub struct Config {
+    /// Where gRPC listens; port 0 picks a free one.
+    pub grpc_addr: SocketAddr,
+    /// Where REST listens; port 0 picks a free one.
+    pub http_addr: SocketAddr,
+    /// Where everything durable is; created if need be.
+    pub data_dir: PathBuf,
+    /// Cores that training may use together.
+    pub cpu_budget: usize,
+    /// A session idle for longer expires.
+    pub session_ttl: Duration,
+    /// Most open sessions.
+    pub max_sessions: usize,
+    /// Largest gRPC message and HTTP body, in bytes.
+    pub max_message_size: usize,
+    /// Threads that compute headings.
+    pub engine_threads: usize,
+    /// Fleets that may wait for the engine.
+    pub engine_queue: usize,
+    /// Time that requests in flight are given when the server stops.
+    pub drain_timeout: Duration,
+    /// Whether it may listen where others can reach it, although nobody has to say who they are.
+    pub insecure: bool,
+}
+
+impl Config {
+    /// The defaults, with everything durable in `data_dir`.
+    pub fn new(data_dir: impl Into<PathBuf>) -> Self {
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        Self {
+            grpc_addr: SocketAddr::from(([127, 0, 0, 1], 50051)),
+            http_addr: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            data_dir: data_dir.into(),
+            cpu_budget: cores,
+            session_ttl: Duration::from_secs(600),
+            max_sessions: 100_000,
+            max_message_size: 4 << 20,
+            engine_threads: cores.min(4),
+            engine_queue: 4096,
+            drain_timeout: Duration::from_secs(20),
+            insecure: false,
+        }
+    }
+
+    /// Checks every setting.
+    ///
+    /// # Errors
+    /// The first one that cannot be used.
+    pub fn validate(&self) -> Result<(), Invalid> {
+        in_range("--cpu-budget", self.cpu_budget, 1..=4096)?;
+        in_range("--session-ttl (seconds)", self.session_ttl.as_secs_f64(), 0.001..=1e9)?;
+        in_range("--max-sessions", self.max_sessions, 1..=100_000_000)?;
+        in_range("--max-message-size", self.max_message_size, 1024..=1 << 30)?;
+        in_range("--engine-threads", self.engine_threads, 1..=1024)?;
+        in_range("--engine-queue", self.engine_queue, 1..=10_000_000)?;
+        for (flag, addr) in [("--grpc-addr", self.grpc_addr), ("--http-addr", self.http_addr)] {
+            if !addr.ip().is_loopback() && !self.insecure {
+                let expected = "a loopback address such as 127.0.0.1, or --insecure: whoever reaches this server may use it";
+                return Err(Invalid::new(flag, addr, expected));
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,240 @@
+//! Listeners, background work, shutdown: one process on one data directory.
+//!
+//! Shutdown in order: readiness goes off and new work is refused; requests in flight are answered; then the listeners are
+//! gone and the data directory is free for another server.
+
+use std::fs::{File, TryLockError};
+use std::future::Future;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::serve::ListenerExt;
+use tokio::net::TcpListener;
+use tokio_util::sync::CancellationToken;
+use tonic::transport::server::TcpIncoming;
+use tonic_health::ServingStatus;
+use tonic_health::server::{HealthReporter, HealthService};
+
+use crate::api::{grpc, rest};
+use crate::config::Config;
+use crate::invalid::Invalid;
+use crate::service::{App, policies};
+use crate::serving::{Clock, Engine, Registry, Sessions, SessionsConfig};
+use crate::store::{self, Store};
+use crate::telemetry;
+
+/// Name of the file in the data directory that tells where the server listens.
+pub const ENDPOINTS: &str = "endpoints.json";
+
+/// Why a server does not start or stopped.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A setting that cannot be used.
+    #[error(transparent)]
+    Config(#[from] Invalid),
+    /// A file of the data directory.
+    #[error("{path}: {cause}")]
+    File {
+        /// Which.
+        path: PathBuf,
+        /// What happened.
+        cause: std::io::Error,
+    },
+    /// Another server works on the data directory.
+    #[error("{0} is in use by another qedgix server; stop it, or choose another --data-dir")]
+    InUse(PathBuf),
+    /// The address is taken or not this machine's.
+    #[error("cannot listen on {addr}: {cause}")]
+    Bind {
+        /// Where.
+        addr: SocketAddr,
+        /// What happened.
+        cause: std::io::Error,
+    },
+    /// The database.
+    #[error(transparent)]
+    Store(#[from] store::Error),
+    /// Policies could not be loaded.
+    #[error("loading policies: {0}")]
+    Policies(#[source] crate::service::Error),
+    /// The system refuses a thread.
+    #[error("starting the engine: {0}")]
+    Engine(#[source] std::io::Error),
+    /// The HTTP listener failed.
+    #[error("REST: {0}")]
+    Rest(#[source] std::io::Error),
+    /// The gRPC listener failed.
+    #[error("gRPC: {0}")]
+    Grpc(#[from] tonic::transport::Error),
+}
+
+/// Where a server listens.
+#[derive(Debug)]
+pub struct Listeners {
+    /// gRPC.
+    pub grpc: TcpListener,
+    /// REST.
+    pub http: TcpListener,
+}
+
+/// The addresses of [`Listeners`], ports chosen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+pub struct Endpoints {
+    /// gRPC.
+    pub grpc: SocketAddr,
+    /// REST.
+    pub http: SocketAddr,
+}
+
+impl Listeners {
+    /// Listens where `config` says.
+    ///
+    /// # Errors
+    /// An address that is taken or not this machine's.
+    pub async fn bind(config: &Config) -> Result<Self, Error> {
+        let bind = async |addr| TcpListener::bind(addr).await.map_err(|cause| Error::Bind { addr, cause });
+        Ok(Self { grpc: bind(config.grpc_addr).await?, http: bind(config.http_addr).await? })
+    }
+
+    /// Where they listen.
+    ///
+    /// # Errors
+    /// The system does not know.
+    pub fn endpoints(&self) -> std::io::Result<Endpoints> {
+        Ok(Endpoints { grpc: self.grpc.local_addr()?, http: self.http.local_addr()? })
+    }
+}
+
+/// A data directory that this process works on until it is dropped.
+#[derive(Debug)]
+pub struct DataDir {
+    path: PathBuf,
+    /// Held for its lock, which the system releases however the process ends.
+    _lock: File,
+}
+
+impl DataDir {
+    /// Takes the directory, which is created if need be.
+    ///
+    /// # Errors
+    /// Another server has it, or it cannot be written.
+    pub fn take(path: &Path) -> Result<Self, Error> {
+        let failed = |path: &Path| {
+            let path = path.to_owned();
+            move |cause| Error::File { path, cause }
+        };
+        std::fs::create_dir_all(path).map_err(failed(path))?;
+        let file = path.join("lock");
+        let lock = File::options().create(true).truncate(false).write(true).open(&file).map_err(failed(&file))?;
+        match lock.try_lock() {
+            Ok(()) => Ok(Self { path: path.to_owned(), _lock: lock }),
+            Err(TryLockError::WouldBlock) => Err(Error::InUse(path.to_owned())),
+            Err(TryLockError::Error(cause)) => Err(failed(&file)(cause)),
+        }
+    }
+
+    /// Writes where the server listens, whole or not at all.
+    fn publish(&self, endpoints: Endpoints) -> Result<(), Error> {
+        let (path, part) = (self.path.join(ENDPOINTS), self.path.join(".endpoints.json.part"));
+        let text = serde_json::to_string(&endpoints).expect("addresses are plain data") + "\n";
+        let written = std::fs::write(&part, text).and_then(|()| std::fs::rename(&part, &path));
+        written.map_err(|cause| Error::File { path, cause })
+    }
+
+    fn withdraw(&self) {
+        // Whoever reads it afterwards finds nobody listening either way.
+        let _ = std::fs::remove_file(self.path.join(ENDPOINTS));
+    }
+}
+
+/// Opens everything that use cases work with.
+///
+/// # Errors
+/// The database or a policy in it cannot be read.
+pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<App>, Error> {
+    config.validate()?;
+    let sessions = SessionsConfig { ttl: config.session_ttl, max: config.max_sessions };
+    let app = App {
+        store: Store::open(&data.path).await?,
+        registry: Registry::default(),
+        sessions: Sessions::new(sessions, clock.clone()),
+        engine: Engine::start(config.engine_threads, config.engine_queue).map_err(Error::Engine)?,
+        clock,
+        draining: Default::default(),
+    };
+    policies::load(&app).await.map_err(Error::Policies)?;
+    Ok(Arc::new(app))
+}
+
+/// Serves until `shutdown` resolves, then drains.
+///
+/// # Errors
+/// A listener fails.
+pub async fn run(
+    config: &Config,
+    data: &DataDir,
+    app: Arc<App>,
+    listeners: Listeners,
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), Error> {
+    let endpoints = listeners.endpoints().map_err(Error::Rest)?;
+    let metrics = telemetry::metrics();
+    let health = HealthReporter::new();
+    let report = async |status| {
+        for service in ["", grpc::SERVICES[0]].iter().chain(&grpc::SERVICES[1..]) {
+            health.set_service_status(*service, status).await;
+        }
+    };
+    report(ServingStatus::Serving).await;
+    let stop = CancellationToken::new();
+
+    let health_server = tonic_health::pb::health_server::HealthServer::new(HealthService::from_health_reporter(health.clone()));
+    let serve_grpc = tonic::transport::Server::builder()
+        .http2_keepalive_interval(Some(Duration::from_secs(30)))
+        .max_concurrent_streams(1024)
+        .add_routes(grpc::routes(&app, health_server, config.max_message_size))
+        .serve_with_incoming_shutdown(TcpIncoming::from(listeners.grpc).with_nodelay(Some(true)), stop.clone().cancelled_owned());
+    let http = listeners.http.tap_io(|stream| {
+        // Only latency is lost where it cannot be set.
+        let _ = stream.set_nodelay(true);
+    });
+    let router = rest::router(app.clone(), metrics.clone(), config.max_message_size);
+    let serve_rest = axum::serve(http, router).with_graceful_shutdown(stop.clone().cancelled_owned());
+
+    let housekeeping = tokio::spawn(housekeeping(app.clone(), metrics, config.session_ttl));
+    data.publish(endpoints)?;
+    tracing::info!(grpc = %endpoints.grpc, http = %endpoints.http, policies = app.registry.len(), "serving");
+
+    let drain = async {
+        shutdown.await;
+        tracing::info!("draining");
+        app.draining.begin();
+        report(ServingStatus::NotServing).await;
+        stop.cancel();
+        tokio::time::sleep(config.drain_timeout).await;
+        tracing::warn!(after = ?config.drain_timeout, "gave up on requests in flight");
+    };
+    let serve = async {
+        tokio::try_join!(async { serve_grpc.await.map_err(Error::from) }, async { serve_rest.await.map_err(Error::Rest) })
+    };
+    let served = tokio::select! {
+        served = serve => served.map(|_| ()),
+        () = drain => Ok(()),
+    };
+    housekeeping.abort();
+    data.withdraw();
+    tracing::info!("stopped");
+    served
+}
+
+/// What has to be done now and then, however quiet it is.
+async fn housekeeping(app: Arc<App>, metrics: metrics_exporter_prometheus::PrometheusHandle, ttl: Duration) {
+    let pause = (ttl / 4).clamp(Duration::from_secs(1), Duration::from_secs(30));
+    loop {
+        tokio::time::sleep(pause).await;
+        app.sessions.sweep();
+        metrics.run_upkeep();
+    }
+}
