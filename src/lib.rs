@@ -25,6 +25,7 @@ pub mod config;
 pub mod env;
 pub mod invalid;
 pub mod learner;
+pub mod nn;
 pub mod policy;
 pub mod recipe;
 pub mod rng;

@@ -53,7 +53,7 @@ pub enum Identity {
 /// Width of a `token` identity.
 pub const TOKEN: usize = 4;
 /// H, the hidden width.
-pub const HIDDEN: usize = 64;
+pub const HIDDEN: usize = crate::nn::HIDDEN;
 
 /// Architecture of the agents, shared by all UAVs (spec 3).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

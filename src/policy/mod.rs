@@ -1,10 +1,22 @@
 //! What a UAV knows and decides: observations, agents, mixers, baselines, and the trait that all policies share.
 
+mod actor;
+mod agent;
 pub mod baselines;
 mod config;
+mod features;
+mod geometry;
+mod learned;
+pub mod mixer;
 mod slot;
+mod vision;
 
+pub use actor::{Actor, StepInput};
+pub use agent::{Agent, AgentCache, Dims};
 pub use config::{AgentConfig, Aggregation, Gnn, HIDDEN, Identity, Observation, TOKEN};
+pub use features::{Inputs, NO_ACTION, SetEncoder, flat_observation, flat_state};
+pub use geometry::{Fleet, Geometry, GeometryConfig, View};
+pub use learned::Learned;
 pub use slot::{Detection, Slot};
 
 use crate::invalid::Invalid;

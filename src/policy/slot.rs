@@ -1,5 +1,6 @@
 //! One slot of one fleet as its nodes see it (spec 2): who detects whom, where, and how old its data is.
 
+use super::vision::Vision;
 use crate::env::Point;
 
 /// Node `target` seen at `rel` = target position - own position.
@@ -12,7 +13,7 @@ pub struct Detection {
 }
 
 /// The sparse graph of one slot. Nodes are UAVs 0..M, then users M..M+N. A node is never in its own list.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default)]
 pub struct Slot {
     uavs: usize,
     users: usize,
@@ -22,6 +23,21 @@ pub struct Slot {
     aoi: Vec<f32>,
     uav_positions: Option<Vec<Point>>,
     user_positions: Option<Vec<Point>>,
+    /// Scratch of `set_scene`.
+    points: Vec<Point>,
+    vision: Vision,
+}
+
+impl PartialEq for Slot {
+    fn eq(&self, other: &Self) -> bool {
+        let parts = |s: &Self| (s.uavs, s.users);
+        parts(self) == parts(other)
+            && self.offsets == other.offsets
+            && self.detections == other.detections
+            && self.aoi == other.aoi
+            && self.uav_positions == other.uav_positions
+            && self.user_positions == other.user_positions
+    }
 }
 
 impl Slot {
@@ -52,7 +68,7 @@ impl Slot {
             flat.extend_from_slice(list);
             offsets.push(flat.len() as u32);
         }
-        Self { uavs, users, offsets, detections: flat, aoi, uav_positions, user_positions: None }
+        Self { uavs, users, offsets, detections: flat, aoi, uav_positions, ..Self::default() }
     }
 
     /// Rebuilds this slot from a scene, keeping its allocations (see [`Slot::from_scene`]).
@@ -74,19 +90,10 @@ impl Slot {
         self.offsets.clear();
         self.offsets.push(0);
         self.detections.clear();
-        let at = |i: usize| if i < uavs.len() { uavs[i] } else { users[i - uavs.len()] };
-        let nodes = uavs.len() + users.len();
-        for i in 0..nodes {
-            let from = at(i);
-            for j in (0..nodes).filter(|&j| j != i) {
-                let to = at(j);
-                let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
-                if dx * dx + dy * dy <= range * range {
-                    self.detections.push(Detection { target: j as u32, rel: [dx as f32, dy as f32] });
-                }
-            }
-            self.offsets.push(self.detections.len() as u32);
-        }
+        self.points.clear();
+        self.points.extend_from_slice(uavs);
+        self.points.extend_from_slice(users);
+        self.vision.look(&self.points, self.points.len(), range, &mut self.offsets, &mut self.detections);
     }
 
     /// M.

@@ -1,0 +1,327 @@
+//! The loss of an update and its gradient (spec 5): double Q-learning with a target network and TD(lambda).
+//!
+//!     m_k = target_mixer(Q_target(argmax_a Q(o_k, a)), s_k)
+//!     G_K = m_K,  G_k = r_k + gamma (lambda G_{k+1} + (1 - lambda) m_{k+1})
+//!     loss = mean over episodes, slots and joint values of (Q_tot - G)^2 / 2
+//!
+//! A batch is split into chunks of episodes whose number depends on sizes only. Each chunk's gradient is its own and they
+//! are summed in order, so the result has the same bits whatever the number of threads.
+
+use std::sync::{Mutex, PoisonError};
+
+use rayon::prelude::*;
+
+use super::episodes::Episodes;
+use crate::nn::{Batch, Layout, Real, Weights, norm_squared};
+use crate::policy::mixer::{Mixer, MixerCache, Mixing};
+use crate::policy::{Agent, AgentCache, AgentConfig, Dims, Geometry, Inputs, NO_ACTION, TOKEN, flat_state};
+
+/// UAV rows per slot that a chunk aims at: enough for a product to be efficient, few enough for the caches.
+const ROWS: usize = 24;
+/// Parameters reduced together.
+const BLOCK: usize = 4096;
+
+/// Discounting.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Returns {
+    /// gamma.
+    pub gamma: f64,
+    /// lambda.
+    pub lambda: f64,
+}
+
+/// What a batch says about the parameters.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Figures {
+    /// The loss.
+    pub loss: f64,
+    /// L2 norm of the gradient.
+    pub grad_norm: f64,
+    /// Mean Q_tot of the actions taken.
+    pub q_tot: f64,
+}
+
+/// Everything an update computes on its way, in the order (episode, slot, ...): for tests and curious people.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Trace<T> {
+    /// (B, K+1, M, A) Q-values of the online network.
+    pub q: Vec<T>,
+    /// (B, K, W) joint values of the actions taken; W is 1, or M when nothing is mixed.
+    pub q_tot: Vec<T>,
+    /// (B, K, W) targets.
+    pub target: Vec<T>,
+}
+
+/// The networks and the buffers of an update. Parameters belong to the caller.
+#[derive(Debug)]
+pub struct Objective<T: Real> {
+    agent: Agent,
+    mixer: Mixer,
+    layout: Layout,
+    returns: Returns,
+    /// Online and target network, see [`Weights`].
+    turned: [Vec<T>; 2],
+    chunks: Vec<Chunk<T>>,
+    workspaces: Vec<Mutex<Workspace<T>>>,
+    gradient: Vec<T>,
+    norms: Vec<f64>,
+}
+
+/// What a chunk of episodes contributes.
+#[derive(Debug)]
+struct Chunk<T> {
+    grads: Vec<T>,
+    loss: f64,
+    q_tot: f64,
+    trace: Trace<T>,
+}
+
+/// Buffers of one thread.
+#[derive(Debug, Default)]
+struct Workspace<T: Real> {
+    geometry: Geometry,
+    last: Vec<u8>,
+    token: Vec<f32>,
+    position: Vec<f32>,
+    states: Batch<T>,
+    online: AgentCache<T>,
+    target: AgentCache<T>,
+    online_mixer: MixerCache<T>,
+    target_mixer: MixerCache<T>,
+    chosen: Batch<T>,
+    best: Batch<T>,
+    total: Batch<T>,
+    target_total: Batch<T>,
+    goal: Batch<T>,
+    d_chosen: Batch<T>,
+    dq: Batch<T>,
+}
+
+impl<T: Real> Objective<T> {
+    /// Networks for `config`; `threads` is how many threads will work at most.
+    pub fn new(config: AgentConfig, dims: Dims, mixing: Mixing, returns: Returns, threads: usize) -> Self {
+        let agent = Agent::new(config, dims);
+        let mut layout = agent.layout().clone();
+        let mixer = Mixer::new(mixing, &dims, &mut layout);
+        let len = layout.len();
+        Self {
+            agent,
+            mixer,
+            layout,
+            returns,
+            turned: [vec![T::ZERO; len], vec![T::ZERO; len]],
+            chunks: Vec::new(),
+            workspaces: (0..threads.max(1)).map(|_| Mutex::default()).collect(),
+            gradient: vec![T::ZERO; len],
+            norms: vec![0.0; len.div_ceil(BLOCK)],
+        }
+    }
+
+    /// `agent.*`, then `mixer.*`.
+    pub fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// The agents.
+    pub fn agent(&self) -> &Agent {
+        &self.agent
+    }
+
+    /// The gradient of the last batch, before clipping.
+    pub fn gradient(&self) -> &[T] {
+        &self.gradient
+    }
+
+    /// Computes the loss of a batch and its gradient with respect to `online`. Runs on the current rayon pool.
+    ///
+    /// # Panics
+    /// When the episodes' sizes are not those of the networks, or there are none.
+    pub fn evaluate(&mut self, online: &[T], target: &[T], episodes: &Episodes, trace: Option<&mut Trace<T>>) -> Figures {
+        let dims = *self.agent.dims();
+        assert!(episodes.len > 0, "a batch of at least one episode");
+        assert_eq!((episodes.uavs, episodes.users, episodes.slots), (dims.uavs, dims.users, dims.slots), "episodes of M, N, K");
+        let [turned_online, turned_target] = &mut self.turned;
+        for (flat, turned) in [(online, &mut *turned_online), (target, &mut *turned_target)] {
+            self.agent.prepare(flat, turned);
+            self.mixer.prepare(flat, turned);
+        }
+        let per_chunk = (ROWS / dims.uavs).max(1);
+        let count = episodes.len.div_ceil(per_chunk);
+        let len = self.layout.len();
+        let empty = || Chunk { grads: vec![T::ZERO; len], loss: 0.0, q_tot: 0.0, trace: Trace::default() };
+        if self.chunks.len() < count {
+            self.chunks.resize_with(count, empty);
+        }
+        let pass = Pass {
+            agent: &self.agent,
+            mixer: &self.mixer,
+            online: Weights { flat: online, turned: turned_online },
+            target: Weights { flat: target, turned: turned_target },
+            returns: self.returns,
+            episodes,
+            traced: trace.is_some(),
+        };
+        let workspaces = &self.workspaces;
+        self.chunks[..count].par_iter_mut().with_max_len(1).enumerate().for_each(|(i, chunk)| {
+            let thread = rayon::current_thread_index().unwrap_or(0) % workspaces.len();
+            // A poisoned workspace is as good as any: every buffer is written before it is read.
+            let mut workspace = workspaces[thread].lock().unwrap_or_else(PoisonError::into_inner);
+            let first = i * per_chunk;
+            pass.run(first..(first + per_chunk).min(episodes.len), &mut workspace, chunk);
+        });
+        let chunks = &self.chunks[..count];
+        self.gradient.par_chunks_mut(BLOCK).zip(&mut self.norms).enumerate().for_each(|(i, (sum, norm))| {
+            sum.fill(T::ZERO);
+            for chunk in chunks {
+                sum.iter_mut().zip(&chunk.grads[i * BLOCK..]).for_each(|(s, &g)| *s += g);
+            }
+            *norm = norm_squared(sum);
+        });
+        if let Some(trace) = trace {
+            let join = |part: fn(&Trace<T>) -> &[T]| chunks.iter().flat_map(|c| part(&c.trace)).copied().collect();
+            *trace = Trace { q: join(|t| &t.q), q_tot: join(|t| &t.q_tot), target: join(|t| &t.target) };
+        }
+        let count = (episodes.len * dims.slots * self.mixer.values()) as f64;
+        Figures {
+            loss: 0.5 * chunks.iter().map(|c| c.loss).sum::<f64>() / count,
+            grad_norm: self.norms.iter().sum::<f64>().sqrt(),
+            q_tot: chunks.iter().map(|c| c.q_tot).sum::<f64>() / count,
+        }
+    }
+}
+
+/// What all chunks of a batch share.
+struct Pass<'a, T> {
+    agent: &'a Agent,
+    mixer: &'a Mixer,
+    online: Weights<'a, T>,
+    target: Weights<'a, T>,
+    returns: Returns,
+    episodes: &'a Episodes,
+    traced: bool,
+}
+
+impl<T: Real> Pass<'_, T> {
+    fn run(&self, range: std::ops::Range<usize>, w: &mut Workspace<T>, out: &mut Chunk<T>) {
+        let ep = self.episodes;
+        let (m, k, b) = (ep.uavs, ep.slots, range.len());
+        let (slots, per_slot) = (k + 1, b * m);
+        w.load(self.agent, ep, range.clone());
+        let inputs = Inputs { geometry: &w.geometry, last: &w.last, token: &w.token, position: &w.position };
+        for (weights, cache) in [(self.online, &mut w.online), (self.target, &mut w.target)] {
+            cache.begin(per_slot, slots).fill(T::ZERO);
+            self.agent.forward(weights, &inputs, slots, cache);
+        }
+
+        // The online network chooses, the target network says what the choice is worth; slot 0 is nobody's future.
+        let actions = self.agent.dims().actions;
+        let action = |row: usize| usize::from(ep.actions[((range.start + row / m % b) * k + row / per_slot) * m + row % m]);
+        w.best.reset(m, k * b);
+        for (best, row) in w.best.as_mut_slice().iter_mut().zip(per_slot..) {
+            *best = w.target.q.row(row)[argmax(w.online.q.row(row))];
+        }
+        w.chosen.reset(m, k * b);
+        for (chosen, row) in w.chosen.as_mut_slice().iter_mut().zip(0..) {
+            *chosen = w.online.q.row(row)[action(row)];
+        }
+        let values = self.mixer.values();
+        w.target_total.reset(values, k * b);
+        w.total.reset(values, k * b);
+        let future = (w.states.range(b..slots * b), w.best.rows());
+        self.mixer.forward(self.target, future, &mut w.target_mixer, w.target_total.rows_mut());
+        let present = (w.states.range(0..k * b), w.chosen.rows());
+        self.mixer.forward(self.online, present, &mut w.online_mixer, w.total.rows_mut());
+
+        w.goal.reset(values, k * b);
+        self.goals(range.start, b, w.target_total.as_slice(), w.goal.as_mut_slice());
+        if self.traced {
+            trace(w, (b, slots, m), &mut out.trace);
+        }
+        let share = T::of(1.0 / (ep.len * k * values) as f64);
+        (out.loss, out.q_tot) = (0.0, 0.0);
+        // From here on `total` is its own gradient.
+        for (total, &goal) in w.total.as_mut_slice().iter_mut().zip(w.goal.as_slice()) {
+            out.q_tot += total.wide();
+            *total -= goal;
+            out.loss += total.wide() * total.wide();
+            *total *= share;
+        }
+
+        out.grads.fill(T::ZERO);
+        let gradients = (&mut out.grads[..], &mut w.d_chosen);
+        self.mixer.backward(self.online, present, &mut w.online_mixer, w.total.as_slice(), gradients);
+        w.dq.reset_zero(actions, slots * per_slot);
+        for (row, &d) in w.d_chosen.as_slice().iter().enumerate() {
+            w.dq.row_mut(row)[action(row)] = d;
+        }
+        self.agent.backward(self.online, (&inputs, slots), w.dq.rows(), &mut w.online, &mut out.grads);
+    }
+
+    /// TD(lambda), from the last slot backwards; `future` begins with slot 1.
+    fn goals(&self, first: usize, b: usize, future: &[T], goal: &mut [T]) {
+        let k = self.episodes.slots;
+        let stride = b * self.mixer.values();
+        let gamma = T::of(self.returns.gamma);
+        let (keep, cut) = (T::of(self.returns.lambda), T::of(1.0 - self.returns.lambda));
+        for t in (0..k).rev() {
+            for i in 0..stride {
+                let reward = T::of(self.episodes.reward[(first + i / self.mixer.values()) * k + t].into());
+                let value = future[t * stride + i];
+                let next = if t + 1 == k { value } else { goal[(t + 1) * stride + i] };
+                goal[t * stride + i] = reward + gamma * (keep * next + cut * value);
+            }
+        }
+    }
+}
+
+impl<T: Real> Workspace<T> {
+    /// Lays out the episodes `range`, time-major.
+    fn load(&mut self, agent: &Agent, ep: &Episodes, range: std::ops::Range<usize>) {
+        let (m, n, k) = (ep.uavs, ep.users, ep.slots);
+        let config = agent.geometry();
+        let slots = k + 1;
+        self.geometry.clear();
+        self.last.clear();
+        self.token.clear();
+        self.position.clear();
+        self.states.reset(2 * m + 3 * n, slots * range.len());
+        let mut states = self.states.as_mut_slice().chunks_exact_mut(2 * m + 3 * n);
+        for t in 0..slots {
+            for e in range.clone() {
+                let at = e * slots + t;
+                let uav_xy = &ep.uav_xy[at * 2 * m..][..2 * m];
+                let user_xy = &ep.user_xy[if ep.users_move { at } else { e } * 2 * n..][..2 * n];
+                let aoi = &ep.aoi[at * n..][..n];
+                self.geometry.push_scene(&config, uav_xy, user_xy, aoi);
+                match t {
+                    0 => self.last.resize(self.last.len() + m, NO_ACTION),
+                    t => self.last.extend_from_slice(&ep.actions[(e * k + t - 1) * m..][..m]),
+                }
+                self.token.extend_from_slice(&ep.token[e * m * TOKEN..][..m * TOKEN]);
+                self.position.extend_from_slice(uav_xy);
+                flat_state(uav_xy, user_xy, aoi, k, states.next().expect("one state per slot"));
+            }
+        }
+        self.geometry.finish(&config);
+    }
+}
+
+/// Writes a chunk's part of the trace, episode-major.
+fn trace<T: Real>(w: &Workspace<T>, (b, slots, m): (usize, usize, usize), out: &mut Trace<T>) {
+    let reorder = |from: &[T], slots: usize, to: &mut Vec<T>| {
+        to.clear();
+        let width = from.len() / (slots * b);
+        for e in 0..b {
+            (0..slots).for_each(|t| to.extend_from_slice(&from[(t * b + e) * width..][..width]));
+        }
+    };
+    debug_assert_eq!(w.online.q.len(), slots * b * m);
+    reorder(w.online.q.as_slice(), slots, &mut out.q);
+    reorder(w.total.as_slice(), slots - 1, &mut out.q_tot);
+    reorder(w.goal.as_slice(), slots - 1, &mut out.target);
+}
+
+/// Index of the first largest value.
+fn argmax<T: Real>(x: &[T]) -> usize {
+    (1..x.len()).fold(0, |best, i| if x[i] > x[best] { i } else { best })
+}

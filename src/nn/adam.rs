@@ -1,0 +1,57 @@
+//! Adam over a flat vector, with the gradient clipped to a global norm, as `PyTorch` does both.
+
+use super::kernels::simd;
+use super::real::Real;
+
+const BETA1: f64 = 0.9;
+const BETA2: f64 = 0.999;
+const EPS: f64 = 1e-8;
+
+/// The optimiser's state.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Adam<T> {
+    /// First moments.
+    pub m: Vec<T>,
+    /// Second moments.
+    pub v: Vec<T>,
+    /// Steps taken.
+    pub steps: u64,
+}
+
+impl<T: Real> Adam<T> {
+    /// The state before the first step.
+    pub fn new(len: usize) -> Self {
+        Self { m: vec![T::ZERO; len], v: vec![T::ZERO; len], steps: 0 }
+    }
+
+    /// One step of `params` against `grads`, scaled down to the norm `clip` when `norm` exceeds it.
+    ///
+    /// # Panics
+    /// When lengths differ.
+    pub fn step(&mut self, params: &mut [T], grads: &[T], rate: f64, (norm, clip): (f64, f64)) {
+        assert!(params.len() == grads.len() && grads.len() == self.m.len(), "one moment per parameter");
+        self.steps += 1;
+        let power = i32::try_from(self.steps).unwrap_or(i32::MAX);
+        let scale = T::of((clip / (norm + 1e-6)).min(1.0));
+        let rate = T::of(rate / (1.0 - BETA1.powi(power)));
+        let root = T::of(1.0 / (1.0 - BETA2.powi(power)).sqrt());
+        let (rest1, beta2, rest2, eps) = (T::of(1.0 - BETA1), T::of(BETA2), T::of(1.0 - BETA2), T::of(EPS));
+        let (m, v) = (&mut self.m[..], &mut self.v[..]);
+        simd(
+            #[inline(always)]
+            || {
+                for (((p, &g), m), v) in params.iter_mut().zip(grads).zip(m).zip(v) {
+                    let g = g * scale;
+                    *m += rest1 * (g - *m);
+                    *v = *v * beta2 + rest2 * g * g;
+                    *p -= rate * *m / (v.sqrt() * root + eps);
+                }
+            },
+        );
+    }
+}
+
+/// Sum of squares, in f64.
+pub fn norm_squared<T: Real>(x: &[T]) -> f64 {
+    x.iter().map(|x| x.wide() * x.wide()).sum()
+}

@@ -1,0 +1,124 @@
+//! Activations of many samples in nalgebra's column-major storage: one column per sample, so a sample is contiguous.
+
+use std::ops::Range;
+
+use nalgebra::DMatrix;
+
+use super::real::Real;
+
+/// Activations: `width` numbers for each of `len` samples. Resizing keeps the allocation.
+#[derive(Clone, Debug)]
+pub struct Batch<T: Real>(DMatrix<T>);
+
+impl<T: Real> Default for Batch<T> {
+    fn default() -> Self {
+        Self(DMatrix::from_vec(0, 0, Vec::new()))
+    }
+}
+
+/// A view of samples: sample i is `data[i * stride ..]`, of a width that the reader knows.
+#[derive(Clone, Copy, Debug)]
+pub struct Rows<'a, T> {
+    /// First number of the first sample, and on.
+    pub data: &'a [T],
+    /// Distance between samples.
+    pub stride: usize,
+    /// Samples.
+    pub len: usize,
+}
+
+/// A mutable view of samples.
+#[derive(Debug)]
+pub struct RowsMut<'a, T> {
+    /// First number of the first sample, and on.
+    pub data: &'a mut [T],
+    /// Distance between samples.
+    pub stride: usize,
+    /// Samples.
+    pub len: usize,
+}
+
+impl<'a, T> Rows<'a, T> {
+    /// The same samples from column `from` on.
+    #[must_use]
+    pub fn from_column(self, from: usize) -> Self {
+        Self { data: &self.data[from.min(self.data.len())..], ..self }
+    }
+}
+
+impl<T: Real> Batch<T> {
+    /// Takes a new shape. What it holds afterwards is unspecified.
+    pub fn reset(&mut self, width: usize, len: usize) {
+        if (self.0.nrows(), self.0.ncols()) != (width, len) {
+            let mut data: Vec<T> = std::mem::take(self).0.data.into();
+            data.resize(width * len, T::ZERO);
+            self.0 = DMatrix::from_vec(width, len, data);
+        }
+    }
+
+    /// Takes a new shape, all zeros.
+    pub fn reset_zero(&mut self, width: usize, len: usize) {
+        self.reset(width, len);
+        self.0.fill(T::ZERO);
+    }
+
+    /// Numbers per sample.
+    pub fn width(&self) -> usize {
+        self.0.nrows()
+    }
+
+    /// Samples.
+    pub fn len(&self) -> usize {
+        self.0.ncols()
+    }
+
+    /// Whether it holds nothing.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// All numbers, sample by sample.
+    pub fn as_slice(&self) -> &[T] {
+        self.0.as_slice()
+    }
+
+    /// All numbers, sample by sample.
+    pub fn as_mut_slice(&mut self) -> &mut [T] {
+        self.0.as_mut_slice()
+    }
+
+    /// Sample i.
+    pub fn row(&self, i: usize) -> &[T] {
+        let w = self.width();
+        &self.0.as_slice()[i * w..(i + 1) * w]
+    }
+
+    /// Sample i.
+    pub fn row_mut(&mut self, i: usize) -> &mut [T] {
+        let w = self.width();
+        &mut self.0.as_mut_slice()[i * w..(i + 1) * w]
+    }
+
+    /// All samples.
+    pub fn rows(&self) -> Rows<'_, T> {
+        Rows { data: self.as_slice(), stride: self.width(), len: self.len() }
+    }
+
+    /// All samples.
+    pub fn rows_mut(&mut self) -> RowsMut<'_, T> {
+        let (stride, len) = (self.width(), self.len());
+        RowsMut { data: self.as_mut_slice(), stride, len }
+    }
+
+    /// Samples `range`.
+    pub fn range(&self, range: Range<usize>) -> Rows<'_, T> {
+        let w = self.width();
+        Rows { data: &self.as_slice()[range.start * w..range.end * w], stride: w, len: range.len() }
+    }
+
+    /// Samples `range`.
+    pub fn range_mut(&mut self, range: Range<usize>) -> RowsMut<'_, T> {
+        let w = self.width();
+        RowsMut { stride: w, len: range.len(), data: &mut self.as_mut_slice()[range.start * w..range.end * w] }
+    }
+}

@@ -1,0 +1,237 @@
+//! `EdgeConv` in its factored form (spec 3), exact up to rounding:
+//!
+//!     x'_i = agg_j f(x_i || x_j - x_i),  f = Linear(2H, 96), LayerNorm, ReLU, Linear(96, H)
+//!     u_i = (Wa - Wb) x_i + b,  v_j = Wb x_j            per node: f's first Linear is linear in x_i and x_j
+//!     a_i = agg_j relu(LayerNorm(u_i + v_j))            per edge, never stored; backward recomputes it
+//!     x'_i = W' a_i + b'                                per node: f's last Linear commutes with the sum
+//!
+//! A node without neighbours gets 0. Nodes computed are a prefix of the nodes read (see [`Graph`]).
+
+use super::HIDDEN as H;
+use super::batch::{Batch, Rows, RowsMut};
+use super::graph::Graph;
+use super::kernels::simd;
+use super::linear::Linear;
+use super::matmul::{Lhs, Out, Rhs, Start, matmul};
+use super::norm::{self, Affine, Norm, Stats};
+use super::params::{Layout, Weights};
+use super::real::Real;
+
+/// Width of f's hidden layer.
+const W: usize = 96;
+
+/// One layer.
+#[derive(Clone, Copy, Debug)]
+pub struct EdgeConv {
+    first: Linear,
+    norm: Norm<W>,
+    last: Linear,
+    mean: bool,
+}
+
+/// What backward needs: u, v, a, and (mean, 1 / deviation) per edge.
+#[derive(Debug, Default)]
+pub struct EdgeConvCache<T: Real> {
+    u: Batch<T>,
+    v: Batch<T>,
+    a: Batch<T>,
+    stats: Vec<[T; 2]>,
+}
+
+/// Scratch of backward, shared by all layers.
+#[derive(Debug, Default)]
+pub struct EdgeScratch<T: Real> {
+    da: Batch<T>,
+    du: Batch<T>,
+    dv: Batch<T>,
+}
+
+impl EdgeConv {
+    /// Adds `name.f.0`, `name.f.1`, `name.f.3`; aggregation is the mean or the sum over neighbours.
+    pub fn new(layout: &mut Layout, name: &str, mean: bool) -> Self {
+        Self {
+            first: Linear::new(layout, &format!("{name}.f.0"), 2 * H, W),
+            norm: Norm::new(layout, &format!("{name}.f.1")),
+            last: Linear::new(layout, &format!("{name}.f.3"), W, H),
+            mean,
+        }
+    }
+
+    /// Writes Wa - Wb and Wb, transposed, (H, W) each, and the last layer's transposed weight.
+    pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
+        self.last.prepare(flat, turned);
+        let (difference, neighbour) = self.first.weight_grad(turned).split_at_mut(H * W);
+        for (o, row) in self.first.weight(flat).as_chunks::<{ 2 * H }>().0.iter().enumerate() {
+            for i in 0..H {
+                difference[i * W + o] = row[i] - row[H + i];
+                neighbour[i * W + o] = row[H + i];
+            }
+        }
+    }
+
+    /// x' of the first `y.len` nodes from x of all of them.
+    pub fn forward<T: Real>(
+        &self,
+        w: Weights<'_, T>,
+        graph: &Graph,
+        x: Rows<'_, T>,
+        cache: &mut EdgeConvCache<T>,
+        y: RowsMut<'_, T>,
+    ) {
+        let nodes = y.len;
+        cache.u.reset(W, nodes);
+        cache.v.reset(W, x.len);
+        cache.a.reset(W, nodes);
+        cache.stats.resize(graph.offsets[nodes] as usize, [T::ZERO; 2]);
+        let (difference, neighbour) = self.first.weight_turned(w).split_at(H * W);
+        let lhs = Lhs::rows(x.data, x.stride);
+        let out = Out { data: cache.u.as_mut_slice(), stride: W };
+        matmul((nodes, H, W), lhs, Rhs { data: difference, stride: W }, out, Start::Bias(self.first.bias(w)));
+        let out = Out { data: cache.v.as_mut_slice(), stride: W };
+        matmul((x.len, H, W), lhs, Rhs { data: neighbour, stride: W }, out, Start::Zero);
+        let affine = self.norm.affine(w.flat);
+        let EdgeConvCache { u, v, a, stats } = cache;
+        let (u, v) = (u.as_slice().as_chunks().0, v.as_slice().as_chunks().0);
+        simd(
+            #[inline(always)]
+            || aggregate(graph, self.mean, &affine, (u, v), stats, a.as_mut_slice().as_chunks_mut().0),
+        );
+        let stride = y.stride;
+        self.last.forward(w, a.rows(), RowsMut { data: &mut *y.data, ..y });
+        let bias = self.last.bias(w);
+        for i in 0..nodes {
+            // The product gave every node one bias; a sum has one per neighbour, and a node without neighbours none.
+            let degree = graph.degree(i);
+            if degree == 0 {
+                y.data[i * stride..][..H].fill(T::ZERO);
+            } else if !self.mean {
+                let more = T::of((degree - 1) as f64);
+                y.data[i * stride..][..H].iter_mut().zip(bias).for_each(|(y, &b)| *y += more * b);
+            }
+        }
+    }
+
+    /// Adds all gradients and writes dx of all nodes read. Spoils `dy`.
+    pub fn backward<T: Real>(
+        &self,
+        flat: &[T],
+        (graph, x, cache): (&Graph, Rows<'_, T>, &EdgeConvCache<T>),
+        dy: &mut Batch<T>,
+        scratch: &mut EdgeScratch<T>,
+        (grads, dx): (&mut [T], &mut Batch<T>),
+    ) {
+        let nodes = dy.len();
+        let EdgeScratch { da, du, dv } = scratch;
+        da.reset(W, nodes);
+        du.reset(W, nodes);
+        dv.reset_zero(W, x.len);
+        let bias = self.last.bias_grad(grads);
+        for (i, dy) in dy.as_mut_slice().chunks_exact_mut(H).enumerate() {
+            match graph.degree(i) {
+                0 => dy.fill(T::ZERO),
+                degree => {
+                    let times = if self.mean { T::ONE } else { T::of(degree as f64) };
+                    bias.iter_mut().zip(dy).for_each(|(g, &mut d)| *g += times * d);
+                }
+            }
+        }
+        self.last.backward_part((0, W), cache.a.rows(), dy.rows(), grads);
+        self.last.backward_input(flat, (0, W), dy.rows(), da.rows_mut(), Start::Zero);
+
+        let affine = self.norm.affine(flat);
+        let mut sums = Affine::zero();
+        let (u, v) = (cache.u.as_slice().as_chunks().0, cache.v.as_slice().as_chunks().0);
+        let (du_rows, dv_rows) = (du.as_mut_slice().as_chunks_mut().0, dv.as_mut_slice().as_chunks_mut().0);
+        let da = da.as_slice().as_chunks().0;
+        simd(
+            #[inline(always)]
+            || aggregate_back(graph, self.mean, &affine, (u, v, &cache.stats, da), (du_rows, dv_rows), &mut sums),
+        );
+        self.norm.add_grads(&sums, grads);
+
+        // u takes Wa - Wb and v takes Wb: Wa sees du, Wb sees dv - du.
+        self.first.backward_bias(du.rows(), grads);
+        self.first.backward_part((0, H), x, du.rows(), grads);
+        dv.as_mut_slice().iter_mut().zip(du.as_slice()).for_each(|(v, &u)| *v -= u);
+        self.first.backward_part((H, H), x, dv.rows(), grads);
+        dx.reset(H, x.len);
+        self.first.backward_input(flat, (H, H), dv.rows(), dx.rows_mut(), Start::Zero);
+        self.first.backward_input(flat, (0, H), du.rows(), dx.range_mut(0..nodes), Start::Add);
+    }
+}
+
+#[inline(always)]
+fn aggregate<T: Real>(
+    graph: &Graph,
+    mean: bool,
+    affine: &Affine<T, W>,
+    (u, v): (&[[T; W]], &[[T; W]]),
+    stats: &mut [[T; 2]],
+    a: &mut [[T; W]],
+) {
+    let mut stats = stats.iter_mut();
+    for (i, (u, a)) in u.iter().zip(a).enumerate() {
+        let mut sum = [T::ZERO; W];
+        let neighbours = graph.neighbours(i);
+        for (&j, stats) in neighbours.iter().zip(&mut stats) {
+            let v = &v[j as usize];
+            let mut x = [T::ZERO; W];
+            for c in 0..W {
+                x[c] = u[c] + v[c];
+            }
+            let s = norm::stats(&x);
+            *stats = [s.mean, s.inverse];
+            let mut y = [T::ZERO; W];
+            norm::forward(&x, s, affine, &mut y);
+            for c in 0..W {
+                sum[c] += y[c];
+            }
+        }
+        let share = share(neighbours, mean);
+        for c in 0..W {
+            a[c] = sum[c] * share;
+        }
+    }
+}
+
+#[inline(always)]
+fn aggregate_back<T: Real>(
+    graph: &Graph,
+    mean: bool,
+    affine: &Affine<T, W>,
+    (u, v, stats, da): (&[[T; W]], &[[T; W]], &[[T; 2]], &[[T; W]]),
+    (du, dv): (&mut [[T; W]], &mut [[T; W]]),
+    sums: &mut Affine<T, W>,
+) {
+    let mut stats = stats.iter();
+    for (i, ((u, da), du)) in u.iter().zip(da).zip(du).enumerate() {
+        let neighbours = graph.neighbours(i);
+        let share = share(neighbours, mean);
+        let mut da = *da;
+        for d in &mut da {
+            *d *= share;
+        }
+        let mut sum = [T::ZERO; W];
+        for (&j, stats) in neighbours.iter().zip(&mut stats) {
+            let v = &v[j as usize];
+            let mut x = [T::ZERO; W];
+            for c in 0..W {
+                x[c] = u[c] + v[c];
+            }
+            let s = Stats { mean: stats[0], inverse: stats[1] };
+            let d = norm::backward(&x, s, affine, &da, sums);
+            let dv = &mut dv[j as usize];
+            for c in 0..W {
+                sum[c] += d[c];
+                dv[c] += d[c];
+            }
+        }
+        *du = sum;
+    }
+}
+
+/// Weight of a neighbour in the aggregate.
+#[inline(always)]
+fn share<T: Real>(neighbours: &[u32], mean: bool) -> T {
+    if mean { T::ONE / T::of(neighbours.len().max(1) as f64) } else { T::ONE }
+}

@@ -1,0 +1,85 @@
+//! ReLU(Linear(F, 64)) of single points, to be summed over what a node sees or a state holds (spec 2.2, 4.2).
+//!
+//! F is 2 or 3, so a matrix product would be all overhead: F multiply-adds on rows of 64, recomputed in backward.
+
+use super::HIDDEN as H;
+use super::linear::Linear;
+use super::params::{Layout, Weights};
+use super::real::Real;
+
+/// The embedding of points of F coordinates.
+#[derive(Clone, Copy, Debug)]
+pub struct Embedding<const F: usize>(Linear);
+
+/// Its weights as rows of 64, for the time of a loop; or the sums of their gradients.
+#[derive(Clone, Copy, Debug)]
+pub struct EmbeddingGrad<T, const F: usize> {
+    weight: [[T; H]; F],
+    bias: [T; H],
+}
+
+impl<const F: usize> Embedding<F> {
+    /// Adds `name.weight` (64, F) and `name.bias`.
+    pub fn new(layout: &mut Layout, name: &str) -> Self {
+        Self(Linear::new(layout, name, F, H))
+    }
+
+    /// See [`Linear::prepare`].
+    pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
+        self.0.prepare(flat, turned);
+    }
+
+    /// The weights, ready for [`EmbeddingGrad::add`] and [`EmbeddingGrad::backward`].
+    pub fn load<T: Real>(&self, w: Weights<'_, T>) -> EmbeddingGrad<T, F> {
+        let rows = self.0.weight_turned(w).as_chunks::<H>().0;
+        EmbeddingGrad { weight: rows.try_into().expect("F rows"), bias: self.0.bias(w).try_into().expect("64 numbers") }
+    }
+
+    /// Adds gathered gradients.
+    pub fn add_grads<T: Real>(&self, sums: &EmbeddingGrad<T, F>, grads: &mut [T]) {
+        for (o, row) in self.0.weight_grad(grads).chunks_exact_mut(F).enumerate() {
+            row.iter_mut().zip(&sums.weight).for_each(|(g, s)| *g += s[o]);
+        }
+        self.0.bias_grad(grads).iter_mut().zip(&sums.bias).for_each(|(g, &s)| *g += s);
+    }
+}
+
+impl<T: Real, const F: usize> EmbeddingGrad<T, F> {
+    /// No gradient yet.
+    pub fn zero() -> Self {
+        Self { weight: [[T::ZERO; H]; F], bias: [T::ZERO; H] }
+    }
+
+    #[inline(always)]
+    fn before(&self, point: [T; F]) -> [T; H] {
+        let mut x = self.bias;
+        for f in 0..F {
+            for c in 0..H {
+                x[c] = self.weight[f][c].mul_add(point[f], x[c]);
+            }
+        }
+        x
+    }
+
+    /// sum += the embedding of `point`.
+    #[inline(always)]
+    pub fn add(&self, point: [T; F], sum: &mut [T; H]) {
+        let x = self.before(point);
+        for c in 0..H {
+            sum[c] += x[c].relu();
+        }
+    }
+
+    /// Adds the gradients of one point, whose embedding had the gradient `d`.
+    #[inline(always)]
+    pub fn backward(&self, point: [T; F], d: &[T; H], grads: &mut Self) {
+        let x = self.before(point);
+        for c in 0..H {
+            let open = if x[c] > T::ZERO { d[c] } else { T::ZERO };
+            grads.bias[c] += open;
+            for f in 0..F {
+                grads.weight[f][c] = open.mul_add(point[f], grads.weight[f][c]);
+            }
+        }
+    }
+}

@@ -1,0 +1,169 @@
+//! `PyTorch`'s `GRUCell` over time, gates in the order reset, update, new:
+//!
+//!     r = sigmoid(Wi_r x + bi_r + Wh_r h + bh_r)      z likewise
+//!     q = Wh_n h + bh_n        n = tanh(Wi_n x + bi_n + r q)        h' = (1 - z) n + z h
+//!
+//! Only Wh h walks over time; Wi x is one product over all slots, and so are all gradients of weights, from the gate
+//! gradients of all slots. Samples are time-major: slot t is samples t n .. (t + 1) n.
+
+use super::HIDDEN as H;
+use super::batch::{Batch, Rows};
+use super::kernels::{add_rows, simd};
+use super::linear::transpose;
+use super::matmul::{Lhs, Out, Rhs, Start, matmul};
+use super::params::{Init, Layout, Weights};
+use super::real::Real;
+
+/// Numbers kept per sample: r, z, n, q; after backward the gradients before their activations, in the same places.
+const GATES: usize = 4 * H;
+
+/// Offsets of the cell's parameters; input and state are both H wide.
+#[derive(Clone, Copy, Debug)]
+pub struct Gru {
+    weight_ih: usize,
+    weight_hh: usize,
+    bias_ih: usize,
+    bias_hh: usize,
+}
+
+impl Gru {
+    /// Adds `name.weight_ih`, `weight_hh` (3H, H), `bias_ih`, `bias_hh` (3H), uniform in +-1/sqrt(H).
+    pub fn new(layout: &mut Layout, name: &str) -> Self {
+        let init = Init::Uniform(1.0 / (H as f64).sqrt());
+        let mut add = |part: &str, shape: &[usize]| layout.add(format!("{name}.{part}"), shape, init);
+        Self {
+            weight_ih: add("weight_ih", &[3 * H, H]),
+            weight_hh: add("weight_hh", &[3 * H, H]),
+            bias_ih: add("bias_ih", &[3 * H]),
+            bias_hh: add("bias_hh", &[3 * H]),
+        }
+    }
+
+    /// Transposes both weights and joins the biases of r and z.
+    pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
+        for weight in [self.weight_ih, self.weight_hh] {
+            transpose(&flat[weight..][..3 * H * H], H, &mut turned[weight..][..3 * H * H]);
+        }
+        for i in 0..3 * H {
+            let hidden = if i < 2 * H { flat[self.bias_hh + i] } else { T::ZERO };
+            turned[self.bias_ih + i] = flat[self.bias_ih + i] + hidden;
+        }
+    }
+
+    /// Fills `h` from slot 0 on; `h` is (slots + 1) n samples of which the first n hold the state before slot 0.
+    pub fn forward<T: Real>(&self, w: Weights<'_, T>, x: Rows<'_, T>, slots: usize, gates: &mut Batch<T>, h: &mut Batch<T>) {
+        let n = x.len / slots;
+        assert_eq!(h.len(), x.len + n, "one block of states before the first slot");
+        gates.reset(GATES, x.len);
+        let weight = Rhs { data: &w.turned[self.weight_ih..][..3 * H * H], stride: 3 * H };
+        let bias = Start::Bias(&w.turned[self.bias_ih..][..3 * H]);
+        let all = Out { data: gates.as_mut_slice(), stride: GATES };
+        matmul((x.len, H, 3 * H), Lhs::rows(x.data, x.stride), weight, all, bias);
+        let weight = &w.turned[self.weight_hh..][..3 * H * H];
+        let bias = &w.flat[self.bias_hh + 2 * H..][..H];
+        for (gates, t) in gates.as_mut_slice().chunks_exact_mut(n * GATES).zip(0..) {
+            let (before, after) = h.as_mut_slice()[t * n * H..].split_at_mut(n * H);
+            let lhs = Lhs::rows(before, H);
+            matmul((n, H, 2 * H), lhs, Rhs { data: weight, stride: 3 * H }, Out { data: gates, stride: GATES }, Start::Add);
+            let q = Out { data: &mut gates[3 * H..], stride: GATES };
+            matmul((n, H, H), lhs, Rhs { data: &weight[2 * H..], stride: 3 * H }, q, Start::Bias(bias));
+            simd(
+                #[inline(always)]
+                || step(gates, before, &mut after[..n * H]),
+            );
+        }
+    }
+
+    /// Adds the gradients of the weights. `dh` comes in as the gradient of every slot's state from outside and leaves as the
+    /// whole one; `gates` leaves as gradients, of which [`Gru::backward_input`] makes dx.
+    pub fn backward<T: Real>(
+        &self,
+        flat: &[T],
+        (x, slots): (Rows<'_, T>, usize),
+        h: &Batch<T>,
+        (gates, dh): (&mut Batch<T>, &mut Batch<T>),
+        grads: &mut [T],
+    ) {
+        let n = x.len / slots;
+        let weight = &flat[self.weight_hh..][..3 * H * H];
+        for t in (0..slots).rev() {
+            let gates = &mut gates.as_mut_slice()[t * n * GATES..][..n * GATES];
+            let (earlier, now) = dh.as_mut_slice().split_at_mut(t * n * H);
+            let now = &now[..n * H];
+            let before = &h.as_slice()[t * n * H..][..n * H];
+            let first = t == 0;
+            let carry = if first { &mut [][..] } else { &mut earlier[(t - 1) * n * H..] };
+            simd(
+                #[inline(always)]
+                || step_back(gates, before, now, carry),
+            );
+            if !first {
+                let rz = Rhs { data: weight, stride: H };
+                matmul((n, 2 * H, H), Lhs::rows(gates, GATES), rz, Out { data: carry, stride: H }, Start::Add);
+                let q = Rhs { data: &weight[2 * H * H..], stride: H };
+                matmul((n, H, H), Lhs::rows(&gates[3 * H..], GATES), q, Out { data: carry, stride: H }, Start::Add);
+            }
+        }
+        let d = gates.as_slice();
+        let len = x.len;
+        let hidden = |d, width, grads: &mut [T]| {
+            let before = Rhs { data: h.as_slice(), stride: H };
+            matmul((width, len, H), Lhs::transposed(d, GATES), before, Out { data: grads, stride: H }, Start::Add);
+        };
+        hidden(d, 2 * H, &mut grads[self.weight_hh..]);
+        hidden(&d[3 * H..], H, &mut grads[self.weight_hh + 2 * H * H..]);
+        let input = Rhs { data: x.data, stride: x.stride };
+        let out = Out { data: &mut grads[self.weight_ih..], stride: H };
+        matmul((3 * H, len, H), Lhs::transposed(d, GATES), input, out, Start::Add);
+        let rows = |from: usize| Rows { data: &d[from..], stride: GATES, len };
+        add_rows(rows(0), &mut grads[self.bias_ih..][..3 * H]);
+        add_rows(rows(0), &mut grads[self.bias_hh..][..2 * H]);
+        add_rows(rows(3 * H), &mut grads[self.bias_hh + 2 * H..][..H]);
+    }
+
+    /// After [`Gru::backward`]: the gradient of x.
+    pub fn backward_input<T: Real>(&self, flat: &[T], gates: &Batch<T>, dx: &mut Batch<T>) {
+        dx.reset(H, gates.len());
+        let weight = Rhs { data: &flat[self.weight_ih..][..3 * H * H], stride: H };
+        let out = Out { data: dx.as_mut_slice(), stride: H };
+        matmul((gates.len(), 3 * H, H), Lhs::rows(gates.as_slice(), GATES), weight, out, Start::Zero);
+    }
+}
+
+#[inline(always)]
+fn step<T: Real>(gates: &mut [T], before: &[T], after: &mut [T]) {
+    let states = before.as_chunks::<H>().0.iter().zip(after.as_chunks_mut::<H>().0);
+    for (gates, (h, next)) in gates.as_chunks_mut::<GATES>().0.iter_mut().zip(states) {
+        let [r, z, n, q] = gates.as_chunks_mut::<H>().0 else { unreachable!("four parts") };
+        for c in 0..H {
+            r[c] = r[c].sigmoid();
+            z[c] = z[c].sigmoid();
+            n[c] = r[c].mul_add(q[c], n[c]).tanh();
+            next[c] = z[c].mul_add(h[c] - n[c], n[c]);
+        }
+    }
+}
+
+/// Gates become their gradients; what flows to the slot before through z h is added to `carry`, where there is one.
+#[inline(always)]
+fn step_back<T: Real>(gates: &mut [T], before: &[T], dh: &[T], carry: &mut [T]) {
+    let states = before.as_chunks::<H>().0.iter().zip(dh.as_chunks::<H>().0);
+    let mut carry = carry.as_chunks_mut::<H>().0.iter_mut();
+    for (gates, (h, dh)) in gates.as_chunks_mut::<GATES>().0.iter_mut().zip(states) {
+        let [r, z, n, q] = gates.as_chunks_mut::<H>().0 else { unreachable!("four parts") };
+        if let Some(carry) = carry.next() {
+            for c in 0..H {
+                carry[c] = dh[c].mul_add(z[c], carry[c]);
+            }
+        }
+        for c in 0..H {
+            let (rc, zc, nc) = (r[c], z[c], n[c]);
+            let open = T::ONE - zc;
+            let dn = dh[c] * open * (T::ONE - nc * nc);
+            r[c] = dn * q[c] * rc * (T::ONE - rc);
+            z[c] = dh[c] * (h[c] - nc) * zc * open;
+            n[c] = dn;
+            q[c] = dn * rc;
+        }
+    }
+}

@@ -1,0 +1,126 @@
+//! y = W x + b with W (out, in), as in `PyTorch`. Weights are also kept transposed (in, out) for the forward product.
+
+use super::batch::{Rows, RowsMut};
+use super::kernels::add_rows;
+use super::matmul::{Lhs, Out, Rhs, Start, matmul};
+use super::params::{Init, Layout, Weights};
+use super::real::Real;
+
+/// A linear layer: offsets of its weight and bias in the flat vector.
+#[derive(Clone, Copy, Debug)]
+pub struct Linear {
+    weight: usize,
+    bias: usize,
+    /// Width of x.
+    pub inputs: usize,
+    /// Width of y.
+    pub outputs: usize,
+}
+
+impl Linear {
+    /// Adds `name.weight` and `name.bias`, uniform in +-1/sqrt(inputs).
+    pub fn new(layout: &mut Layout, name: &str, inputs: usize, outputs: usize) -> Self {
+        let init = Init::Uniform(1.0 / (inputs as f64).sqrt());
+        let weight = layout.add(format!("{name}.weight"), &[outputs, inputs], init);
+        let bias = layout.add(format!("{name}.bias"), &[outputs], init);
+        Self { weight, bias, inputs, outputs }
+    }
+
+    /// Writes the transposed weight.
+    pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
+        let n = self.inputs * self.outputs;
+        transpose(&flat[self.weight..][..n], self.inputs, &mut turned[self.weight..][..n]);
+    }
+
+    /// W, (outputs, inputs).
+    pub fn weight<'a, T>(&self, flat: &'a [T]) -> &'a [T] {
+        &flat[self.weight..][..self.inputs * self.outputs]
+    }
+
+    /// W transposed, (inputs, outputs).
+    pub fn weight_turned<'a, T>(&self, w: Weights<'a, T>) -> &'a [T] {
+        &w.turned[self.weight..][..self.inputs * self.outputs]
+    }
+
+    /// b.
+    pub fn bias<'a, T>(&self, w: Weights<'a, T>) -> &'a [T] {
+        &w.flat[self.bias..][..self.outputs]
+    }
+
+    /// The weight's gradient, (outputs, inputs).
+    pub fn weight_grad<'a, T>(&self, grads: &'a mut [T]) -> &'a mut [T] {
+        &mut grads[self.weight..][..self.inputs * self.outputs]
+    }
+
+    /// The bias's gradient.
+    pub fn bias_grad<'a, T>(&self, grads: &'a mut [T]) -> &'a mut [T] {
+        &mut grads[self.bias..][..self.outputs]
+    }
+
+    /// y = W x + b.
+    pub fn forward<T: Real>(&self, w: Weights<'_, T>, x: Rows<'_, T>, y: RowsMut<'_, T>) {
+        self.forward_part(w, (0, self.inputs), x, y, Start::Bias(self.bias(w)));
+    }
+
+    /// y = start + W[:, from..from + width] x: the share of some inputs.
+    pub fn forward_part<T: Real>(
+        &self,
+        w: Weights<'_, T>,
+        (from, width): (usize, usize),
+        x: Rows<'_, T>,
+        y: RowsMut<'_, T>,
+        start: Start<'_, T>,
+    ) {
+        debug_assert_eq!(x.len, y.len);
+        let b = Rhs { data: &self.weight_turned(w)[from * self.outputs..], stride: self.outputs };
+        let c = Out { data: y.data, stride: y.stride };
+        matmul((x.len, width, self.outputs), Lhs::rows(x.data, x.stride), b, c, start);
+    }
+
+    /// Adds the gradients of W and b; writes dx where wanted.
+    pub fn backward<T: Real>(&self, flat: &[T], x: Rows<'_, T>, dy: Rows<'_, T>, grads: &mut [T], dx: Option<RowsMut<'_, T>>) {
+        self.backward_bias(dy, grads);
+        self.backward_part((0, self.inputs), x, dy, grads);
+        if let Some(dx) = dx {
+            self.backward_input(flat, (0, self.inputs), dy, dx, Start::Zero);
+        }
+    }
+
+    /// Adds the gradient of b.
+    pub fn backward_bias<T: Real>(&self, dy: Rows<'_, T>, grads: &mut [T]) {
+        add_rows(dy, self.bias_grad(grads));
+    }
+
+    /// Adds the gradient of W[:, from..from + width], for as many samples as `dy` has.
+    pub fn backward_part<T: Real>(&self, (from, width): (usize, usize), x: Rows<'_, T>, dy: Rows<'_, T>, grads: &mut [T]) {
+        debug_assert!(x.len >= dy.len);
+        let stride = self.inputs;
+        let c = Out { data: &mut self.weight_grad(grads)[from..], stride };
+        let b = Rhs { data: x.data, stride: x.stride };
+        matmul((self.outputs, dy.len, width), Lhs::transposed(dy.data, dy.stride), b, c, Start::Add);
+    }
+
+    /// dx = start + dy W[:, from..from + width].
+    pub fn backward_input<T: Real>(
+        &self,
+        flat: &[T],
+        (from, width): (usize, usize),
+        dy: Rows<'_, T>,
+        dx: RowsMut<'_, T>,
+        start: Start<'_, T>,
+    ) {
+        let b = Rhs { data: &self.weight(flat)[from..], stride: self.inputs };
+        let c = Out { data: dx.data, stride: dx.stride };
+        matmul((dy.len, self.outputs, width), Lhs::rows(dy.data, dy.stride), b, c, start);
+    }
+}
+
+/// `to` (columns, rows) = transpose of `from` (rows, columns).
+pub(super) fn transpose<T: Real>(from: &[T], columns: usize, to: &mut [T]) {
+    let rows = from.len() / columns;
+    for (i, row) in from.chunks_exact(columns).enumerate() {
+        for (j, &x) in row.iter().enumerate() {
+            to[j * rows + i] = x;
+        }
+    }
+}

@@ -1,0 +1,229 @@
+//! Matrix products, the bulk of the arithmetic: C = A B, C = bias + A B, C += A B.
+//!
+//! One kernel serves all three products of a layer, because each has a right-hand side whose rows are contiguous:
+//! Y = X Wt (weights transposed once per update), dX = dY W, dW += dYt X. A tile of C stays in vector registers while k
+//! runs. Every element of C is summed over k in ascending order by fused multiply-adds, whatever the size of the batch or
+//! the place of its row in it. So an answer does not depend on what it was batched with, which serving promises and
+//! general-purpose products (with their special cases for few rows) do not keep. No allocation, no packing, no threads:
+//! callers split the work.
+
+use pulp::{Arch, Simd, WithSimd};
+
+use super::real::Real;
+
+/// A: element (i, k) is `data[i * row + k * col]`; one of the strides is 1.
+#[derive(Clone, Copy, Debug)]
+pub struct Lhs<'a, T> {
+    data: &'a [T],
+    row: usize,
+    col: usize,
+}
+
+impl<'a, T> Lhs<'a, T> {
+    /// Rows of `stride` numbers each.
+    pub fn rows(data: &'a [T], stride: usize) -> Self {
+        Self { data, row: stride, col: 1 }
+    }
+
+    /// The transpose of rows of `stride` numbers each.
+    pub fn transposed(data: &'a [T], stride: usize) -> Self {
+        Self { data, row: 1, col: stride }
+    }
+}
+
+/// B: element (k, j) is `data[k * stride + j]`.
+#[derive(Clone, Copy, Debug)]
+pub struct Rhs<'a, T> {
+    /// Rows, one after another.
+    pub data: &'a [T],
+    /// Distance between rows.
+    pub stride: usize,
+}
+
+/// C: element (i, j) is `data[i * stride + j]`.
+#[derive(Debug)]
+pub struct Out<'a, T> {
+    /// Rows, one after another.
+    pub data: &'a mut [T],
+    /// Distance between rows.
+    pub stride: usize,
+}
+
+/// What the sum over k begins with.
+#[derive(Clone, Copy, Debug)]
+pub enum Start<'a, T> {
+    /// 0.
+    Zero,
+    /// One number per column.
+    Bias(&'a [T]),
+    /// What C holds.
+    Add,
+}
+
+/// Rows of a tile of C.
+const ROWS: usize = 6;
+/// Terms summed before a tile is put back: a panel of B of this height stays in the first-level cache.
+const DEPTH: usize = 144;
+
+/// C = start + A B for A (m, k), B (k, n).
+///
+/// # Panics
+/// When a slice is too short for its shape.
+pub fn matmul<T: Real>((m, k, n): (usize, usize, usize), a: Lhs<'_, T>, b: Rhs<'_, T>, c: Out<'_, T>, start: Start<'_, T>) {
+    if m == 0 || n == 0 {
+        return;
+    }
+    assert!(c.data.len() >= (m - 1) * c.stride + n && c.stride >= n, "C is too short");
+    assert!(k == 0 || a.data.len() > (m - 1) * a.row + (k - 1) * a.col, "A is too short");
+    assert!(k == 0 || b.data.len() >= (k - 1) * b.stride + n, "B is too short");
+    if let Start::Bias(bias) = start {
+        assert!(bias.len() >= n, "the bias is too short");
+    }
+    Arch::new().dispatch(Product { m, k, n, a, b, c, start });
+}
+
+struct Product<'a, T> {
+    m: usize,
+    k: usize,
+    n: usize,
+    a: Lhs<'a, T>,
+    b: Rhs<'a, T>,
+    c: Out<'a, T>,
+    start: Start<'a, T>,
+}
+
+impl<T: Real> WithSimd for Product<'_, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(mut self, simd: S) {
+        // 6 x 4 accumulators fit into 32 registers, 6 x 2 into 16.
+        let wide = S::REGISTER_COUNT >= 32;
+        let lanes = T::lanes::<S>();
+        let mut k0 = 0;
+        loop {
+            let depth = DEPTH.min(self.k - k0);
+            let mut j = 0;
+            while j < self.n {
+                let left = self.n - j;
+                if wide && left >= 4 * lanes {
+                    self.columns::<S, 4>(simd, k0, depth, j, 4 * lanes);
+                    j += 4 * lanes;
+                } else if left >= 2 * lanes {
+                    self.columns::<S, 2>(simd, k0, depth, j, 2 * lanes);
+                    j += 2 * lanes;
+                } else {
+                    let width = left.min(lanes);
+                    self.columns::<S, 1>(simd, k0, depth, j, width);
+                    j += width;
+                }
+            }
+            k0 += depth;
+            if k0 >= self.k {
+                return;
+            }
+            self.start = Start::Add;
+        }
+    }
+}
+
+impl<T: Real> Product<'_, T> {
+    /// Columns j..j + width of C, terms k0..k0 + depth of the sums.
+    #[inline(always)]
+    fn columns<S: Simd, const V: usize>(&mut self, simd: S, k0: usize, depth: usize, j: usize, width: usize) {
+        let mut i = 0;
+        while i + ROWS <= self.m {
+            self.tile::<S, ROWS, V>(simd, (i, j, k0), depth, width);
+            i += ROWS;
+        }
+        if i + 4 <= self.m {
+            self.tile::<S, 4, V>(simd, (i, j, k0), depth, width);
+            i += 4;
+        }
+        if i + 2 <= self.m {
+            self.tile::<S, 2, V>(simd, (i, j, k0), depth, width);
+            i += 2;
+        }
+        if i < self.m {
+            self.tile::<S, 1, V>(simd, (i, j, k0), depth, width);
+        }
+    }
+
+    #[inline(always)]
+    fn tile<S: Simd, const R: usize, const V: usize>(
+        &mut self,
+        simd: S,
+        (i, j, k0): (usize, usize, usize),
+        depth: usize,
+        width: usize,
+    ) {
+        let lanes = T::lanes::<S>();
+        let last = width - (V - 1) * lanes;
+        let mut sums = [[T::splat(simd, T::ZERO); V]; R];
+        match self.start {
+            Start::Zero => {}
+            Start::Bias(bias) => {
+                for v in 0..V {
+                    let at = j + v * lanes;
+                    let x = T::load(simd, &bias[at..at + if v + 1 < V { lanes } else { last }]);
+                    for row in &mut sums {
+                        row[v] = x;
+                    }
+                }
+            }
+            Start::Add => {
+                for (r, row) in sums.iter_mut().enumerate() {
+                    let c = &self.c.data[(i + r) * self.c.stride + j..][..width];
+                    for (v, x) in row.iter_mut().enumerate() {
+                        *x = T::load(simd, &c[v * lanes..if v + 1 < V { (v + 1) * lanes } else { width }]);
+                    }
+                }
+            }
+        }
+        if depth > 0 {
+            let b = &self.b.data[k0 * self.b.stride + j..];
+            let b_rows = b.chunks(self.b.stride).take(depth);
+            if self.a.col == 1 {
+                let mut rows: [&[T]; R] = [&[]; R];
+                for (r, row) in rows.iter_mut().enumerate() {
+                    *row = &self.a.data[(i + r) * self.a.row + k0..][..depth];
+                }
+                for (k, b) in b_rows.enumerate() {
+                    let mut a = [T::ZERO; R];
+                    for r in 0..R {
+                        a[r] = rows[r][k];
+                    }
+                    accumulate::<T, S, R, V>(simd, &a, &b[..width], &mut sums);
+                }
+            } else {
+                let a_rows = self.a.data[i + k0 * self.a.col..].chunks(self.a.col);
+                for (a, b) in a_rows.zip(b_rows) {
+                    let a: &[T; R] = a[..R].try_into().expect("R numbers");
+                    accumulate::<T, S, R, V>(simd, a, &b[..width], &mut sums);
+                }
+            }
+        }
+        for (r, row) in sums.iter().enumerate() {
+            let c = &mut self.c.data[(i + r) * self.c.stride + j..][..width];
+            for (v, x) in row.iter().enumerate() {
+                T::store(simd, &mut c[v * lanes..if v + 1 < V { (v + 1) * lanes } else { width }], *x);
+            }
+        }
+    }
+}
+
+/// `sums[r]` += `a[r]` * b.
+#[inline(always)]
+fn accumulate<T: Real, S: Simd, const R: usize, const V: usize>(simd: S, a: &[T; R], b: &[T], sums: &mut [[T::Vector<S>; V]; R]) {
+    let lanes = T::lanes::<S>();
+    let mut row = [T::splat(simd, T::ZERO); V];
+    for (v, x) in row.iter_mut().enumerate() {
+        *x = T::load(simd, &b[v * lanes..if v + 1 < V { (v + 1) * lanes } else { b.len() }]);
+    }
+    for r in 0..R {
+        let x = T::splat(simd, a[r]);
+        for v in 0..V {
+            sums[r][v] = T::fma(simd, x, row[v], sums[r][v]);
+        }
+    }
+}

@@ -1,0 +1,116 @@
+//! Linear, LayerNorm, ReLU, Linear: the head of graph agents and the networks of `agggnn`.
+//!
+//! The input may come in two parts (x || x'), which are multiplied apart and never concatenated.
+
+use super::batch::{Batch, Rows, RowsMut};
+use super::kernels::simd;
+use super::linear::Linear;
+use super::matmul::Start;
+use super::norm::{self, Affine, Norm, Stats};
+use super::params::{Layout, Weights};
+use super::real::Real;
+
+/// A network with a hidden layer of W.
+#[derive(Clone, Copy, Debug)]
+pub struct Mlp<const W: usize> {
+    /// First layer.
+    pub first: Linear,
+    norm: Norm<W>,
+    last: Linear,
+}
+
+/// What backward needs, and its scratch.
+#[derive(Debug, Default)]
+pub struct MlpCache<T: Real> {
+    before: Batch<T>,
+    stats: Batch<T>,
+    hidden: Batch<T>,
+}
+
+impl<const W: usize> Mlp<W> {
+    /// Adds `name.0`, `name.1` and `name.3`, as `PyTorch` numbers them in a sequence.
+    pub fn new(layout: &mut Layout, name: &str, inputs: usize, outputs: usize) -> Self {
+        Self {
+            first: Linear::new(layout, &format!("{name}.0"), inputs, W),
+            norm: Norm::new(layout, &format!("{name}.1")),
+            last: Linear::new(layout, &format!("{name}.3"), W, outputs),
+        }
+    }
+
+    /// See [`Linear::prepare`].
+    pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
+        self.first.prepare(flat, turned);
+        self.last.prepare(flat, turned);
+    }
+
+    /// y = f(a || b) for `a` of width `split`.
+    pub fn forward<T: Real>(
+        &self,
+        w: Weights<'_, T>,
+        (a, b, split): (Rows<'_, T>, Rows<'_, T>, usize),
+        cache: &mut MlpCache<T>,
+        y: RowsMut<'_, T>,
+    ) {
+        let first = &self.first;
+        cache.before.reset(W, a.len);
+        cache.stats.reset(2, a.len);
+        cache.hidden.reset(W, a.len);
+        first.forward_part(w, (0, split), a, cache.before.rows_mut(), Start::Bias(first.bias(w)));
+        first.forward_part(w, (split, first.inputs - split), b, cache.before.rows_mut(), Start::Add);
+        let affine = self.norm.affine(w.flat);
+        simd(
+            #[inline(always)]
+            || normalise(cache.before.as_slice(), &affine, cache.stats.as_mut_slice(), cache.hidden.as_mut_slice()),
+        );
+        self.last.forward(w, cache.hidden.rows(), y);
+    }
+
+    /// Adds all gradients; afterwards [`Mlp::d_first`] is the gradient at the output of the first layer.
+    pub fn backward<T: Real>(
+        &self,
+        flat: &[T],
+        (a, b, split): (Rows<'_, T>, Rows<'_, T>, usize),
+        dy: Rows<'_, T>,
+        cache: &mut MlpCache<T>,
+        grads: &mut [T],
+    ) {
+        self.last.backward_bias(dy, grads);
+        self.last.backward_part((0, W), cache.hidden.rows(), dy, grads);
+        // The hidden layer has served; its gradient takes its place, then the first layer's that of `before`.
+        self.last.backward_input(flat, (0, W), dy, cache.hidden.rows_mut(), Start::Zero);
+        let affine = self.norm.affine(flat);
+        let mut sums = Affine::zero();
+        simd(
+            #[inline(always)]
+            || normalise_back(cache.before.as_mut_slice(), &affine, cache.stats.as_slice(), cache.hidden.as_slice(), &mut sums),
+        );
+        self.norm.add_grads(&sums, grads);
+        let d = cache.before.rows();
+        self.first.backward_bias(d, grads);
+        self.first.backward_part((0, split), a, d, grads);
+        self.first.backward_part((split, self.first.inputs - split), b, d, grads);
+    }
+
+    /// After [`Mlp::backward`]: the gradient at the output of the first layer.
+    pub fn d_first<'a, T: Real>(&self, cache: &'a MlpCache<T>) -> Rows<'a, T> {
+        cache.before.rows()
+    }
+}
+
+#[inline(always)]
+fn normalise<T: Real, const W: usize>(x: &[T], p: &Affine<T, W>, stats: &mut [T], y: &mut [T]) {
+    let rows = x.as_chunks::<W>().0.iter().zip(y.as_chunks_mut::<W>().0);
+    for ((x, y), stats) in rows.zip(stats.as_chunks_mut::<2>().0) {
+        let s = norm::stats(x);
+        *stats = [s.mean, s.inverse];
+        norm::forward(x, s, p, y);
+    }
+}
+
+#[inline(always)]
+fn normalise_back<T: Real, const W: usize>(x: &mut [T], p: &Affine<T, W>, stats: &[T], dy: &[T], sums: &mut Affine<T, W>) {
+    let rows = x.as_chunks_mut::<W>().0.iter_mut().zip(dy.as_chunks::<W>().0);
+    for ((x, dy), stats) in rows.zip(stats.as_chunks::<2>().0) {
+        *x = norm::backward(x, Stats { mean: stats[0], inverse: stats[1] }, p, dy, sums);
+    }
+}

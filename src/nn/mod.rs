@@ -1,0 +1,34 @@
+//! Layers with hand-derived gradients: forward beside backward. Pure arithmetic; knows nothing of UAVs.
+//!
+//! Activations live in [`Batch`]es (nalgebra storage, one column per sample). All parameters of a network live in one flat
+//! vector described by a [`Layout`]; a layer holds offsets into it, so one network serves many threads and any scalar type.
+//! `forward` writes what `backward` needs into buffers of the caller, which are sized once and reused.
+
+mod adam;
+mod batch;
+mod edgeconv;
+mod embedding;
+mod graph;
+mod gru;
+mod kernels;
+mod linear;
+pub mod matmul;
+mod mlp;
+mod norm;
+mod params;
+mod real;
+
+pub use adam::{Adam, norm_squared};
+pub use batch::{Batch, Rows, RowsMut};
+pub use edgeconv::{EdgeConv, EdgeConvCache, EdgeScratch};
+pub use embedding::{Embedding, EmbeddingGrad};
+pub use graph::Graph;
+pub use gru::Gru;
+pub use kernels::{elu, leaky_relu, leaky_relu_back, relu, relu_back, simd};
+pub use linear::Linear;
+pub use mlp::{Mlp, MlpCache};
+pub use params::{Init, Layout, Parameter, Weights};
+pub use real::Real;
+
+/// H, the width of hidden activations.
+pub const HIDDEN: usize = 64;

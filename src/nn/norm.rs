@@ -1,0 +1,135 @@
+//! LayerNorm (eps 1e-5, scale g, shift b) followed by ReLU, sample by sample, for widths that are a multiple of 16.
+//!
+//! y = relu(g n + b) with n = (x - mean) / deviation. Backward, with e = dy g where y > 0 and means over the width:
+//! dx = (e - mean(e) - n mean(e n)) / deviation.
+
+use super::params::{Init, Layout};
+use super::real::Real;
+
+/// Lanes of a reduction: fixed, so that sums have a fixed order that vector units like.
+const LANES: usize = 16;
+const EPS: f64 = 1e-5;
+
+/// Offsets of scale and shift.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Norm<const W: usize> {
+    scale: usize,
+    shift: usize,
+}
+
+/// mean and 1 / deviation of a sample.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Stats<T> {
+    pub(super) mean: T,
+    pub(super) inverse: T,
+}
+
+/// Scale and shift, or their gradients.
+#[derive(Clone, Copy)]
+pub(super) struct Affine<T, const W: usize> {
+    pub(super) scale: [T; W],
+    pub(super) shift: [T; W],
+}
+
+impl<const W: usize> Norm<W> {
+    pub(super) fn new(layout: &mut Layout, name: &str) -> Self {
+        let scale = layout.add(format!("{name}.weight"), &[W], Init::Constant(1.0));
+        let shift = layout.add(format!("{name}.bias"), &[W], Init::Constant(0.0));
+        Self { scale, shift }
+    }
+
+    pub(super) fn affine<T: Real>(&self, flat: &[T]) -> Affine<T, W> {
+        let at = |from: usize| flat[from..from + W].try_into().expect("W numbers");
+        Affine { scale: at(self.scale), shift: at(self.shift) }
+    }
+
+    /// Adds gradients gathered in `sums`.
+    pub(super) fn add_grads<T: Real>(&self, sums: &Affine<T, W>, grads: &mut [T]) {
+        grads[self.scale..][..W].iter_mut().zip(&sums.scale).for_each(|(g, &s)| *g += s);
+        grads[self.shift..][..W].iter_mut().zip(&sums.shift).for_each(|(g, &s)| *g += s);
+    }
+}
+
+impl<T: Real, const W: usize> Affine<T, W> {
+    pub(super) fn zero() -> Self {
+        Self { scale: [T::ZERO; W], shift: [T::ZERO; W] }
+    }
+}
+
+/// Sum of all lanes, in halves.
+#[inline(always)]
+fn fold<T: Real>(mut lanes: [T; LANES]) -> T {
+    let mut width = LANES / 2;
+    while width > 0 {
+        for l in 0..width {
+            lanes[l] += lanes[l + width];
+        }
+        width /= 2;
+    }
+    lanes[0]
+}
+
+#[inline(always)]
+pub(super) fn stats<T: Real, const W: usize>(x: &[T; W]) -> Stats<T> {
+    let share = T::of(1.0 / W as f64);
+    let mut sum = [T::ZERO; LANES];
+    for c in x.chunks_exact(LANES) {
+        for l in 0..LANES {
+            sum[l] += c[l];
+        }
+    }
+    let mean = fold(sum) * share;
+    let mut square = [T::ZERO; LANES];
+    for c in x.chunks_exact(LANES) {
+        for l in 0..LANES {
+            let d = c[l] - mean;
+            square[l] = d.mul_add(d, square[l]);
+        }
+    }
+    let variance = fold(square) * share;
+    Stats { mean, inverse: T::ONE / (variance + T::of(EPS)).sqrt() }
+}
+
+/// y = relu(g n + b).
+#[inline(always)]
+pub(super) fn forward<T: Real, const W: usize>(x: &[T; W], s: Stats<T>, p: &Affine<T, W>, y: &mut [T; W]) {
+    for c in 0..W {
+        let n = (x[c] - s.mean) * s.inverse;
+        y[c] = n.mul_add(p.scale[c], p.shift[c]).relu();
+    }
+}
+
+/// dx from x and dy; adds the gradients of scale and shift.
+#[inline(always)]
+pub(super) fn backward<T: Real, const W: usize>(
+    x: &[T; W],
+    s: Stats<T>,
+    p: &Affine<T, W>,
+    dy: &[T; W],
+    grads: &mut Affine<T, W>,
+) -> [T; W] {
+    let share = T::of(1.0 / W as f64);
+    let mut n = [T::ZERO; W];
+    let mut e = [T::ZERO; W];
+    for c in 0..W {
+        n[c] = (x[c] - s.mean) * s.inverse;
+        let open = n[c].mul_add(p.scale[c], p.shift[c]) > T::ZERO;
+        let d = if open { dy[c] } else { T::ZERO };
+        grads.scale[c] = d.mul_add(n[c], grads.scale[c]);
+        grads.shift[c] += d;
+        e[c] = d * p.scale[c];
+    }
+    let (mut sum, mut product) = ([T::ZERO; LANES], [T::ZERO; LANES]);
+    for (e, n) in e.chunks_exact(LANES).zip(n.chunks_exact(LANES)) {
+        for l in 0..LANES {
+            sum[l] += e[l];
+            product[l] = e[l].mul_add(n[l], product[l]);
+        }
+    }
+    let (mean, slope) = (fold(sum) * share, fold(product) * share);
+    let mut dx = [T::ZERO; W];
+    for c in 0..W {
+        dx[c] = s.inverse * ((e[c] - mean) - n[c] * slope);
+    }
+    dx
+}

@@ -1,0 +1,89 @@
+//! Where each parameter lies in a network's flat vector: name, shape, range, and how it is drawn at first.
+
+use std::ops::Range;
+
+use rand::{Rng, RngExt};
+
+use super::real::Real;
+
+/// How a parameter is drawn at first.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Init {
+    /// All equal.
+    Constant(f64),
+    /// Uniform in [-bound, bound].
+    Uniform(f64),
+    /// Normal with mean 0 and this deviation.
+    Normal(f64),
+}
+
+/// One named tensor.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Parameter {
+    /// `PyTorch`'s name, as in the golden files: `agent.fc.weight`.
+    pub name: String,
+    /// `PyTorch`'s shape; row-major.
+    pub shape: Vec<usize>,
+    /// Its place in the flat vector.
+    pub range: Range<usize>,
+    init: Init,
+}
+
+/// The parameters of a network, in the order of its flat vector.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Layout {
+    parameters: Vec<Parameter>,
+}
+
+/// A network's flat vector, and the forms derived from it that products need (each layer's `prepare` writes its own).
+#[derive(Clone, Copy, Debug)]
+pub struct Weights<'a, T> {
+    /// The parameters.
+    pub flat: &'a [T],
+    /// As long as `flat`: weights transposed, and other derived forms, at the places of what they derive from.
+    pub turned: &'a [T],
+}
+
+impl Layout {
+    /// Appends a parameter and returns where it begins.
+    pub fn add(&mut self, name: impl Into<String>, shape: &[usize], init: Init) -> usize {
+        let start = self.len();
+        let range = start..start + shape.iter().product::<usize>();
+        self.parameters.push(Parameter { name: name.into(), shape: shape.to_vec(), range, init });
+        start
+    }
+
+    /// Length of the flat vector.
+    pub fn len(&self) -> usize {
+        self.parameters.last().map_or(0, |p| p.range.end)
+    }
+
+    /// Whether there is no parameter.
+    pub fn is_empty(&self) -> bool {
+        self.parameters.is_empty()
+    }
+
+    /// All parameters, in order.
+    pub fn parameters(&self) -> &[Parameter] {
+        &self.parameters
+    }
+
+    /// Draws every parameter, in order.
+    pub fn initialise<T: Real>(&self, rng: &mut impl Rng) -> Vec<T> {
+        let mut flat = Vec::with_capacity(self.len());
+        for p in &self.parameters {
+            for _ in p.range.clone() {
+                flat.push(T::of(match p.init {
+                    Init::Constant(x) => x,
+                    Init::Uniform(bound) => bound * (2.0 * rng.random::<f64>() - 1.0),
+                    Init::Normal(deviation) => {
+                        // Box and Muller; 1 - u is never 0.
+                        let (u, angle) = (1.0 - rng.random::<f64>(), std::f64::consts::TAU * rng.random::<f64>());
+                        deviation * (-2.0 * u.ln()).sqrt() * angle.cos()
+                    }
+                }));
+            }
+        }
+        flat
+    }
+}

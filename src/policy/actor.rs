@@ -1,0 +1,92 @@
+//! Batched rollout: B equal fleets act together, slot after slot, with no allocation per step.
+
+use super::agent::{Agent, AgentCache};
+use super::config::TOKEN;
+use super::features::{Inputs, NO_ACTION};
+use super::geometry::Geometry;
+use crate::nn::{HIDDEN, Weights};
+
+/// What B fleets see in one slot.
+#[derive(Clone, Copy, Debug)]
+pub struct StepInput<'a> {
+    /// (B, M, 2) UAV positions.
+    pub uav_xy: &'a [f32],
+    /// (B, N, 2) user positions.
+    pub user_xy: &'a [f32],
+    /// (B, N) AoI in slots.
+    pub aoi: &'a [f32],
+}
+
+/// B fleets of an agent's own size: their hidden states and last actions, and all buffers.
+#[derive(Debug)]
+pub struct Actor {
+    fleets: usize,
+    flat: Vec<f32>,
+    turned: Vec<f32>,
+    hidden: Vec<f32>,
+    last: Vec<u8>,
+    token: Vec<f32>,
+    geometry: Geometry,
+    cache: AgentCache<f32>,
+}
+
+impl Actor {
+    /// Room for `fleets` fleets; call [`Actor::begin`] before the first step.
+    pub fn new(agent: &Agent, fleets: usize) -> Self {
+        let (len, rows) = (agent.layout().len(), fleets * agent.dims().uavs);
+        Self {
+            fleets,
+            flat: vec![0.0; len],
+            turned: vec![0.0; len],
+            hidden: vec![0.0; rows * HIDDEN],
+            last: vec![NO_ACTION; rows],
+            token: vec![0.0; rows * TOKEN],
+            geometry: Geometry::default(),
+            cache: AgentCache::default(),
+        }
+    }
+
+    /// Begins an episode, to be flown with these parameters. `token` is (B, M, 4), used by agents with that identity.
+    ///
+    /// # Panics
+    /// When a length does not fit.
+    pub fn begin(&mut self, agent: &Agent, params: &[f32], token: &[f32]) {
+        self.flat.copy_from_slice(params);
+        agent.prepare(&self.flat, &mut self.turned);
+        self.token.copy_from_slice(token);
+        self.hidden.fill(0.0);
+        self.last.fill(NO_ACTION);
+    }
+
+    /// Q-values (B, M, A) of the next slot; advances the hidden states.
+    ///
+    /// # Panics
+    /// When a length does not fit.
+    pub fn step(&mut self, agent: &Agent, input: StepInput<'_>) -> &[f32] {
+        let (m, n) = (agent.dims().uavs, agent.dims().users);
+        let lengths = (input.uav_xy.len(), input.user_xy.len(), input.aoi.len());
+        assert_eq!(lengths, (self.fleets * m * 2, self.fleets * n * 2, self.fleets * n), "B fleets of M and N");
+        let config = agent.geometry();
+        self.geometry.clear();
+        for f in 0..self.fleets {
+            let (uav_xy, user_xy) = (&input.uav_xy[f * 2 * m..][..2 * m], &input.user_xy[f * 2 * n..][..2 * n]);
+            self.geometry.push_scene(&config, uav_xy, user_xy, &input.aoi[f * n..][..n]);
+        }
+        self.geometry.finish(&config);
+        let rows = self.fleets * m;
+        self.cache.begin(rows, 1).copy_from_slice(&self.hidden);
+        let weights = Weights { flat: &self.flat, turned: &self.turned };
+        let inputs = Inputs { geometry: &self.geometry, last: &self.last, token: &self.token, position: input.uav_xy };
+        agent.forward(weights, &inputs, 1, &mut self.cache);
+        self.hidden.copy_from_slice(self.cache.last_hidden(rows));
+        self.cache.q.as_slice()
+    }
+
+    /// Records the actions taken (B, M), the next slot's last actions.
+    ///
+    /// # Panics
+    /// When there is not one per UAV.
+    pub fn acted(&mut self, actions: &[u8]) {
+        self.last.copy_from_slice(actions);
+    }
+}

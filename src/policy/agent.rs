@@ -1,0 +1,297 @@
+//! The agent (spec 3): parameters shared by all UAVs; only the GRU walks over time.
+//!
+//!     x = relu(fc(input))        h_k = GRU(x, h_{k-1})
+//!     no graph:    Q = head(h)
+//!     with one:    y = leaky(w1 h) for UAVs, leaky(w2 obs) for users; graph layers with ReLU between; Q = head(h || y)
+//!
+//! All slots of all fleets go through each layer at once. UAV rows are time-major: slot, fleet, UAV.
+
+use super::config::{AgentConfig, Aggregation, Gnn, Identity, Observation};
+use super::features::{Inputs, SetEncoder, flat_observation, identity_width, write_rest};
+use super::geometry::GeometryConfig;
+use crate::invalid::Invalid;
+use crate::nn::matmul::Start;
+use crate::nn::{
+    Batch, EdgeConv, EdgeConvCache, EdgeScratch, Gru, HIDDEN, Layout, Linear, Mlp, MlpCache, Real, Rows, Weights, leaky_relu,
+    leaky_relu_back, relu, relu_back,
+};
+
+/// Sizes of the fleet and the environment that an agent is made for.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Dims {
+    /// M.
+    pub uavs: usize,
+    /// N.
+    pub users: usize,
+    /// A, the number of actions.
+    pub actions: usize,
+    /// d.
+    pub detection_range: f64,
+    /// K, what AoI is divided by.
+    pub slots: usize,
+}
+
+/// An agent's architecture and where its parameters lie.
+#[derive(Clone, Debug)]
+pub struct Agent {
+    config: AgentConfig,
+    dims: Dims,
+    layout: Layout,
+    sets: Option<SetEncoder>,
+    fc: Linear,
+    rnn: Gru,
+    body: Body,
+    /// Width of an observation.
+    observation: usize,
+}
+
+#[derive(Clone, Debug)]
+enum Body {
+    Plain { head: Linear },
+    Graph { w1: Linear, w2: Linear, layers: Vec<EdgeConv>, head: Mlp<HIDDEN> },
+}
+
+/// Activations of one forward pass, and scratch of its backward pass.
+#[derive(Debug, Default)]
+pub struct AgentCache<T: Real> {
+    /// (slots + 1) blocks of hidden states: before the first slot, then after each.
+    pub h: Batch<T>,
+    /// Q-values, A per UAV row.
+    pub q: Batch<T>,
+    input: Batch<T>,
+    user_obs: Batch<T>,
+    x: Batch<T>,
+    gates: Batch<T>,
+    /// Input of each graph layer; the last is the output of the last.
+    y: Vec<Batch<T>>,
+    layers: Vec<EdgeConvCache<T>>,
+    head: MlpCache<T>,
+    scratch: Scratch<T>,
+}
+
+#[derive(Debug, Default)]
+struct Scratch<T: Real> {
+    dh: Batch<T>,
+    dx: Batch<T>,
+    dy: Batch<T>,
+    next: Batch<T>,
+    observation: Batch<T>,
+    edges: EdgeScratch<T>,
+}
+
+impl<T: Real> AgentCache<T> {
+    /// Makes room for `slots` slots of `rows` UAVs, and returns the hidden state before the first, to be filled in.
+    pub fn begin(&mut self, rows: usize, slots: usize) -> &mut [T] {
+        self.h.reset(HIDDEN, rows * (slots + 1));
+        &mut self.h.as_mut_slice()[..rows * HIDDEN]
+    }
+
+    /// Hidden states after the last slot.
+    pub fn last_hidden(&self, rows: usize) -> &[T] {
+        &self.h.as_slice()[self.h.as_slice().len() - rows * HIDDEN..]
+    }
+}
+
+impl Agent {
+    /// The agent's own layout: `agent.*`.
+    pub fn new(config: AgentConfig, dims: Dims) -> Self {
+        let mut layout = Layout::default();
+        let m = dims.uavs;
+        let sets =
+            (config.observation == Observation::Set).then(|| SetEncoder::new(&mut layout, "agent.sets", dims.detection_range));
+        let observation = if sets.is_some() { SetEncoder::WIDTH } else { 2 * m + 3 * dims.users };
+        let position = if config.self_position { 2 } else { 0 };
+        let input = observation + dims.actions + identity_width(config.identity, m) + position;
+        let fc = Linear::new(&mut layout, "agent.fc", input, HIDDEN);
+        let rnn = Gru::new(&mut layout, "agent.rnn");
+        let body = if config.gnn == Gnn::None {
+            Body::Plain { head: Linear::new(&mut layout, "agent.head", HIDDEN, dims.actions) }
+        } else {
+            let w1 = Linear::new(&mut layout, "agent.w1", HIDDEN, HIDDEN);
+            let w2 = Linear::new(&mut layout, "agent.w2", observation, HIDDEN);
+            let mean = config.aggregation == Aggregation::Mean;
+            let layer = |l: usize| EdgeConv::new(&mut layout, &format!("agent.layers.{l}"), mean);
+            let layers = (0..config.layers).map(layer).collect();
+            Body::Graph { w1, w2, layers, head: Mlp::new(&mut layout, "agent.head", 2 * HIDDEN, dims.actions) }
+        };
+        Self { config, dims, layout, sets, fc, rnn, body, observation }
+    }
+
+    /// Its architecture.
+    pub fn config(&self) -> &AgentConfig {
+        &self.config
+    }
+
+    /// What it was made for.
+    pub fn dims(&self) -> &Dims {
+        &self.dims
+    }
+
+    /// Its parameters.
+    pub fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// How geometries must be built for it.
+    pub fn geometry(&self) -> GeometryConfig {
+        let layers = if self.config.gnn == Gnn::None { 0 } else { self.config.layers };
+        let Dims { detection_range, slots, .. } = self.dims;
+        GeometryConfig { range: detection_range, slots, layers, self_loops: self.config.self_loops }
+    }
+
+    /// Whether it fits a fleet: with flat observations only the one it was made for, with one-hot identities only its number
+    /// of UAVs, otherwise any.
+    ///
+    /// # Errors
+    /// The count that does not fit, and what would.
+    pub fn check_fleet(&self, uavs: usize, users: usize) -> Result<(), Invalid> {
+        let flat = self.sets.is_none();
+        let exact = |field: &str, count: usize, fits: usize| {
+            if count == fits {
+                Ok(())
+            } else {
+                Err(Invalid::new(field, count, format!("{fits}, which this policy was trained for")))
+            }
+        };
+        if flat || self.config.identity == Identity::Onehot {
+            exact("uavs", uavs, self.dims.uavs)?;
+        }
+        if flat {
+            exact("users", users, self.dims.users)?;
+        }
+        if uavs == 0 {
+            return Err(Invalid::new("uavs", uavs, "at least 1"));
+        }
+        Ok(())
+    }
+
+    /// Fills `turned` (see [`Weights`]); both are as long as the layout, or longer.
+    pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
+        if let Some(sets) = &self.sets {
+            sets.prepare(flat, turned);
+        }
+        self.fc.prepare(flat, turned);
+        self.rnn.prepare(flat, turned);
+        match &self.body {
+            Body::Plain { head } => head.prepare(flat, turned),
+            Body::Graph { w1, w2, layers, head } => {
+                w1.prepare(flat, turned);
+                w2.prepare(flat, turned);
+                layers.iter().for_each(|layer| layer.prepare(flat, turned));
+                head.prepare(flat, turned);
+            }
+        }
+    }
+
+    /// Writes the observations of rows `first` and on, `stride` apart.
+    fn observe<T: Real>(&self, w: Weights<'_, T>, inputs: &Inputs<'_>, first: usize, out: &mut [T], stride: usize) {
+        match &self.sets {
+            Some(sets) => sets.forward(w, inputs.geometry, first, out, stride),
+            None => {
+                for (r, out) in out.chunks_exact_mut(stride).enumerate() {
+                    flat_observation(&inputs.geometry.view(first + r), &mut out[..self.observation]);
+                }
+            }
+        }
+    }
+
+    /// Q-values and hidden states of `slots` slots; [`AgentCache::begin`] has been called.
+    pub fn forward<T: Real>(&self, w: Weights<'_, T>, inputs: &Inputs<'_>, slots: usize, c: &mut AgentCache<T>) {
+        let uavs = inputs.geometry.uav_rows();
+        let rows = inputs.geometry.rows();
+        c.input.reset(self.fc.inputs, uavs);
+        self.observe(w, inputs, 0, c.input.as_mut_slice(), self.fc.inputs);
+        for (r, input) in c.input.as_mut_slice().chunks_exact_mut(self.fc.inputs).enumerate() {
+            write_rest(&self.config, self.dims.actions, inputs, r, &mut input[self.observation..]);
+        }
+        c.x.reset(HIDDEN, uavs);
+        self.fc.forward(w, c.input.rows(), c.x.rows_mut());
+        relu(c.x.as_mut_slice());
+        self.rnn.forward(w, c.x.rows(), slots, &mut c.gates, &mut c.h);
+        let h = hidden(&c.h, uavs);
+        c.q.reset(self.dims.actions, uavs);
+        match &self.body {
+            Body::Plain { head } => head.forward(w, h, c.q.rows_mut()),
+            Body::Graph { w1, w2, layers, head } => {
+                let graph = inputs.geometry.graph();
+                c.user_obs.reset(self.observation, rows - uavs);
+                self.observe(w, inputs, uavs, c.user_obs.as_mut_slice(), self.observation);
+                c.y.resize_with(layers.len() + 1, Batch::default);
+                c.layers.resize_with(layers.len(), EdgeConvCache::default);
+                c.y[0].reset(HIDDEN, rows);
+                w1.forward(w, h, c.y[0].range_mut(0..uavs));
+                w2.forward(w, c.user_obs.rows(), c.y[0].range_mut(uavs..rows));
+                leaky_relu(c.y[0].as_mut_slice());
+                for (l, layer) in layers.iter().enumerate() {
+                    let [x, y] = &mut c.y[l..l + 2] else { unreachable!("one batch more than layers") };
+                    y.reset(HIDDEN, graph.span(l, layers.len()).1);
+                    layer.forward(w, graph, x.rows(), &mut c.layers[l], y.rows_mut());
+                    if l + 1 < layers.len() {
+                        relu(y.as_mut_slice());
+                    }
+                }
+                head.forward(w, (h, c.y[layers.len()].rows(), HIDDEN), &mut c.head, c.q.rows_mut());
+            }
+        }
+    }
+
+    /// Adds the gradients of all parameters, given those of the Q-values of the last forward pass. Spoils the cache.
+    pub fn backward<T: Real>(
+        &self,
+        w: Weights<'_, T>,
+        (inputs, slots): (&Inputs<'_>, usize),
+        dq: Rows<'_, T>,
+        c: &mut AgentCache<T>,
+        grads: &mut [T],
+    ) {
+        let uavs = inputs.geometry.uav_rows();
+        let h = hidden(&c.h, uavs);
+        let s = &mut c.scratch;
+        s.dh.reset(HIDDEN, uavs);
+        match &self.body {
+            Body::Plain { head } => head.backward(w.flat, h, dq, grads, Some(s.dh.rows_mut())),
+            Body::Graph { w1, w2, layers, head } => {
+                let graph = inputs.geometry.graph();
+                head.backward(w.flat, (h, c.y[layers.len()].rows(), HIDDEN), dq, &mut c.head, grads);
+                let d = head.d_first(&c.head);
+                head.first.backward_input(w.flat, (0, HIDDEN), d, s.dh.rows_mut(), Start::Zero);
+                s.dy.reset(HIDDEN, uavs);
+                head.first.backward_input(w.flat, (HIDDEN, HIDDEN), d, s.dy.rows_mut(), Start::Zero);
+                for (l, layer) in layers.iter().enumerate().rev() {
+                    if l + 1 < layers.len() {
+                        relu_back(c.y[l + 1].as_slice(), s.dy.as_mut_slice());
+                    }
+                    let forward = (graph, c.y[l].rows(), &c.layers[l]);
+                    layer.backward(w.flat, forward, &mut s.dy, &mut s.edges, (grads, &mut s.next));
+                    std::mem::swap(&mut s.dy, &mut s.next);
+                }
+                leaky_relu_back(c.y[0].as_slice(), s.dy.as_mut_slice());
+                let (own, users) = (s.dy.range(0..uavs), s.dy.range(uavs..s.dy.len()));
+                w1.backward_bias(own, grads);
+                w1.backward_part((0, HIDDEN), h, own, grads);
+                w1.backward_input(w.flat, (0, HIDDEN), own, s.dh.rows_mut(), Start::Add);
+                w2.backward_bias(users, grads);
+                w2.backward_part((0, self.observation), c.user_obs.rows(), users, grads);
+                if let Some(sets) = &self.sets {
+                    s.observation.reset(SetEncoder::WIDTH, users.len);
+                    w2.backward_input(w.flat, (0, SetEncoder::WIDTH), users, s.observation.rows_mut(), Start::Zero);
+                    sets.backward(w, (inputs.geometry, uavs), s.observation.rows(), grads);
+                }
+            }
+        }
+        self.rnn.backward(w.flat, (c.x.rows(), slots), &c.h, (&mut c.gates, &mut s.dh), grads);
+        self.rnn.backward_input(w.flat, &c.gates, &mut s.dx);
+        relu_back(c.x.as_slice(), s.dx.as_mut_slice());
+        self.fc.backward(w.flat, c.input.rows(), s.dx.rows(), grads, None);
+        if let Some(sets) = &self.sets {
+            s.observation.reset(SetEncoder::WIDTH, uavs);
+            self.fc.backward_input(w.flat, (0, SetEncoder::WIDTH), s.dx.rows(), s.observation.rows_mut(), Start::Zero);
+            sets.backward(w, (inputs.geometry, 0), s.observation.rows(), grads);
+        }
+    }
+}
+
+/// Hidden states after each slot.
+fn hidden<T: Real>(h: &Batch<T>, uavs: usize) -> Rows<'_, T> {
+    h.range(h.len() - uavs..h.len())
+}

@@ -1,0 +1,193 @@
+//! What a node's network is fed (spec 2.1, 2.2, 2.4): observations, last action, identity, own position.
+
+use super::config::{AgentConfig, Identity, TOKEN};
+use super::geometry::{Geometry, View};
+use crate::nn::{Embedding, EmbeddingGrad, HIDDEN, Layout, Real, Rows, Weights, simd};
+
+/// Last action of a UAV that has not acted yet.
+pub const NO_ACTION: u8 = u8::MAX;
+
+/// One batch of inputs: geometry, and what UAV rows know beside it.
+#[derive(Clone, Copy, Debug)]
+pub struct Inputs<'a> {
+    /// Who sees whom; its first rows are the UAVs.
+    pub geometry: &'a Geometry,
+    /// Last action per UAV row, [`NO_ACTION`] at slot 0.
+    pub last: &'a [u8],
+    /// Identity token per UAV row, where the agent has one.
+    pub token: &'a [f32],
+    /// Own position (x, y) per UAV row, where the agent knows it.
+    pub position: &'a [f32],
+}
+
+/// Writes the flat observation (spec 2.1) of one node, 2M + 3N wide.
+pub fn flat_observation<T: Real>(view: &View<'_>, out: &mut [T]) {
+    out.fill(T::ZERO);
+    let uavs = view.fleet.uavs;
+    let (seen_uavs, seen_users) = out.split_at_mut(2 * uavs);
+    let mut user = |j: usize, rel: [f32; 2]| {
+        seen_users[3 * j..3 * j + 3].copy_from_slice(&[T::of(rel[0].into()), T::of(rel[1].into()), T::of(view.aoi[j].into())]);
+    };
+    if view.node >= uavs {
+        user(view.node - uavs, [0.0; 2]);
+    }
+    for d in view.detections {
+        let target = d.target as usize;
+        match target.checked_sub(uavs) {
+            Some(j) => user(j, d.rel),
+            None => seen_uavs[2 * target..2 * target + 2].copy_from_slice(&d.rel.map(|x| T::of(x.into()))),
+        }
+    }
+}
+
+/// Writes the flat state (spec 2.3) of a fleet, 2M + 3N wide: positions as (x, y) each, AoI in slots, K slots.
+pub fn flat_state<T: Real>(uav_xy: &[f32], user_xy: &[f32], aoi: &[f32], slots: usize, out: &mut [T]) {
+    let (uavs, users) = out.split_at_mut(uav_xy.len());
+    uavs.iter_mut().zip(uav_xy).for_each(|(s, &x)| *s = T::of(x.into()));
+    for (user, (xy, a)) in users.chunks_exact_mut(3).zip(user_xy.chunks_exact(2).zip(aoi)) {
+        user.copy_from_slice(&[T::of(xy[0].into()), T::of(xy[1].into()), T::of((a / slots as f32).into())]);
+    }
+}
+
+/// Writes what follows the observation in a UAV's input (spec 2.4).
+pub(super) fn write_rest<T: Real>(config: &AgentConfig, actions: usize, inputs: &Inputs<'_>, row: usize, out: &mut [T]) {
+    out.fill(T::ZERO);
+    let (last, rest) = out.split_at_mut(actions);
+    if inputs.last[row] != NO_ACTION {
+        last[inputs.last[row] as usize] = T::ONE;
+    }
+    let view = inputs.geometry.view(row);
+    let identity = identity_width(config.identity, view.fleet.uavs);
+    let (own, position) = rest.split_at_mut(identity);
+    match config.identity {
+        Identity::None => {}
+        Identity::Onehot => own[view.node] = T::ONE,
+        Identity::Phase => {
+            let turn = std::f64::consts::TAU * view.node as f64 / view.fleet.uavs as f64;
+            own.copy_from_slice(&[T::of(turn.cos()), T::of(turn.sin())]);
+        }
+        Identity::Token => {
+            let token = &inputs.token[row * TOKEN..][..TOKEN];
+            own.iter_mut().zip(token).for_each(|(o, &t)| *o = T::of(t.into()));
+        }
+    }
+    if config.self_position {
+        let own = &inputs.position[2 * row..][..2];
+        position.iter_mut().zip(own).for_each(|(o, &p)| *o = T::of(p.into()) - T::of(0.5));
+    }
+}
+
+/// Width of an identity among `uavs` UAVs.
+pub(super) fn identity_width(identity: Identity, uavs: usize) -> usize {
+    match identity {
+        Identity::Onehot => uavs,
+        Identity::Phase => 2,
+        Identity::Token => TOKEN,
+        Identity::None => 0,
+    }
+}
+
+/// The set observation (spec 2.2): sums of embeddings of visible UAVs, and of visible users.
+#[derive(Clone, Copy, Debug)]
+pub struct SetEncoder {
+    uav: Embedding<2>,
+    user: Embedding<3>,
+    /// 1 / d.
+    scale: f64,
+}
+
+impl SetEncoder {
+    /// Width of the observation.
+    pub const WIDTH: usize = 2 * HIDDEN;
+
+    pub(super) fn new(layout: &mut Layout, name: &str, range: f64) -> Self {
+        let uav = Embedding::new(layout, &format!("{name}.uav"));
+        Self { uav, user: Embedding::new(layout, &format!("{name}.user")), scale: 1.0 / range }
+    }
+
+    pub(super) fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
+        self.uav.prepare(flat, turned);
+        self.user.prepare(flat, turned);
+    }
+
+    /// Observations of rows `first` and on, into the first columns of rows of `stride` numbers.
+    pub(super) fn forward<T: Real>(&self, w: Weights<'_, T>, geometry: &Geometry, first: usize, out: &mut [T], stride: usize) {
+        let (uav, user, scale) = (self.uav.load(w), self.user.load(w), T::of(self.scale));
+        simd(
+            #[inline(always)]
+            || {
+                for (r, out) in out.chunks_exact_mut(stride).enumerate() {
+                    let [uavs, users] = out[..Self::WIDTH].as_chunks_mut::<HIDDEN>().0 else { unreachable!("two halves") };
+                    encode(&geometry.view(first + r), scale, (&uav, &user), (uavs, users));
+                }
+            },
+        );
+    }
+
+    /// Adds gradients, given those of the observations of rows `first` and on.
+    pub(super) fn backward<T: Real>(
+        &self,
+        w: Weights<'_, T>,
+        (geometry, first): (&Geometry, usize),
+        d: Rows<'_, T>,
+        grads: &mut [T],
+    ) {
+        let (uav, user, scale) = (self.uav.load(w), self.user.load(w), T::of(self.scale));
+        let (mut uav_sums, mut user_sums) = (EmbeddingGrad::zero(), EmbeddingGrad::zero());
+        simd(
+            #[inline(always)]
+            || {
+                for (r, d) in d.data.chunks(d.stride).take(d.len).enumerate() {
+                    let [uavs, users] = d[..Self::WIDTH].as_chunks::<HIDDEN>().0 else { unreachable!("two halves") };
+                    let sums = (&mut uav_sums, &mut user_sums);
+                    encode_back(&geometry.view(first + r), scale, (&uav, &user), (uavs, users), sums);
+                }
+            },
+        );
+        self.uav.add_grads(&uav_sums, grads);
+        self.user.add_grads(&user_sums, grads);
+    }
+}
+
+#[inline(always)]
+fn encode<T: Real>(
+    view: &View<'_>,
+    scale: T,
+    (uav, user): (&EmbeddingGrad<T, 2>, &EmbeddingGrad<T, 3>),
+    (uav_sum, user_sum): (&mut [T; HIDDEN], &mut [T; HIDDEN]),
+) {
+    let (mut uavs, mut users) = ([T::ZERO; HIDDEN], [T::ZERO; HIDDEN]);
+    each_seen(view, scale, |point| uav.add(point, &mut uavs), |point| user.add(point, &mut users));
+    *uav_sum = uavs;
+    *user_sum = users;
+}
+
+#[inline(always)]
+fn encode_back<T: Real>(
+    view: &View<'_>,
+    scale: T,
+    (uav, user): (&EmbeddingGrad<T, 2>, &EmbeddingGrad<T, 3>),
+    (d_uav, d_user): (&[T; HIDDEN], &[T; HIDDEN]),
+    (uav_sums, user_sums): (&mut EmbeddingGrad<T, 2>, &mut EmbeddingGrad<T, 3>),
+) {
+    each_seen(view, scale, |point| uav.backward(point, d_uav, uav_sums), |point| user.backward(point, d_user, user_sums));
+}
+
+/// Every entity a node sees; a user sees itself.
+#[inline(always)]
+fn each_seen<T: Real>(view: &View<'_>, scale: T, mut uav: impl FnMut([T; 2]), mut user: impl FnMut([T; 3])) {
+    let m = view.fleet.uavs;
+    let aoi = |node: usize| T::of(view.aoi[node - m].into());
+    if view.node >= m {
+        user([T::ZERO, T::ZERO, aoi(view.node)]);
+    }
+    for d in view.detections {
+        let [x, y] = d.rel.map(|x| T::of(x.into()) * scale);
+        let target = d.target as usize;
+        if target < m {
+            uav([x, y]);
+        } else {
+            user([x, y, aoi(target)]);
+        }
+    }
+}

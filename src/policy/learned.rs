@@ -1,0 +1,158 @@
+//! A trained agent as a [`Policy`]: a ragged batch of fleets in one forward pass.
+//!
+//! Memory per UAV: hidden state (64), last heading (-1 before the first), and its token where the agent has that identity.
+
+use std::sync::{Mutex, PoisonError};
+
+use rand::RngExt;
+
+use super::agent::{Agent, AgentCache, Dims};
+use super::config::{AgentConfig, Identity, TOKEN};
+use super::features::{Inputs, NO_ACTION};
+use super::geometry::Geometry;
+use super::{Needs, Policy, Turn};
+use crate::invalid::Invalid;
+use crate::nn::{HIDDEN, Weights};
+use crate::rng;
+
+/// A trained agent, its weights prepared once. Shared by threads.
+#[derive(Debug)]
+pub struct Learned {
+    agent: Agent,
+    flat: Vec<f32>,
+    turned: Vec<f32>,
+    /// Buffers of calls that are over; a call takes one or makes one.
+    buffers: Mutex<Vec<Box<Buffers>>>,
+}
+
+#[derive(Debug, Default)]
+struct Buffers {
+    geometry: Geometry,
+    cache: AgentCache<f32>,
+    last: Vec<u8>,
+    token: Vec<f32>,
+    position: Vec<f32>,
+}
+
+impl Learned {
+    /// The policy of `params`, in the order of the agent's layout.
+    ///
+    /// # Errors
+    /// When their number is not the architecture's, or one is not finite.
+    pub fn new(config: AgentConfig, dims: Dims, params: Vec<f32>) -> Result<Self, Invalid> {
+        let agent = Agent::new(config, dims);
+        let len = agent.layout().len();
+        if params.len() != len {
+            return Err(Invalid::new("parameters", format!("{} numbers", params.len()), format!("{len} numbers")));
+        }
+        if let Some(bad) = params.iter().find(|x| !x.is_finite()) {
+            return Err(Invalid::new("parameters", bad, "finite numbers"));
+        }
+        let mut turned = vec![0.0; len];
+        agent.prepare(&params, &mut turned);
+        Ok(Self { agent, flat: params, turned, buffers: Mutex::default() })
+    }
+
+    /// The architecture.
+    pub fn agent(&self) -> &Agent {
+        &self.agent
+    }
+
+    /// The parameters, in the order of the agent's layout.
+    pub fn parameters(&self) -> &[f32] {
+        &self.flat
+    }
+
+    fn has_token(&self) -> bool {
+        self.agent.config().identity == Identity::Token
+    }
+
+    /// Numbers remembered per UAV.
+    fn stride(&self) -> usize {
+        HIDDEN + 1 + if self.has_token() { TOKEN } else { 0 }
+    }
+}
+
+impl Policy for Learned {
+    fn actions(&self) -> usize {
+        self.agent.dims().actions
+    }
+
+    fn needs(&self) -> Needs {
+        if self.agent.config().self_position { Needs::OwnPositions } else { Needs::Detections }
+    }
+
+    fn detection_range(&self) -> f64 {
+        self.agent.dims().detection_range
+    }
+
+    fn check_fleet(&self, uavs: usize, users: usize) -> Result<(), Invalid> {
+        self.agent.check_fleet(uavs, users)
+    }
+
+    fn memory_len(&self, uavs: usize, _users: usize) -> usize {
+        uavs * self.stride()
+    }
+
+    fn start(&self, _uavs: usize, _users: usize, seed: u64, memory: &mut [f32]) {
+        let mut stream = rng::stream(seed, "token", 0);
+        for uav in memory.chunks_exact_mut(self.stride()) {
+            uav.fill(0.0);
+            uav[HIDDEN] = -1.0;
+            uav[HIDDEN + 1..].fill_with(|| 2.0 * stream.random::<f32>() - 1.0);
+        }
+    }
+
+    fn act(&self, turns: &mut [Turn<'_>]) {
+        let pool = || self.buffers.lock().unwrap_or_else(PoisonError::into_inner);
+        let taken = pool().pop();
+        let mut buffers = taken.unwrap_or_default();
+        self.run(turns, &mut buffers);
+        pool().push(buffers);
+    }
+}
+
+impl Learned {
+    fn run(&self, turns: &mut [Turn<'_>], b: &mut Buffers) {
+        let stride = self.stride();
+        let config = self.agent.geometry();
+        b.geometry.clear();
+        b.last.clear();
+        b.token.clear();
+        b.position.clear();
+        for turn in turns.iter() {
+            b.geometry.push_slot(&config, turn.slot);
+            for uav in turn.memory.chunks_exact(stride) {
+                // Memory may come from a caller: what is no heading counts as none.
+                let known = (0.0..self.actions() as f32).contains(&uav[HIDDEN]);
+                b.last.push(if known { uav[HIDDEN] as u8 } else { NO_ACTION });
+                b.token.extend_from_slice(&uav[HIDDEN + 1..]);
+            }
+            if let Some(own) = turn.slot.uav_positions() {
+                b.position.extend(own.iter().flatten().map(|&x| x as f32));
+            }
+        }
+        b.geometry.finish(&config);
+        let rows = b.geometry.uav_rows();
+        let memories = turns.iter().flat_map(|turn| turn.memory.chunks_exact(stride));
+        for (h, uav) in b.cache.begin(rows, 1).chunks_exact_mut(HIDDEN).zip(memories) {
+            h.copy_from_slice(&uav[..HIDDEN]);
+        }
+        let inputs = Inputs { geometry: &b.geometry, last: &b.last, token: &b.token, position: &b.position };
+        let weights = Weights { flat: &self.flat, turned: &self.turned };
+        self.agent.forward(weights, &inputs, 1, &mut b.cache);
+        let mut after = b.cache.last_hidden(rows).chunks_exact(HIDDEN).zip(b.cache.q.as_slice().chunks_exact(self.actions()));
+        for turn in turns {
+            for (i, uav) in turn.memory.chunks_exact_mut(stride).enumerate() {
+                let (h, q) = after.next().expect("one row per UAV");
+                let best = (1..q.len()).fold(0, |best, a| if q[a] > q[best] { a } else { best });
+                uav[..HIDDEN].copy_from_slice(h);
+                uav[HIDDEN] = best as f32;
+                turn.headings[i] = best as u8;
+                if let Some(values) = &mut turn.q_values {
+                    values[i * q.len()..][..q.len()].copy_from_slice(q);
+                }
+            }
+        }
+    }
+}

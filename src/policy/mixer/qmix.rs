@@ -1,0 +1,138 @@
+//! QMIX (spec 4.1), E = 32, s the flat state:
+//!
+//!     W1 = |Linear(64, M E)(relu(Linear(S, 64)(s)))|   b1 = Linear(S, E)(s)
+//!     w2 = |Linear(64, E)(relu(Linear(S, 64)(s)))|     b2 = Linear(E, 1)(relu(Linear(S, E)(s)))
+//!     Q_tot = w2 . ELU(q W1 + b1) + b2
+
+use super::hyper::{Hyper, HyperCache};
+use super::{E, elu_slope, sign};
+use crate::nn::{Batch, HIDDEN, Layout, Linear, Real, Rows, Weights, elu, simd};
+use crate::policy::agent::Dims;
+
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Qmix {
+    w1: Hyper,
+    b1: Linear,
+    w2: Hyper,
+    b2: Hyper,
+}
+
+#[derive(Debug, Default)]
+pub(super) struct QmixCache<T: Real> {
+    w1: HyperCache<T>,
+    w2: HyperCache<T>,
+    b2: HyperCache<T>,
+    /// b1, then ELU(q W1 + b1).
+    mixed: Batch<T>,
+}
+
+impl Qmix {
+    pub(super) fn new(layout: &mut Layout, dims: &Dims) -> Self {
+        let states = 2 * dims.uavs + 3 * dims.users;
+        Self {
+            w1: Hyper::new(layout, "mixer.w1", [states, HIDDEN, dims.uavs * E]),
+            b1: Linear::new(layout, "mixer.b1", states, E),
+            w2: Hyper::new(layout, "mixer.w2", [states, HIDDEN, E]),
+            b2: Hyper::new(layout, "mixer.b2", [states, E, 1]),
+        }
+    }
+
+    pub(super) fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
+        [&self.w1, &self.w2, &self.b2].iter().for_each(|net| net.prepare(flat, turned));
+        self.b1.prepare(flat, turned);
+    }
+
+    pub(super) fn forward<T: Real>(
+        &self,
+        w: Weights<'_, T>,
+        states: Rows<'_, T>,
+        q: Rows<'_, T>,
+        c: &mut QmixCache<T>,
+        total: &mut [T],
+    ) {
+        self.w1.forward(w, states, &mut c.w1);
+        self.w2.forward(w, states, &mut c.w2);
+        self.b2.forward(w, states, &mut c.b2);
+        c.mixed.reset(E, states.len);
+        self.b1.forward(w, states, c.mixed.rows_mut());
+        let parts = (c.w1.out.as_slice(), c.w2.out.as_slice(), c.b2.out.as_slice());
+        simd(
+            #[inline(always)]
+            || mix(parts, (q.data, q.stride), c.mixed.as_mut_slice(), total),
+        );
+    }
+
+    pub(super) fn backward<T: Real>(
+        &self,
+        w: Weights<'_, T>,
+        (states, q): (Rows<'_, T>, Rows<'_, T>),
+        c: &mut QmixCache<T>,
+        d_total: &[T],
+        (grads, dq): (&mut [T], &mut Batch<T>),
+    ) {
+        let (w1, w2) = (c.w1.out.as_mut_slice(), c.w2.out.as_mut_slice());
+        simd(
+            #[inline(always)]
+            || mix_back((w1, w2, c.mixed.as_mut_slice()), (q.data, q.stride), d_total, dq.as_mut_slice()),
+        );
+        c.b2.out.as_mut_slice().copy_from_slice(d_total);
+        self.b1.backward(w.flat, states, c.mixed.rows(), grads, None);
+        self.w1.backward(w.flat, states, &mut c.w1, grads);
+        self.w2.backward(w.flat, states, &mut c.w2, grads);
+        self.b2.backward(w.flat, states, &mut c.b2, grads);
+    }
+}
+
+#[inline(always)]
+pub(super) fn mix<T: Real>((w1, w2, b2): (&[T], &[T], &[T]), (q, uavs): (&[T], usize), mixed: &mut [T], total: &mut [T]) {
+    let (w1, w2) = (w1.as_chunks::<E>().0, w2.as_chunks::<E>().0);
+    for (g, (mixed, total)) in mixed.as_chunks_mut::<E>().0.iter_mut().zip(total).enumerate() {
+        for (w1, &q) in w1[g * uavs..][..uavs].iter().zip(&q[g * uavs..]) {
+            for e in 0..E {
+                mixed[e] = q.mul_add(w1[e].abs(), mixed[e]);
+            }
+        }
+        let mut sum = T::ZERO;
+        let mut terms = [T::ZERO; E];
+        for e in 0..E {
+            mixed[e] = elu(mixed[e]);
+            terms[e] = mixed[e] * w2[g][e].abs();
+        }
+        for x in terms {
+            sum += x;
+        }
+        *total = sum + b2[g];
+    }
+}
+
+/// w1, w2 and mixed become their gradients.
+#[inline(always)]
+pub(super) fn mix_back<T: Real>(
+    (w1, w2, mixed): (&mut [T], &mut [T], &mut [T]),
+    (q, uavs): (&[T], usize),
+    d_total: &[T],
+    dq: &mut [T],
+) {
+    let (w1, w2) = (w1.as_chunks_mut::<E>().0, w2.as_chunks_mut::<E>().0);
+    for (g, (mixed, &d)) in mixed.as_chunks_mut::<E>().0.iter_mut().zip(d_total).enumerate() {
+        let w2 = &mut w2[g];
+        for e in 0..E {
+            let y = mixed[e];
+            mixed[e] = d * w2[e].abs() * elu_slope(y);
+            w2[e] = d * y * sign(w2[e]);
+        }
+        for i in g * uavs..(g + 1) * uavs {
+            let w1 = &mut w1[i];
+            let mut terms = [T::ZERO; E];
+            for e in 0..E {
+                terms[e] = mixed[e] * w1[e].abs();
+                w1[e] = mixed[e] * q[i] * sign(w1[e]);
+            }
+            let mut sum = T::ZERO;
+            for x in terms {
+                sum += x;
+            }
+            dq[i] = sum;
+        }
+    }
+}

@@ -1,0 +1,142 @@
+//! Finds what nodes detect: pairs with distance^2 <= range^2, in f64.
+//!
+//! Few nodes are compared pair by pair; many are sorted into square cells at least as wide as the range, so that work and
+//! memory grow with the nodes and the detections. Both give the same detections in the same (ascending) order.
+
+use super::slot::Detection;
+use crate::env::Point;
+
+/// Up to this many nodes all pairs are compared.
+const FEW: usize = 48;
+
+/// Scratch of the search; keeps its allocations.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Vision {
+    /// Cell of each node.
+    cell: Vec<u32>,
+    /// Nodes of cell c are `nodes[starts[c]..starts[c + 1]]`.
+    starts: Vec<u32>,
+    nodes: Vec<u32>,
+}
+
+/// A square grid over all points.
+struct Grid {
+    low: Point,
+    size: f64,
+    side: usize,
+}
+
+impl Grid {
+    fn over(points: &[Point], range: f64) -> Self {
+        let fold = |axis: usize, f: fn(f64, f64) -> f64| points.iter().map(|p| p[axis]).fold(points[0][axis], f);
+        let low = [fold(0, f64::min), fold(1, f64::min)];
+        let extent = (fold(0, f64::max) - low[0]).max(fold(1, f64::max) - low[1]);
+        // No more cells than a few per node; a shade wider than the range, so that rounding cannot part a pair by two cells.
+        let most = (points.len() as f64).sqrt().ceil() * 2.0;
+        let size = (range * (1.0 + 1e-9)).max(extent / most).max(f64::MIN_POSITIVE);
+        Self { low, size, side: (extent / size) as usize + 1 }
+    }
+
+    fn place(&self, p: Point) -> [usize; 2] {
+        [0, 1].map(|axis| (((p[axis] - self.low[axis]) / self.size) as usize).min(self.side - 1))
+    }
+}
+
+impl Vision {
+    /// Appends what nodes 0..`observers` detect among all `points`, each in ascending order of target, without itself, and
+    /// the end of each list to `offsets`.
+    pub(super) fn look(
+        &mut self,
+        points: &[Point],
+        observers: usize,
+        range: f64,
+        offsets: &mut Vec<u32>,
+        detections: &mut Vec<Detection>,
+    ) {
+        if points.len() <= FEW {
+            for (i, &from) in points[..observers].iter().enumerate() {
+                detections.extend(points.iter().enumerate().filter_map(|(j, &to)| detect(i, from, j, to, range)));
+                offsets.push(detections.len() as u32);
+            }
+            return;
+        }
+        let grid = Grid::over(points, range);
+        self.sort(points, &grid);
+        for (i, &from) in points[..observers].iter().enumerate() {
+            let first = detections.len();
+            let [x, y] = grid.place(from);
+            for row in y.saturating_sub(1)..=(y + 1).min(grid.side - 1) {
+                let (left, right) = (x.saturating_sub(1), (x + 1).min(grid.side - 1));
+                let cells = self.starts[row * grid.side + left] as usize..self.starts[row * grid.side + right + 1] as usize;
+                let near = self.nodes[cells].iter().map(|&j| j as usize);
+                detections.extend(near.filter_map(|j| detect(i, from, j, points[j], range)));
+            }
+            detections[first..].sort_unstable_by_key(|d| d.target);
+            offsets.push(detections.len() as u32);
+        }
+    }
+
+    /// Sorts nodes by cell.
+    fn sort(&mut self, points: &[Point], grid: &Grid) {
+        self.cell.clear();
+        self.cell.extend(points.iter().map(|&p| {
+            let [x, y] = grid.place(p);
+            (y * grid.side + x) as u32
+        }));
+        self.starts.clear();
+        self.starts.resize(grid.side * grid.side + 2, 0);
+        // Counted two places on, so that filling moves each start to where its cell begins.
+        for &c in &self.cell {
+            self.starts[c as usize + 2] += 1;
+        }
+        for c in 2..self.starts.len() {
+            self.starts[c] += self.starts[c - 1];
+        }
+        self.nodes.resize(points.len(), 0);
+        for (i, &c) in self.cell.iter().enumerate() {
+            let place = &mut self.starts[c as usize + 1];
+            self.nodes[*place as usize] = i as u32;
+            *place += 1;
+        }
+    }
+}
+
+#[inline(always)]
+fn detect(i: usize, from: Point, j: usize, to: Point, range: f64) -> Option<Detection> {
+    let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
+    (dx * dx + dy * dy <= range * range && i != j).then_some(Detection { target: j as u32, rel: [dx as f32, dy as f32] })
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::RngExt;
+
+    use super::*;
+
+    fn pairs(points: &[Point], range: f64) -> (Vec<u32>, Vec<Detection>) {
+        let (mut offsets, mut detections) = (vec![0], Vec::new());
+        for (i, &from) in points.iter().enumerate() {
+            detections.extend(points.iter().enumerate().filter_map(|(j, &to)| detect(i, from, j, to, range)));
+            offsets.push(detections.len() as u32);
+        }
+        (offsets, detections)
+    }
+
+    #[test]
+    fn cells_find_what_comparing_all_pairs_finds() {
+        for (n, range, spread) in
+            [(49, 0.28, 1.0), (300, 0.04, 1.0), (500, 0.1, 30.0), (200, 1e-6, 1.0), (100, 2.0, 1.0), (60, 0.25, 0.0)]
+        {
+            let mut rng = crate::rng::stream(7, "vision", n);
+            // A lattice of quarters of the range puts many pairs exactly at the range.
+            let mut coordinate = |i: u64| {
+                let x = spread * (rng.random::<f64>() - 0.3);
+                if i % 2 == 0 { x } else { (x / range * 4.0).round() * range / 4.0 }
+            };
+            let points: Vec<Point> = (0..n).map(|i| [coordinate(i), coordinate(i)]).collect();
+            let (mut offsets, mut detections) = (vec![0], Vec::new());
+            Vision::default().look(&points, points.len(), range, &mut offsets, &mut detections);
+            assert_eq!((offsets, detections), pairs(&points, range), "{n} nodes, range {range}");
+        }
+    }
+}

@@ -1,0 +1,302 @@
+//! Recorded learner updates of an independent implementation (spec 8), replayed: visibility, observations, Q-values,
+//! targets, loss, every gradient, every parameter after the step.
+//!
+//! `QEDGIX_GOLDEN_DIR=DIR cargo test --release --test golden` checks every `*.safetensors` in DIR; without the variable, the
+//! repository's own. Prints each file with its worst tensor. A tensor that is missing, unexpected or of another shape fails.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::str::FromStr;
+
+use qedgix::learner::Episodes;
+use qedgix::learner::objective::{Objective, Returns, Trace};
+use qedgix::nn::Adam;
+use qedgix::policy::mixer::Mixing;
+use qedgix::policy::{
+    AgentConfig, Aggregation, Dims, Geometry, GeometryConfig, Gnn, Identity, Observation, TOKEN, flat_observation, flat_state,
+};
+use safetensors::{Dtype, SafeTensors};
+
+/// Allowed error of outputs and gradients, relative to the tensor's largest magnitude.
+const EXACT: f64 = 2e-5;
+/// Of parameters after the step: Adam's first step turns tiny gradients into whole steps.
+const AFTER: f64 = 2e-3;
+
+type Outcome<T> = Result<T, String>;
+
+fn main() -> ExitCode {
+    let own = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden");
+    let dir = std::env::var_os("QEDGIX_GOLDEN_DIR").map_or(own, PathBuf::from);
+    let files = match golden_files(&dir) {
+        Ok(files) => files,
+        Err(message) => {
+            println!("golden: {}: {message}", dir.display());
+            return ExitCode::FAILURE;
+        }
+    };
+    let mut failed = 0;
+    for file in &files {
+        let name = file.file_name().unwrap_or_default().to_string_lossy();
+        match check(file) {
+            Ok(worst) => println!("ok    {name}: {worst}"),
+            Err(message) => {
+                failed += 1;
+                println!("FAIL  {name}: {message}");
+            }
+        }
+    }
+    println!("golden: {} files, {failed} failed", files.len());
+    if failed == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+}
+
+fn golden_files(dir: &Path) -> Outcome<Vec<PathBuf>> {
+    let entries = std::fs::read_dir(dir).map_err(|e| e.to_string())?;
+    let paths: Result<Vec<_>, _> = entries.map(|e| e.map(|e| e.path())).collect();
+    let mut files = paths.map_err(|e| e.to_string())?;
+    files.retain(|p| p.extension().is_some_and(|e| e == "safetensors"));
+    files.sort();
+    if files.is_empty() { Err("no *.safetensors here".into()) } else { Ok(files) }
+}
+
+/// A golden file's configuration.
+struct Config {
+    agent: AgentConfig,
+    dims: Dims,
+    mixing: Mixing,
+    returns: Returns,
+    batch: usize,
+    learning_rate: f64,
+    clip: f64,
+}
+
+impl Config {
+    fn parse(meta: &HashMap<String, String>) -> Outcome<Self> {
+        let text = |key: &str| meta.get(key).map(String::as_str).ok_or_else(|| format!("metadata lacks {key}"));
+        fn number<T: FromStr>(key: &str, text: &str) -> Outcome<T> {
+            text.parse().map_err(|_| format!("metadata {key} = {text} is not a number of its kind"))
+        }
+        let count = |key: &str| number::<usize>(key, text(key)?);
+        let real = |key: &str| number::<f64>(key, text(key)?);
+        let flag = |key: &str| match text(key)? {
+            "True" => Ok(true),
+            "False" => Ok(false),
+            other => Err(format!("metadata {key} = {other} is neither True nor False")),
+        };
+        let unknown = |key: &str| Err(format!("metadata {key} = {} is unknown", meta[key]));
+        let agent = AgentConfig {
+            gnn: match text("gnn")? {
+                "none" => Gnn::None,
+                "edgeconv" => Gnn::EdgeConv,
+                "agggnn" => Gnn::AggGnn,
+                "rgcn" => Gnn::Rgcn,
+                _ => return unknown("gnn"),
+            },
+            layers: count("layers")?,
+            aggregation: match text("agg")? {
+                "mean" => Aggregation::Mean,
+                "sum" => Aggregation::Sum,
+                _ => return unknown("agg"),
+            },
+            observation: match text("encoder")? {
+                "flat" => Observation::Flat,
+                "set" => Observation::Set,
+                _ => return unknown("encoder"),
+            },
+            identity: match text("ident")? {
+                "onehot" => Identity::Onehot,
+                "phase" => Identity::Phase,
+                "token" => Identity::Token,
+                "none" => Identity::None,
+                _ => return unknown("ident"),
+            },
+            self_position: flag("self_position")?,
+            self_loops: flag("self_loops")?,
+        };
+        if count("token")? != TOKEN {
+            return Err(format!("metadata token = {}; the specification has {TOKEN}", text("token")?));
+        }
+        Ok(Self {
+            agent,
+            dims: Dims {
+                uavs: count("M")?,
+                users: count("N")?,
+                actions: count("A")?,
+                detection_range: real("d")?,
+                slots: count("K")?,
+            },
+            mixing: match text("mixer")? {
+                "qmix" => Mixing::Qmix,
+                "invariant" => Mixing::Invariant,
+                "vdn" => Mixing::Vdn,
+                _ => return unknown("mixer"),
+            },
+            returns: Returns { gamma: real("gamma")?, lambda: real("td_lambda")? },
+            batch: count("batch")?,
+            learning_rate: real("lr")?,
+            clip: real("clip")?,
+        })
+    }
+}
+
+/// A file's tensors, each taken once and its shape checked.
+struct Tensors<'a> {
+    all: SafeTensors<'a>,
+    taken: BTreeSet<String>,
+}
+
+impl Tensors<'_> {
+    fn bytes(&mut self, name: &str, shape: &[usize], dtype: Dtype) -> Outcome<&[u8]> {
+        let view = self.all.tensor(name).map_err(|_| format!("{name} is missing"))?;
+        if view.shape() != shape || view.dtype() != dtype {
+            let found = (view.shape(), view.dtype());
+            return Err(format!("{name} is {found:?} instead of {:?}", (shape, dtype)));
+        }
+        self.taken.insert(name.to_owned());
+        Ok(view.data())
+    }
+
+    fn f32(&mut self, name: &str, shape: &[usize]) -> Outcome<Vec<f32>> {
+        let bytes = self.bytes(name, shape, Dtype::F32)?;
+        let values: Vec<f32> = bytes.as_chunks().0.iter().map(|&b| f32::from_le_bytes(b)).collect();
+        if values.iter().all(|x| x.is_finite()) { Ok(values) } else { Err(format!("{name} is not finite")) }
+    }
+
+    fn actions(&mut self, name: &str, shape: &[usize], count: usize) -> Outcome<Vec<u8>> {
+        let bytes = self.bytes(name, shape, Dtype::I64)?;
+        let values = bytes.as_chunks().0.iter().map(|&b| i64::from_le_bytes(b));
+        values
+            .map(|a| u8::try_from(a).ok().filter(|&a| usize::from(a) < count).ok_or_else(|| format!("{name} has action {a}")))
+            .collect()
+    }
+}
+
+/// Compares tensors and remembers which came closest to its tolerance.
+#[derive(Default)]
+struct Report {
+    /// Share of the tolerance used, tensor, relative error.
+    worst: (f64, String, f64),
+    failures: BTreeMap<String, f64>,
+}
+
+impl Report {
+    fn compare(&mut self, name: &str, ours: &[f32], golden: &[f32], tolerance: f64) {
+        assert_eq!(ours.len(), golden.len(), "{name}");
+        let scale = golden.iter().fold(0.0, |max: f64, x| max.max(f64::from(x.abs())));
+        let difference = |(a, b): (&f32, &f32)| (f64::from(*a) - f64::from(*b)).abs();
+        // Not f64::max, which ignores NaN.
+        let largest = ours.iter().zip(golden).map(difference).fold(0.0, |m: f64, d| if d <= m { m } else { d });
+        let error = if largest == 0.0 { 0.0 } else { largest / scale };
+        if !(error <= tolerance) {
+            self.failures.insert(name.to_owned(), error);
+        }
+        if !(error / tolerance <= self.worst.0) || self.worst.1.is_empty() {
+            self.worst = (error / tolerance, name.to_owned(), error);
+        }
+    }
+}
+
+fn check(file: &Path) -> Outcome<String> {
+    let bytes = std::fs::read(file).map_err(|e| e.to_string())?;
+    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|e| e.to_string())?;
+    let config = Config::parse(header.metadata().as_ref().ok_or("no metadata")?)?;
+    let all = SafeTensors::deserialize(&bytes).map_err(|e| e.to_string())?;
+    let mut tensors = Tensors { all, taken: BTreeSet::new() };
+    let mut report = Report::default();
+    let Dims { uavs: m, users: n, slots: k, actions, .. } = config.dims;
+    let b = config.batch;
+
+    let episodes = Episodes {
+        len: b,
+        uavs: m,
+        users: n,
+        slots: k,
+        uav_xy: tensors.f32("in.uavs", &[b, k + 1, m, 2])?,
+        user_xy: tensors.f32("in.users", &[b, n, 2])?,
+        users_move: false,
+        aoi: tensors.f32("in.aoi", &[b, k + 1, n])?,
+        actions: tensors.actions("in.actions", &[b, k, m], actions)?,
+        reward: tensors.f32("in.reward", &[b, k])?,
+        token: tensors.f32("in.token", &[b, m, TOKEN])?,
+    };
+    check_features(&config, &episodes, &mut tensors, &mut report)?;
+
+    let Config { agent, dims, mixing, returns, .. } = config;
+    let mut objective = Objective::<f32>::new(agent, dims, mixing, returns, 1);
+    let layout = objective.layout().clone();
+    let mut flat = |prefix: &str| -> Outcome<Vec<f32>> {
+        let mut values = Vec::with_capacity(layout.len());
+        for p in layout.parameters() {
+            values.extend(tensors.f32(&format!("{prefix}{}", p.name), &p.shape)?);
+        }
+        Ok(values)
+    };
+    let (mut online, target, grads, after) = (flat("")?, flat("target_")?, flat("grad.")?, flat("after.")?);
+
+    let mut trace = Trace::default();
+    let figures = objective.evaluate(&online, &target, &episodes, Some(&mut trace));
+    for (name, ours, shape) in [
+        ("out.q", &trace.q[..], &[b, k + 1, m, actions][..]),
+        ("out.q_tot", &trace.q_tot, &[b, k]),
+        ("out.target", &trace.target, &[b, k]),
+        ("out.loss", &[figures.loss as f32], &[1]),
+        ("out.grad_norm", &[figures.grad_norm as f32], &[1]),
+    ] {
+        report.compare(name, ours, &tensors.f32(name, shape)?, EXACT);
+    }
+    Adam::new(online.len()).step(&mut online, objective.gradient(), config.learning_rate, (figures.grad_norm, config.clip));
+    for p in layout.parameters() {
+        let range = p.range.clone();
+        report.compare(&format!("grad.{}", p.name), &objective.gradient()[range.clone()], &grads[range.clone()], EXACT);
+        report.compare(&format!("after.{}", p.name), &online[range.clone()], &after[range], AFTER);
+    }
+
+    let unexpected: Vec<_> = tensors.all.names().into_iter().filter(|name| !tensors.taken.contains(*name)).collect();
+    if !unexpected.is_empty() {
+        return Err(format!("unexpected tensors: {}", unexpected.join(", ")));
+    }
+    let (_, name, error) = &report.worst;
+    let worst = format!("{} tensors, worst {name} with relative error {error:.1e}", tensors.taken.len());
+    if report.failures.is_empty() {
+        return Ok(worst);
+    }
+    let failures: Vec<_> = report.failures.iter().map(|(name, error)| format!("{name} {error:.1e}")).collect();
+    Err(format!("{worst}; beyond tolerance: {}", failures.join(", ")))
+}
+
+/// Visibility of all pairs, bit for bit; the flat observation of every node and the flat state, where recorded.
+fn check_features(config: &Config, episodes: &Episodes, tensors: &mut Tensors<'_>, report: &mut Report) -> Outcome<()> {
+    let Dims { uavs: m, users: n, slots: k, detection_range: range, .. } = config.dims;
+    let (b, nodes, width) = (episodes.len, m + n, 2 * m + 3 * n);
+    // One layer, so that the geometry has the users' view too.
+    let wanted = GeometryConfig { range, slots: k, layers: 1, self_loops: config.agent.self_loops };
+    let mut geometry = Geometry::default();
+    geometry.clear();
+    let mut state = vec![0.0; b * (k + 1) * width];
+    for (at, state) in state.chunks_exact_mut(width).enumerate() {
+        let uav_xy = &episodes.uav_xy[at * 2 * m..][..2 * m];
+        let user_xy = &episodes.user_xy[at / (k + 1) * 2 * n..][..2 * n];
+        let aoi = &episodes.aoi[at * n..][..n];
+        geometry.push_scene(&wanted, uav_xy, user_xy, aoi);
+        flat_state(uav_xy, user_xy, aoi, k, state);
+    }
+    geometry.finish(&wanted);
+    let mut visible = vec![0.0; b * (k + 1) * nodes * nodes];
+    let mut observations = vec![0.0_f32; b * (k + 1) * nodes * width];
+    let rows = visible.chunks_exact_mut(nodes).zip(observations.chunks_exact_mut(width));
+    for (at, (visible, observation)) in rows.enumerate() {
+        let view = geometry.node(at / nodes, at % nodes);
+        visible[view.node] = 1.0;
+        view.detections.iter().for_each(|d| visible[d.target as usize] = 1.0);
+        flat_observation(&view, observation);
+    }
+    let golden = tensors.f32("out.visible", &[b, k + 1, nodes, nodes])?;
+    if golden != visible {
+        return Err(format!("out.visible differs in {} pairs", golden.iter().zip(&visible).filter(|(a, b)| a != b).count()));
+    }
+    if config.agent.observation == Observation::Flat {
+        report.compare("out.obs", &observations, &tensors.f32("out.obs", &[b, k + 1, nodes, width])?, EXACT);
+        report.compare("out.state", &state, &tensors.f32("out.state", &[b, k + 1, width])?, EXACT);
+    }
+    Ok(())
+}
