@@ -20,6 +20,7 @@
 //! Read `env`, then `policy`, then `learner`; then `service` and what it calls.
 
 pub mod api;
+pub mod checkpoint;
 pub mod cli;
 pub mod config;
 pub mod env;

@@ -7,7 +7,8 @@ use serde_json::{Map, Value};
 
 use crate::env::EnvConfig;
 use crate::invalid::{Invalid, in_range};
-use crate::policy::{AgentConfig, Aggregation, Gnn, Identity, Observation};
+use crate::policy::mixer::Mixing;
+use crate::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, Observation};
 
 /// The algorithms of the paper and its usual company.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -53,6 +54,17 @@ pub enum MixerKind {
     Vdn,
     /// Each UAV has its own target (`iql`).
     None,
+}
+
+impl From<MixerKind> for Mixing {
+    fn from(kind: MixerKind) -> Self {
+        match kind {
+            MixerKind::Qmix => Self::Qmix,
+            MixerKind::Invariant => Self::Invariant,
+            MixerKind::Vdn => Self::Vdn,
+            MixerKind::None => Self::None,
+        }
+    }
 }
 
 /// Everything about learning that is not the environment. `steps` counts environment slots.
@@ -221,6 +233,12 @@ impl TrainConfig {
             self_position: t.self_position,
             self_loops: t.self_loops,
         }
+    }
+
+    /// Sizes that agents are made for.
+    pub fn dims(&self) -> Dims {
+        let env = &self.environment;
+        Dims { uavs: env.uavs, users: env.users, actions: env.headings(), detection_range: env.detection_range, slots: env.slots }
     }
 
     /// Checks every field and how they fit together.

@@ -14,6 +14,11 @@ pub enum Event {
         /// Mean over the layouts.
         metrics: EpisodeMetrics,
     },
+    /// A weight left the range of sensible numbers: the run ends here, and its best weights are all that is left of it.
+    Diverged {
+        /// Environment steps until then.
+        step: u64,
+    },
     /// All steps are done.
     Finished {
         /// Environment steps in the end.
@@ -59,7 +64,7 @@ impl Event {
                 (*step, "eval/coverage", m.coverage),
                 (*step, "eval/fairness", m.fairness),
             ],
-            Self::Finished { .. } => Vec::new(),
+            Self::Diverged { .. } | Self::Finished { .. } => Vec::new(),
         }
     }
 }

@@ -6,9 +6,8 @@ use super::episodes::Episodes;
 use super::objective::{Figures, Objective, Returns};
 use crate::invalid::{Invalid, in_range};
 use crate::nn::{Adam, Layout};
-use crate::policy::mixer::Mixing;
-use crate::policy::{Agent, Dims};
-use crate::recipe::{MixerKind, TrainConfig};
+use crate::policy::Agent;
+use crate::recipe::TrainConfig;
 use crate::rng;
 
 /// What an update reports.
@@ -41,14 +40,6 @@ pub struct Learner {
     pool: ThreadPool,
 }
 
-impl TrainConfig {
-    /// Sizes that agents are made for.
-    pub fn dims(&self) -> Dims {
-        let env = &self.environment;
-        Dims { uavs: env.uavs, users: env.users, actions: env.headings(), detection_range: env.detection_range, slots: env.slots }
-    }
-}
-
 impl Learner {
     /// A learner with parameters drawn from the configuration's seed, targets equal to them.
     ///
@@ -57,14 +48,8 @@ impl Learner {
     pub fn new(config: &TrainConfig, threads: usize) -> Result<Self, Invalid> {
         in_range("threads", threads, 1..=1024)?;
         let training = &config.training;
-        let mixing = match training.mixer {
-            MixerKind::Qmix => Mixing::Qmix,
-            MixerKind::Invariant => Mixing::Invariant,
-            MixerKind::Vdn => Mixing::Vdn,
-            MixerKind::None => Mixing::None,
-        };
         let returns = Returns { gamma: training.gamma, lambda: training.lambda };
-        let objective = Objective::new(config.agent(), config.dims(), mixing, returns, threads);
+        let objective = Objective::new(config.agent(), config.dims(), training.mixer.into(), returns, threads);
         let online = objective.layout().initialise(&mut rng::stream(config.seed, "init", 0));
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(threads)

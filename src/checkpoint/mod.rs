@@ -1,0 +1,170 @@
+//! Checkpoints: a training run's parameters as a safetensors file that says what it is.
+//!
+//! Metadata: `format`, `version`, `config` (the resolved [`TrainConfig`] as JSON), `step`, and `metrics` where the weights
+//! were evaluated. Tensors have the names and shapes of the golden files; `agent.*` is needed to fly, `mixer.*` to train on.
+//! The same content is the same bytes, so the digest names it. Reading trusts nothing: whatever the bytes, the answer is a
+//! checkpoint that works or an [`Error`] that says what is wrong. Files are opened elsewhere.
+
+mod error;
+mod file;
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+
+use sha2::{Digest, Sha256};
+
+pub use error::Error;
+pub use file::Tensor;
+
+use crate::env::EpisodeMetrics;
+use crate::invalid::Invalid;
+use crate::nn::Layout;
+use crate::policy::mixer::Mixer;
+use crate::policy::{Agent, Learned};
+use crate::recipe::TrainConfig;
+
+/// `format` of every checkpoint.
+pub const FORMAT: &str = "qedgix-checkpoint";
+/// `version` of the checkpoints written and read here.
+pub const VERSION: &str = "1";
+/// Largest magnitude of a parameter: far above what training leaves behind, far below where sums overflow.
+pub const LARGEST: f32 = 1e6;
+
+/// Parameters with what they were trained as.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Checkpoint {
+    config: TrainConfig,
+    step: u64,
+    metrics: Option<EpisodeMetrics>,
+    /// Flat, as [`layout`] orders them; `agent.*` only, or `mixer.*` too.
+    parameters: Vec<f32>,
+}
+
+/// The parameters of a configuration, `agent.*` then `mixer.*`: the order of the flat vector of [`Checkpoint::parameters`].
+pub fn layout(config: &TrainConfig) -> Layout {
+    let dims = config.dims();
+    let mut layout = Agent::new(config.agent(), dims).layout().clone();
+    Mixer::new(config.training.mixer.into(), &dims, &mut layout);
+    layout
+}
+
+impl Checkpoint {
+    /// A checkpoint of `parameters` (flat, as [`layout`] orders them) at environment step `step`.
+    ///
+    /// # Errors
+    /// The configuration is invalid, or the parameters are not as many as it has, or one is not a finite number of sensible
+    /// size.
+    pub fn new(config: TrainConfig, step: u64, metrics: Option<EpisodeMetrics>, parameters: Vec<f32>) -> Result<Self, Error> {
+        config.validate()?;
+        let layout = layout(&config);
+        if parameters.len() != layout.len() {
+            return Err(Invalid::new("parameters", parameters.len(), layout.len().to_string()).into());
+        }
+        for p in layout.parameters() {
+            let values = &parameters[p.range.clone()];
+            if let Some(index) = values.iter().position(|x| x.is_nan() || x.abs() > LARGEST) {
+                return Err(Error::Value { name: p.name.clone(), index, found: values[index] });
+            }
+        }
+        Ok(Self { config, step, metrics, parameters })
+    }
+
+    /// The resolved configuration of the run.
+    pub fn config(&self) -> &TrainConfig {
+        &self.config
+    }
+
+    /// Environment steps after which it was taken.
+    pub fn step(&self) -> u64 {
+        self.step
+    }
+
+    /// Figures on the validation layouts, where they were measured.
+    pub fn metrics(&self) -> Option<&EpisodeMetrics> {
+        self.metrics.as_ref()
+    }
+
+    /// The flat vector, as [`layout`] orders it. Where the file had no `mixer.*`, it ends after `agent.*`.
+    pub fn parameters(&self) -> &[f32] {
+        &self.parameters
+    }
+
+    /// The policy that these weights fly.
+    pub fn policy(&self) -> Learned {
+        let (agent, dims) = (self.config.agent(), self.config.dims());
+        let len = Agent::new(agent, dims).layout().len();
+        Learned::new(agent, dims, self.parameters[..len].to_vec()).expect("checked when it was made or read")
+    }
+
+    /// The file.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let json = |value: serde_json::Result<String>| value.expect("plain data with string keys");
+        let mut metadata = BTreeMap::from([
+            ("format", FORMAT.to_owned()),
+            ("version", VERSION.to_owned()),
+            ("config", json(serde_json::to_string(&self.config))),
+            ("step", self.step.to_string()),
+        ]);
+        if let Some(metrics) = &self.metrics {
+            metadata.insert("metrics", json(serde_json::to_string(metrics)));
+        }
+        let layout = layout(&self.config);
+        let held = layout.parameters().iter().filter(|p| p.range.end <= self.parameters.len());
+        let tensors: Vec<Tensor> = held
+            .map(|p| Tensor { name: p.name.clone(), shape: p.shape.clone(), values: self.parameters[p.range.clone()].to_vec() })
+            .collect();
+        file::write(&metadata, &tensors)
+    }
+
+    /// Reads a file, from wherever it comes.
+    ///
+    /// # Errors
+    /// Anything that keeps the checkpoint from being used: see [`Error`].
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, Error> {
+        let (metadata, tensors) = file::read(bytes)?;
+        let entry = |field: &str| metadata.get(field).cloned();
+        if entry("format").as_deref() != Some(FORMAT) {
+            return Err(Error::Format { found: entry("format") });
+        }
+        if entry("version").as_deref() != Some(VERSION) {
+            return Err(Error::Version { found: entry("version") });
+        }
+        let missing = |field| Error::Metadata { field, reason: "missing".into() };
+        let unreadable = |field| move |e: serde_json::Error| Error::Metadata { field, reason: e.to_string() };
+        let config: TrainConfig =
+            serde_json::from_str(&entry("config").ok_or_else(|| missing("config"))?).map_err(unreadable("config"))?;
+        config.validate()?;
+        let step = entry("step").ok_or_else(|| missing("step"))?;
+        let step = step.parse().map_err(|_| Error::Metadata { field: "step", reason: format!("{step:?} is not a count") })?;
+        let metrics = entry("metrics").map(|m| serde_json::from_str(&m).map_err(unreadable("metrics"))).transpose()?;
+        let parameters = flatten(&config, tensors)?;
+        Ok(Self { config, step, metrics, parameters })
+    }
+}
+
+/// The flat vector of the tensors of a file: all of `agent.*`, and all or none of `mixer.*`.
+fn flatten(config: &TrainConfig, tensors: Vec<Tensor>) -> Result<Vec<f32>, Error> {
+    let mut named: BTreeMap<String, Tensor> = tensors.into_iter().map(|t| (t.name.clone(), t)).collect();
+    let layout = layout(config);
+    let trainable = named.keys().any(|name| name.starts_with("mixer."));
+    let mut flat = Vec::new();
+    for p in layout.parameters().iter().filter(|p| trainable || p.name.starts_with("agent.")) {
+        let Some(t) = named.remove(&p.name) else { return Err(Error::Missing { name: p.name.clone() }) };
+        if t.shape != p.shape {
+            return Err(Error::Shape { name: t.name, found: t.shape, expected: p.shape.clone() });
+        }
+        flat.extend(t.values);
+    }
+    match named.into_keys().next() {
+        Some(name) => Err(Error::Unexpected { name }),
+        None => Ok(flat),
+    }
+}
+
+/// What a file is known by: SHA-256 of its bytes, in hexadecimal.
+pub fn digest(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().fold(String::with_capacity(64), |mut hex, byte| {
+        write!(hex, "{byte:02x}").expect("a String takes all that is written");
+        hex
+    })
+}

@@ -1,0 +1,300 @@
+//! Replay (spec 5): a ring of whole episodes in compact form. AoI is u16, actions u8, positions f32; memory grows with the
+//! episodes held, not with the capacity.
+
+use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
+
+use super::Episodes;
+use crate::env::EnvConfig;
+
+/// The last `capacity` episodes, all of one size.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Replay {
+    shape: Shape,
+    capacity: usize,
+    len: usize,
+    /// Where the next episode goes.
+    next: usize,
+    data: Data,
+    /// 0, 1, ..: scratch of sampling.
+    order: Vec<u32>,
+}
+
+/// Size of an episode.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Shape {
+    /// M.
+    pub uavs: usize,
+    /// N.
+    pub users: usize,
+    /// K.
+    pub slots: usize,
+    /// Whether users move.
+    pub users_move: bool,
+}
+
+/// Episode after episode, structure of arrays; see [`Episodes`].
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Data {
+    pub uav_xy: Vec<f32>,
+    pub user_xy: Vec<f32>,
+    pub aoi: Vec<u16>,
+    pub actions: Vec<u8>,
+    pub reward: Vec<f32>,
+    pub token: Vec<f32>,
+}
+
+impl Shape {
+    /// The shape of the episodes of `e`.
+    pub fn of(e: &Episodes) -> Self {
+        Self { uavs: e.uavs, users: e.users, slots: e.slots, users_move: e.users_move }
+    }
+
+    /// The shape of the episodes of an environment.
+    pub fn of_environment(env: &EnvConfig) -> Self {
+        Self { uavs: env.uavs, users: env.users, slots: env.slots, users_move: env.user_speed > 0.0 }
+    }
+
+    /// Values per episode of each array of [`Data`], in its order.
+    fn widths(&self) -> [usize; 6] {
+        let (m, n, k) = (self.uavs, self.users, self.slots);
+        let moments = if self.users_move { k + 1 } else { 1 };
+        [(k + 1) * m * 2, moments * n * 2, (k + 1) * n, k * m, k, m * crate::policy::TOKEN]
+    }
+
+    /// An empty batch of this shape.
+    pub fn episodes(&self) -> Episodes {
+        let &Self { uavs, users, slots, users_move } = self;
+        Episodes { uavs, users, slots, users_move, ..Episodes::default() }
+    }
+}
+
+impl Replay {
+    /// An empty replay for `capacity` episodes.
+    pub fn new(shape: Shape, capacity: usize) -> Self {
+        Self { shape, capacity, len: 0, next: 0, data: Data::default(), order: Vec::new() }
+    }
+
+    /// A replay that holds what another held; `None` where the pieces do not fit together.
+    pub(super) fn from_parts(shape: Shape, capacity: usize, next: usize, data: Data) -> Option<Self> {
+        let [uavs, users, aoi, actions, reward, token] = shape.widths();
+        let len = data.reward.len() / reward.max(1);
+        let fits = [
+            data.uav_xy.len() == len * uavs,
+            data.user_xy.len() == len * users,
+            data.aoi.len() == len * aoi,
+            data.actions.len() == len * actions,
+            data.reward.len() == len * reward,
+            data.token.len() == len * token,
+            len <= capacity,
+            next == if len < capacity { len } else { next.min(capacity - 1) },
+        ];
+        let order = (0..len as u32).collect();
+        fits.into_iter().all(|fit| fit).then_some(Self { shape, capacity, len, next, data, order })
+    }
+
+    /// Episodes held.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Whether it holds nothing.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// Where the next episode goes.
+    pub(super) fn next(&self) -> usize {
+        self.next
+    }
+
+    /// What it holds.
+    pub(super) fn data(&self) -> &Data {
+        &self.data
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        let d = &self.data;
+        4 * (d.uav_xy.capacity() + d.user_xy.capacity() + d.reward.capacity() + d.token.capacity() + self.order.capacity())
+            + 2 * d.aoi.capacity()
+            + d.actions.capacity()
+    }
+
+    /// Adds every episode of `batch`, over the oldest where the ring is full.
+    ///
+    /// # Panics
+    /// When the episodes are of another size.
+    pub fn push(&mut self, batch: &Episodes) {
+        assert_eq!(Shape::of(batch), self.shape, "all episodes of a replay have one size");
+        let [uavs, users, aoi, actions, reward, token] = self.shape.widths();
+        for b in 0..batch.len {
+            let at = self.next;
+            put(&mut self.data.uav_xy, at, &batch.uav_xy[b * uavs..][..uavs], |x| x);
+            put(&mut self.data.user_xy, at, &batch.user_xy[b * users..][..users], |x| x);
+            put(&mut self.data.aoi, at, &batch.aoi[b * aoi..][..aoi], |x| x as u16);
+            put(&mut self.data.actions, at, &batch.actions[b * actions..][..actions], |x| x);
+            put(&mut self.data.reward, at, &batch.reward[b * reward..][..reward], |x| x);
+            put(&mut self.data.token, at, &batch.token[b * token..][..token], |x| x);
+            if self.len < self.capacity {
+                self.order.push(self.len as u32);
+                self.len += 1;
+            }
+            self.next = (at + 1) % self.capacity;
+        }
+    }
+
+    /// Draws `count` different episodes, each as likely as any other, into `batch`, whose allocations are kept.
+    ///
+    /// # Panics
+    /// When fewer than `count` are held.
+    pub fn sample(&mut self, count: usize, rng: &mut ChaCha8Rng, batch: &mut Episodes) {
+        assert!(count <= self.len, "{count} different episodes of {}", self.len);
+        let shape = self.shape;
+        (batch.uavs, batch.users, batch.slots, batch.users_move) = (shape.uavs, shape.users, shape.slots, shape.users_move);
+        batch.len = count;
+        for array in [&mut batch.uav_xy, &mut batch.user_xy, &mut batch.aoi, &mut batch.reward, &mut batch.token] {
+            array.clear();
+        }
+        batch.actions.clear();
+        // The beginning of a shuffle; undone below, so that the next draw depends on its own stream only.
+        let mut swaps = Vec::with_capacity(count);
+        for i in 0..count {
+            let j = rng.random_range(i..self.len);
+            self.order.swap(i, j);
+            swaps.push(j);
+        }
+        let [uavs, users, aoi, actions, reward, token] = shape.widths();
+        for &e in &self.order[..count] {
+            let (e, data) = (e as usize, &self.data);
+            batch.uav_xy.extend_from_slice(&data.uav_xy[e * uavs..][..uavs]);
+            batch.user_xy.extend_from_slice(&data.user_xy[e * users..][..users]);
+            batch.aoi.extend(data.aoi[e * aoi..][..aoi].iter().map(|&a| f32::from(a)));
+            batch.actions.extend_from_slice(&data.actions[e * actions..][..actions]);
+            batch.reward.extend_from_slice(&data.reward[e * reward..][..reward]);
+            batch.token.extend_from_slice(&data.token[e * token..][..token]);
+        }
+        for (i, j) in swaps.into_iter().enumerate().rev() {
+            self.order.swap(i, j);
+        }
+    }
+}
+
+/// Writes `values` as entry `at` of equally long entries, appending where it is the first of that number.
+fn put<T: Copy, U>(array: &mut Vec<U>, at: usize, values: &[T], as_held: impl Fn(T) -> U) {
+    let start = at * values.len();
+    if start == array.len() {
+        array.extend(values.iter().map(|&x| as_held(x)));
+    } else {
+        for (held, &x) in array[start..].iter_mut().zip(values) {
+            *held = as_held(x);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rng;
+
+    const SHAPE: Shape = Shape { uavs: 3, users: 5, slots: 80, users_move: false };
+
+    /// Episodes whose every value tells which episode it is of.
+    fn numbered(shape: Shape, numbers: std::ops::Range<usize>) -> Episodes {
+        let [uavs, users, aoi, actions, reward, token] = shape.widths();
+        let fill = |width: usize| -> Vec<f32> { numbers.clone().flat_map(|e| vec![e as f32; width]).collect() };
+        Episodes {
+            len: numbers.len(),
+            uav_xy: fill(uavs),
+            user_xy: fill(users),
+            aoi: fill(aoi),
+            actions: fill(actions).into_iter().map(|x| x as u8).collect(),
+            reward: fill(reward),
+            token: fill(token),
+            ..shape.episodes()
+        }
+    }
+
+    fn sampled(replay: &mut Replay, count: usize, update: u64) -> Vec<usize> {
+        let mut batch = Episodes::default();
+        replay.sample(count, &mut rng::stream(1, "replay", update), &mut batch);
+        batch.reward.chunks(replay.shape.slots).map(|r| r[0] as usize).collect()
+    }
+
+    #[test]
+    fn the_oldest_go_first() {
+        let mut replay = Replay::new(SHAPE, 10);
+        replay.push(&numbered(SHAPE, 0..8));
+        assert_eq!(replay.len(), 8);
+        replay.push(&numbered(SHAPE, 8..16));
+        assert_eq!(replay.len(), 10);
+        let mut held = sampled(&mut replay, 10, 0);
+        held.sort_unstable();
+        assert_eq!(held, (6..16).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn episodes_come_back_whole() {
+        for shape in [SHAPE, Shape { users_move: true, ..SHAPE }] {
+            let mut replay = Replay::new(shape, 10);
+            replay.push(&numbered(shape, 0..7));
+            let mut batch = Episodes::default();
+            replay.sample(3, &mut rng::stream(1, "replay", 4), &mut batch);
+            let first: Vec<usize> = batch.reward.chunks(80).map(|r| r[0] as usize).collect();
+            let expected = first.iter().map(|&e| numbered(shape, e..e + 1));
+            let mut joined = Episodes { len: 3, ..shape.episodes() };
+            for e in expected {
+                joined.uav_xy.extend(e.uav_xy);
+                joined.user_xy.extend(e.user_xy);
+                joined.aoi.extend(e.aoi);
+                joined.actions.extend(e.actions);
+                joined.reward.extend(e.reward);
+                joined.token.extend(e.token);
+            }
+            assert_eq!(batch, joined);
+        }
+    }
+
+    #[test]
+    fn draws_are_without_replacement_uniform_and_independent_of_each_other() {
+        let mut replay = Replay::new(SHAPE, 20);
+        replay.push(&numbered(SHAPE, 0..20));
+        let alone = sampled(&mut replay.clone(), 8, 77);
+        let mut counts = [0; 20];
+        for update in 0..2000 {
+            let mut drawn = sampled(&mut replay, 8, update);
+            for &e in &drawn {
+                counts[e] += 1;
+            }
+            drawn.sort_unstable();
+            drawn.dedup();
+            assert_eq!(drawn.len(), 8);
+        }
+        assert_eq!(sampled(&mut replay, 8, 77), alone, "draws before it leave no trace");
+        // 800 expected, standard deviation 22.
+        assert!(counts.iter().all(|c| (690..910).contains(c)), "{counts:?}");
+    }
+
+    #[test]
+    fn a_full_replay_of_the_paper_s_size_is_small() {
+        let mut replay = Replay::new(SHAPE, 5000);
+        let batch = numbered(SHAPE, 0..8);
+        for _ in 0..700 {
+            replay.push(&batch);
+        }
+        assert_eq!(replay.len(), 5000);
+        assert!(replay.bytes() < 50 << 20, "{} bytes", replay.bytes());
+    }
+
+    #[test]
+    fn ages_beyond_u16_saturate() {
+        let shape = Shape { uavs: 1, users: 1, slots: 1, users_move: false };
+        let mut replay = Replay::new(shape, 1);
+        let mut e = numbered(shape, 0..1);
+        e.aoi = vec![65_534.0, 70_000.0];
+        replay.push(&e);
+        let mut batch = Episodes::default();
+        replay.sample(1, &mut rng::stream(1, "replay", 0), &mut batch);
+        assert_eq!(batch.aoi, [65_534.0, 65_535.0]);
+    }
+}

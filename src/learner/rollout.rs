@@ -1,0 +1,209 @@
+//! Collecting episodes (spec 5): several fleets at once, epsilon-greedy, each UAV drawing on its own.
+//!
+//! Randomness is per episode: layout, tokens and exploration of episode number e are streams of e, whichever fleets fly
+//! beside it. Nothing is allocated per slot.
+
+use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
+
+use super::replay::Shape;
+use super::{Episodes, TrainConfig};
+use crate::env::BatchEnv;
+use crate::invalid::Invalid;
+use crate::policy::{Actor, Agent, StepInput, TOKEN};
+use crate::rng;
+
+/// The environments and the actor of a training run, and the last episodes flown.
+#[derive(Debug)]
+pub struct Rollout {
+    seed: u64,
+    env: BatchEnv,
+    actor: Actor,
+    episodes: Episodes,
+    seeds: Vec<u64>,
+    explorers: Vec<ChaCha8Rng>,
+    actions: Vec<u8>,
+}
+
+impl Rollout {
+    /// `training.envs` fleets for `agent`.
+    ///
+    /// # Errors
+    /// The environment is invalid.
+    pub fn new(config: &TrainConfig, agent: &Agent) -> Result<Self, Invalid> {
+        let (environment, fleets) = (&config.environment, config.training.envs);
+        let (m, n, k) = (environment.uavs, environment.users, environment.slots);
+        let env = BatchEnv::new(environment, fleets)?;
+        let shape = Shape::of_environment(environment);
+        let moments = if shape.users_move { k + 1 } else { 1 };
+        let episodes = Episodes {
+            len: fleets,
+            uav_xy: vec![0.0; fleets * (k + 1) * m * 2],
+            user_xy: vec![0.0; fleets * moments * n * 2],
+            aoi: vec![0.0; fleets * (k + 1) * n],
+            actions: vec![0; fleets * k * m],
+            reward: vec![0.0; fleets * k],
+            token: vec![0.0; fleets * m * TOKEN],
+            ..shape.episodes()
+        };
+        Ok(Self {
+            seed: config.seed,
+            env,
+            actor: Actor::new(agent, fleets),
+            episodes,
+            seeds: Vec::with_capacity(fleets),
+            explorers: Vec::with_capacity(fleets),
+            actions: vec![0; fleets * m],
+        })
+    }
+
+    /// Flies the episodes number `first`, `first + 1`, ... of the run with this probability of a random action.
+    pub fn collect(&mut self, agent: &Agent, parameters: &[f32], epsilon: f64, first: u64) -> &Episodes {
+        let numbers = first..first + self.env.copies() as u64;
+        self.seeds.clear();
+        self.seeds.extend(numbers.clone().map(|e| rng::training_episode_seed(self.seed, e)));
+        self.explorers.clear();
+        self.explorers.extend(numbers.map(|e| rng::stream(self.seed, "explore", e)));
+        let tokens = self.episodes.token.chunks_exact_mut(self.env.config().uavs * TOKEN);
+        for (token, &seed) in tokens.zip(&self.seeds) {
+            let mut rng = rng::stream(seed, "token", 0);
+            token.fill_with(|| rng.random_range(-1.0..=1.0));
+        }
+        self.env.reset(&self.seeds);
+        self.actor.begin(agent, parameters, &self.episodes.token);
+        let headings = self.env.config().headings();
+        let uavs = self.env.config().uavs;
+        self.record_scene();
+        while !self.env.done() {
+            let input = StepInput { uav_xy: self.env.uav_xy(), user_xy: self.env.user_xy(), aoi: self.env.aoi() };
+            let q = self.actor.step(agent, input);
+            for (i, (action, q)) in self.actions.iter_mut().zip(q.chunks_exact(headings)).enumerate() {
+                let explorer = &mut self.explorers[i / uavs];
+                *action = if explorer.random::<f64>() < epsilon { explorer.random_range(0..headings as u8) } else { greedy(q) };
+            }
+            self.actor.acted(&self.actions);
+            self.env.step(&self.actions);
+            self.record_step();
+            self.record_scene();
+        }
+        &self.episodes
+    }
+
+    /// Mean AoI of the last episodes flown.
+    pub fn mean_aoi(&self) -> f64 {
+        let b = self.env.copies();
+        (0..b).map(|b| self.env.metrics(b).mean_aoi).sum::<f64>() / b as f64
+    }
+
+    /// Positions and AoI of the current slot.
+    fn record_scene(&mut self) {
+        let (e, slot) = (&mut self.episodes, self.env.slot());
+        place(&mut e.uav_xy, self.env.uav_xy(), e.len, slot);
+        place(&mut e.aoi, self.env.aoi(), e.len, slot);
+        if e.users_move || slot == 0 {
+            place(&mut e.user_xy, self.env.user_xy(), e.len, slot);
+        }
+    }
+
+    /// Actions and rewards of the slot just flown.
+    fn record_step(&mut self) {
+        let (e, slot) = (&mut self.episodes, self.env.slot() - 1);
+        place(&mut e.actions, &self.actions, e.len, slot);
+        place(&mut e.reward, self.env.reward(), e.len, slot);
+    }
+}
+
+/// Writes (B, W) as entry `slot` of (B, T, W).
+fn place<T: Copy>(all: &mut [T], now: &[T], episodes: usize, slot: usize) {
+    let (total, width) = (all.len() / episodes, now.len() / episodes);
+    for (all, now) in all.chunks_exact_mut(total).zip(now.chunks_exact(width)) {
+        all[slot * width..][..width].copy_from_slice(now);
+    }
+}
+
+/// The action of the largest value; the first of equals.
+fn greedy(q: &[f32]) -> u8 {
+    let mut best = 0;
+    for (a, &value) in q.iter().enumerate() {
+        if value > q[best] {
+            best = a;
+        }
+    }
+    best as u8
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::env::{Layout, Start};
+    use crate::recipe::{Algorithm, Preset};
+
+    fn config(envs: usize, user_speed: f64) -> TrainConfig {
+        let mut config = TrainConfig::preset(Algorithm::Qmix, Preset::Practical);
+        config.environment.slots = 30;
+        config.environment.user_speed = user_speed;
+        config.training.envs = envs;
+        config
+    }
+
+    fn flown(config: &TrainConfig, epsilon: f64, first: u64) -> Episodes {
+        let agent = Agent::new(config.agent(), config.dims());
+        let parameters: Vec<f32> = agent.layout().initialise(&mut rng::stream(5, "test", 0));
+        Rollout::new(config, &agent).unwrap().collect(&agent, &parameters, epsilon, first).clone()
+    }
+
+    #[test]
+    fn what_is_recorded_is_what_the_actions_lead_to() {
+        for user_speed in [0.0, 0.02] {
+            let config = config(3, user_speed);
+            let e = flown(&config, 0.5, 10);
+            let (m, n, k) = (e.uavs, e.users, e.slots);
+            for b in 0..e.len {
+                let mut env = BatchEnv::new(&config.environment, 1).unwrap();
+                env.reset(&[rng::training_episode_seed(config.seed, 10 + b as u64)]);
+                for slot in 0..=k {
+                    let at = b * (k + 1) + slot;
+                    assert_eq!(env.uav_xy(), &e.uav_xy[at * m * 2..][..m * 2]);
+                    assert_eq!(env.aoi(), &e.aoi[at * n..][..n]);
+                    let users = if e.users_move { at } else { b };
+                    assert_eq!(env.user_xy(), &e.user_xy[users * n * 2..][..n * 2]);
+                    if slot < k {
+                        env.step(&e.actions[(b * k + slot) * m..][..m]);
+                        assert_eq!(env.reward()[0], e.reward[b * k + slot]);
+                    }
+                }
+            }
+            assert!(e.token.iter().all(|t| (-1.0..=1.0).contains(t)));
+        }
+    }
+
+    #[test]
+    fn an_episode_is_the_same_whatever_flies_beside_it() {
+        let (eight, three) = (flown(&config(8, 0.0), 1.0, 0), flown(&config(3, 0.0), 1.0, 4));
+        let width = eight.slots * eight.uavs;
+        assert_eq!(eight.actions[4 * width..7 * width], three.actions);
+        assert_eq!(eight.token[4 * 12..7 * 12], three.token);
+    }
+
+    #[test]
+    fn each_uav_explores_on_its_own() {
+        let mut config = config(8, 0.0);
+        // With one layout and no identity, greedy UAVs and fleets all do the same.
+        config.environment.start = Start::Center;
+        config.environment.layout = Layout::Given(vec![[0.1, 0.2]; 5]);
+        config.training.identity = crate::policy::Identity::None;
+        let greedy = flown(&config, 0.0, 0).actions;
+        assert!(greedy.chunks(3).all(|a| a[0] == a[1] && a[1] == a[2]));
+        assert!(greedy.chunks(90).all(|episode| episode == &greedy[..90]));
+        let random = flown(&config, 1.0, 0).actions;
+        let together = random.chunks(3).filter(|a| a[0] == a[1] && a[1] == a[2]).count();
+        // 240 slots, one in 64 expected.
+        assert!(together < 15, "{together}");
+        let mut counts = [0; 8];
+        random.iter().for_each(|&a| counts[a as usize] += 1);
+        assert!(counts.iter().all(|c| (50..130).contains(c)), "{counts:?}: 90 each expected");
+        let half = flown(&config, 0.5, 0).actions;
+        assert_ne!(half, greedy);
+        assert_ne!(half, random);
+    }
+}

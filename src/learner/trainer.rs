@@ -1,0 +1,312 @@
+//! A training run as an iterator of events (spec 5): collect, update, copy targets, evaluate.
+//!
+//! The order is that of the reference: an iteration flies `envs` episodes, then makes its updates, then copies the targets
+//! when due. The greedy policy is evaluated at step 0, every `eval_every` steps and at the end, on `valid-v1`; `eval-v1` is
+//! never touched. (configuration, seed) fixes every event and weight, whatever the number of threads, and a run restored
+//! from a snapshot goes on as if it had never stopped. No clock, no files, no jobs: whoever iterates adds those.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use serde::{Deserialize, Serialize};
+
+use super::replay::{Replay, Shape};
+use super::rollout::Rollout;
+use super::snapshot::{self, SnapshotError};
+use super::{Episodes, Event, Iteration, Learner, LearnerState, TrainConfig, Training, evaluate, layouts};
+use crate::checkpoint::{self, Checkpoint};
+use crate::env::EpisodeMetrics;
+use crate::invalid::Invalid;
+use crate::policy::Learned;
+use crate::rng;
+
+/// What the next call of `next` does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Phase {
+    Evaluate,
+    Iterate,
+    Finish,
+    Finished,
+}
+
+/// How far a run has come.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Progress {
+    phase: Phase,
+    /// Environment slots flown.
+    step: u64,
+    /// Episodes collected.
+    episodes: u64,
+    /// Updates made.
+    updates: u64,
+    /// Episodes when the targets were last copied.
+    copied: u64,
+    /// Step of the next evaluation.
+    next_evaluation: u64,
+}
+
+impl Progress {
+    /// Whether a run of this configuration, with this many episodes in replay, can have come so far.
+    pub(super) fn fits(&self, config: &TrainConfig, held: usize) -> bool {
+        let t = &config.training;
+        self.episodes.checked_mul(config.environment.slots as u64) == Some(self.step)
+            && self.step < t.steps + (t.envs * config.environment.slots) as u64
+            && self.copied <= self.episodes
+            && self.updates <= self.episodes.saturating_mul(t.updates_per_iteration as u64)
+            && self.next_evaluation <= (self.step / t.eval_every + 1) * t.eval_every
+            && held as u64 == self.episodes.min(t.buffer as u64)
+    }
+}
+
+/// Figures on the validation layouts and when they were taken.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Evaluated {
+    /// Environment steps.
+    pub step: u64,
+    /// Mean over the layouts.
+    pub metrics: EpisodeMetrics,
+}
+
+/// Everything that a run's future depends on; what a snapshot holds.
+#[derive(Debug)]
+pub(super) struct State {
+    pub config: TrainConfig,
+    pub progress: Progress,
+    pub latest: Option<Evaluated>,
+    pub best: Option<(Evaluated, Vec<f32>)>,
+    pub learner: LearnerState,
+    pub replay: Replay,
+}
+
+/// A training run.
+pub struct Trainer {
+    config: TrainConfig,
+    threads: usize,
+    learner: Learner,
+    rollout: Rollout,
+    replay: Replay,
+    batch: Episodes,
+    progress: Progress,
+    latest: Option<Evaluated>,
+    best: Option<(Evaluated, Vec<f32>)>,
+    stop: Arc<AtomicBool>,
+}
+
+impl Trainer {
+    /// A run at its beginning.
+    ///
+    /// # Errors
+    /// The configuration is invalid.
+    pub fn new(config: TrainConfig, threads: usize) -> Result<Self, Invalid> {
+        config.validate()?;
+        let learner = Learner::new(&config, threads)?;
+        let replay = Replay::new(Shape::of_environment(&config.environment), config.training.buffer);
+        Ok(Self {
+            rollout: Rollout::new(&config, learner.agent())?,
+            threads,
+            learner,
+            replay,
+            batch: Episodes::default(),
+            progress: Progress { phase: Phase::Evaluate, step: 0, episodes: 0, updates: 0, copied: 0, next_evaluation: 0 },
+            latest: None,
+            best: None,
+            stop: Arc::default(),
+            config,
+        })
+    }
+
+    /// The run that [`Trainer::snapshot`] saved, to go on with any number of threads.
+    ///
+    /// # Errors
+    /// The bytes are damaged, of another version, or do not hold a run that can be.
+    pub fn restore(bytes: &[u8], threads: usize) -> Result<Self, SnapshotError> {
+        let state = snapshot::decode(bytes)?;
+        let mut trainer = Self::new(state.config, threads)?;
+        trainer.learner.restore(state.learner)?;
+        trainer.replay = state.replay;
+        trainer.progress = state.progress;
+        trainer.latest = state.latest;
+        trainer.best = state.best;
+        Ok(trainer)
+    }
+
+    /// Everything needed to go on later, elsewhere, as if the run had never stopped.
+    pub fn snapshot(&self) -> Vec<u8> {
+        snapshot::encode(&snapshot::Parts {
+            config: &self.config,
+            progress: &self.progress,
+            latest: self.latest.as_ref(),
+            best: self.best.as_ref(),
+            learner: &self.learner.state(),
+            replay: &self.replay,
+        })
+    }
+
+    /// Once set, [`Iterator::next`] returns `None` after the event it is working on; cleared, the run goes on.
+    pub fn stop_flag(&self) -> Arc<AtomicBool> {
+        Arc::clone(&self.stop)
+    }
+
+    /// The configuration.
+    pub fn config(&self) -> &TrainConfig {
+        &self.config
+    }
+
+    /// Environment slots flown.
+    pub fn step(&self) -> u64 {
+        self.progress.step
+    }
+
+    /// Whether there is nothing more to tell: all steps are done, or the run diverged.
+    pub fn finished(&self) -> bool {
+        self.progress.phase == Phase::Finished
+    }
+
+    /// The current weights, with their figures where they were just evaluated.
+    ///
+    /// # Errors
+    /// Training has diverged: a weight is no sensible number.
+    pub fn checkpoint(&self) -> Result<Checkpoint, checkpoint::Error> {
+        let latest = self.latest.filter(|e| e.step == self.progress.step);
+        let weights = self.learner.parameters().to_vec();
+        Checkpoint::new(self.config.clone(), self.progress.step, latest.map(|e| e.metrics), weights)
+    }
+
+    /// The weights with the lowest mean AoI on the validation layouts so far; `None` before the first evaluation.
+    ///
+    /// # Errors
+    /// Training has diverged: a weight is no sensible number.
+    pub fn best(&self) -> Result<Option<Checkpoint>, checkpoint::Error> {
+        let best = self.best.as_ref();
+        best.map(|(e, weights)| Checkpoint::new(self.config.clone(), e.step, Some(e.metrics), weights.clone())).transpose()
+    }
+
+    /// Figures of the best weights and the step they are of, without copying them.
+    pub fn best_evaluation(&self) -> Option<Evaluated> {
+        self.best.as_ref().map(|(e, _)| *e)
+    }
+
+    fn evaluate(&mut self) -> Event {
+        let t = &self.config.training;
+        let weights = self.learner.agent_parameters().to_vec();
+        let policy = Learned::new(self.config.agent(), self.config.dims(), weights).expect("as many as the agent has");
+        let seeds = layouts("valid-v1").expect("a list of this program").seeds(t.eval_episodes);
+        let flown = evaluate(&policy, &self.config.environment, &seeds, self.threads).expect("an agent fits its environment");
+        let now = Evaluated { step: self.progress.step, metrics: EpisodeMetrics::mean(&flown) };
+        self.latest = Some(now);
+        if self.best.as_ref().is_none_or(|(best, _)| now.metrics.mean_aoi < best.metrics.mean_aoi) {
+            self.best = Some((now, self.learner.parameters().to_vec()));
+        }
+        let p = &mut self.progress;
+        p.next_evaluation = (p.step / t.eval_every + 1) * t.eval_every;
+        p.phase = if p.step >= t.steps { Phase::Finish } else { Phase::Iterate };
+        Event::Evaluation { step: now.step, metrics: now.metrics }
+    }
+
+    fn iterate(&mut self) -> Event {
+        let t = &self.config.training;
+        let p = &mut self.progress;
+        let epsilon = epsilon(t, p.step);
+        let flown = self.rollout.collect(self.learner.agent(), self.learner.agent_parameters(), epsilon, p.episodes);
+        p.step += (flown.len * flown.slots) as u64;
+        p.episodes += flown.len as u64;
+        self.replay.push(flown);
+        let (mut loss, mut grad_norm, mut q_tot) = (0.0, 0.0, 0.0);
+        let learning = self.replay.len() >= t.batch;
+        if learning {
+            for _ in 0..t.updates_per_iteration {
+                let mut draw = rng::stream(self.config.seed, "replay", p.updates);
+                self.replay.sample(t.batch, &mut draw, &mut self.batch);
+                let update = self.learner.update(&self.batch);
+                loss += update.loss;
+                grad_norm += update.grad_norm;
+                q_tot += update.q_tot;
+                p.updates += 1;
+            }
+            if p.episodes - p.copied >= t.target_every {
+                self.learner.sync_targets();
+                p.copied = p.episodes;
+            }
+        }
+        if self.learner.parameters().iter().any(|x| x.is_nan() || x.abs() > checkpoint::LARGEST) {
+            p.phase = Phase::Finished;
+            return Event::Diverged { step: p.step };
+        }
+        let mean = |sum: f64| learning.then(|| sum / t.updates_per_iteration as f64);
+        p.phase = if p.step >= t.steps || p.step >= p.next_evaluation { Phase::Evaluate } else { Phase::Iterate };
+        Event::Iteration(Iteration {
+            step: p.step,
+            episodes: p.episodes,
+            updates: p.updates,
+            epsilon,
+            mean_aoi: self.rollout.mean_aoi(),
+            loss: mean(loss),
+            grad_norm: mean(grad_norm),
+            q_tot: mean(q_tot),
+        })
+    }
+}
+
+impl Iterator for Trainer {
+    type Item = Event;
+
+    fn next(&mut self) -> Option<Event> {
+        if self.stop.load(Ordering::Relaxed) {
+            return None;
+        }
+        Some(match self.progress.phase {
+            Phase::Evaluate => self.evaluate(),
+            Phase::Iterate => self.iterate(),
+            Phase::Finish => {
+                self.progress.phase = Phase::Finished;
+                Event::Finished { step: self.progress.step }
+            }
+            Phase::Finished => return None,
+        })
+    }
+}
+
+/// Exploration at an environment step: linear from 1 to its end, then constant.
+fn epsilon(t: &Training, step: u64) -> f64 {
+    if step >= t.epsilon_anneal {
+        return t.epsilon_end;
+    }
+    1.0 - (1.0 - t.epsilon_end) * step as f64 / t.epsilon_anneal as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::recipe::{Algorithm, Preset};
+
+    #[test]
+    fn a_run_that_diverges_says_so_and_keeps_its_best() {
+        let mut config = TrainConfig::preset(Algorithm::Vdn, Preset::Practical);
+        config.environment.slots = 5;
+        config.training.batch = 8;
+        let mut trainer = Trainer::new(config, 1).unwrap();
+        assert!(matches!(trainer.next(), Some(Event::Evaluation { .. })));
+        let best = trainer.best().unwrap().unwrap();
+        let mut state = trainer.learner.state();
+        state.online.fill(1e30);
+        trainer.learner.restore(state).unwrap();
+        assert_eq!(trainer.next(), Some(Event::Diverged { step: 40 }));
+        assert!(trainer.finished() && trainer.next().is_none());
+        assert!(trainer.checkpoint().is_err());
+        assert_eq!(trainer.best().unwrap(), Some(best));
+        let mut restored = Trainer::restore(&trainer.snapshot(), 1).unwrap();
+        assert!(restored.next().is_none(), "a run that diverged stays ended");
+    }
+
+    #[test]
+    fn exploration_falls_linearly_to_its_end() {
+        let t = TrainConfig::preset(Algorithm::Qedgix, Preset::Practical).training;
+        assert_eq!(epsilon(&t, 0), 1.0);
+        assert!((epsilon(&t, 50_000) - 0.525).abs() < 1e-12);
+        assert_eq!(epsilon(&t, 100_000), 0.05);
+        assert_eq!(epsilon(&t, u64::MAX), 0.05);
+    }
+}

@@ -1,0 +1,205 @@
+//! Checkpoints: what is written is read back, the same content is the same bytes, and no bytes whatever cause a panic.
+
+use proptest::prelude::*;
+use qedgix::checkpoint::{self, Checkpoint, Error};
+use qedgix::env::EpisodeMetrics;
+use qedgix::learner::{Algorithm, MixerKind, Preset, TrainConfig, evaluate, layouts};
+use serde_json::{Value, json};
+
+fn config() -> TrainConfig {
+    let mut config = TrainConfig::preset(Algorithm::Qedgix, Preset::Practical);
+    config.training.steps = 1000;
+    config
+}
+
+/// Weights of plausible size, different everywhere.
+fn weights(config: &TrainConfig) -> Vec<f32> {
+    (0..checkpoint::layout(config).len()).map(|i| ((i * 7919 % 1000) as f32 / 1000.0 - 0.5) * 0.2).collect()
+}
+
+fn example(config: TrainConfig) -> Checkpoint {
+    let weights = weights(&config);
+    let metrics = EpisodeMetrics { mean_aoi: 11.5, peak_aoi: 60.0, p95_aoi: 33.0, coverage: 0.9, fairness: 0.8 };
+    Checkpoint::new(config, 12_800, Some(metrics), weights).unwrap()
+}
+
+/// A file's header and data.
+fn parts(bytes: &[u8]) -> (Value, Vec<u8>) {
+    let n = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+    (serde_json::from_slice(&bytes[8..8 + n]).unwrap(), bytes[8 + n..].to_vec())
+}
+
+/// A file of a changed header.
+fn file(header: &Value, data: &[u8]) -> Vec<u8> {
+    let header = header.to_string();
+    let mut bytes = (header.len() as u64).to_le_bytes().to_vec();
+    bytes.extend(header.as_bytes());
+    bytes.extend(data);
+    bytes
+}
+
+/// The error of reading the example after `change` to its header.
+fn refused(change: impl FnOnce(&mut Value)) -> String {
+    let (mut header, data) = parts(&example(config()).to_bytes());
+    change(&mut header);
+    Checkpoint::from_bytes(&file(&header, &data)).unwrap_err().to_string()
+}
+
+#[test]
+fn what_is_written_is_read_back() {
+    for algorithm in [Algorithm::Qedgix, Algorithm::Qmix, Algorithm::Vdn, Algorithm::Iql] {
+        for preset in [Preset::Paper, Preset::Authors, Preset::Practical] {
+            let checkpoint = example(TrainConfig::preset(algorithm, preset));
+            let bytes = checkpoint.to_bytes();
+            assert_eq!(Checkpoint::from_bytes(&bytes).unwrap(), checkpoint);
+            assert_eq!(bytes.len() % 4, 0);
+        }
+    }
+    let without = Checkpoint::new(config(), 0, None, weights(&config())).unwrap();
+    assert_eq!(Checkpoint::from_bytes(&without.to_bytes()).unwrap().metrics(), None);
+}
+
+#[test]
+fn the_same_content_is_the_same_bytes() {
+    let (a, b) = (example(config()).to_bytes(), example(config()).to_bytes());
+    assert_eq!(a, b);
+    assert_eq!(checkpoint::digest(&a), checkpoint::digest(&b));
+    assert_eq!(checkpoint::digest(b"abc"), "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad");
+    let mut other = weights(&config());
+    other[5] += 1e-6;
+    let other = Checkpoint::new(config(), 12_800, None, other).unwrap();
+    assert_ne!(checkpoint::digest(&other.to_bytes()), checkpoint::digest(&a));
+    // Reading and writing again changes nothing.
+    assert_eq!(Checkpoint::from_bytes(&a).unwrap().to_bytes(), a);
+}
+
+#[test]
+fn names_and_shapes_are_those_of_the_golden_files() {
+    for name in ["qmix", "vdn", "qedgix_paper", "qedgix_authors", "qedgix_set_phase", "qedgix_set_token"] {
+        let path = format!("{}/tests/golden/{name}.safetensors", env!("CARGO_MANIFEST_DIR"));
+        let (golden, _) = parts(&std::fs::read(path).unwrap());
+        let given = &golden["__metadata__"];
+        let is = |key: &str, value: &str| given[key] == value;
+        let number = |key: &str| given[key].as_str().unwrap().parse::<usize>().unwrap();
+        let algorithm = match (is("gnn", "none"), is("mixer", "vdn")) {
+            (true, true) => Algorithm::Vdn,
+            (true, false) => Algorithm::Qmix,
+            _ => Algorithm::Qedgix,
+        };
+        let mut config = TrainConfig::preset(algorithm, Preset::Paper);
+        config.environment.uavs = number("M");
+        config.environment.users = number("N");
+        config.environment.hover = is("A", "9");
+        config.training.layers = number("layers");
+        config.training.self_position = is("self_position", "True");
+        config.training.observation = serde_json::from_value(given["encoder"].clone()).unwrap();
+        config.training.identity = serde_json::from_value(given["ident"].clone()).unwrap();
+        config.training.mixer = serde_json::from_value(given["mixer"].clone()).unwrap();
+        let (header, _) = parts(&example(config).to_bytes());
+        let shapes = |header: &Value| -> Vec<(String, Value)> {
+            let tensors = header.as_object().unwrap().iter();
+            let ours = tensors.filter(|(name, _)| name.starts_with("agent.") || name.starts_with("mixer."));
+            ours.map(|(name, t)| (name.clone(), t["shape"].clone())).collect()
+        };
+        assert_eq!(shapes(&header), shapes(&golden), "{name}");
+    }
+}
+
+#[test]
+fn a_policy_needs_no_mixer() {
+    let (mut header, data) = parts(&example(config()).to_bytes());
+    // Names sort `agent` before `mixer`, so the agent's data comes first.
+    let tensors = header.as_object_mut().unwrap();
+    tensors.retain(|name, _| !name.starts_with("mixer."));
+    let end = tensors.values().filter_map(|t| t["data_offsets"][1].as_u64()).max().unwrap() as usize;
+    let lean = Checkpoint::from_bytes(&file(&header, &data[..end])).unwrap();
+    let full = example(config());
+    let seeds = layouts("eval-v1").unwrap().seeds(4);
+    let flown = |c: &Checkpoint| evaluate(&c.policy(), &config().environment, &seeds, 1).unwrap();
+    assert_eq!(flown(&lean), flown(&full));
+    assert_eq!(Checkpoint::from_bytes(&lean.to_bytes()).unwrap(), lean);
+}
+
+#[test]
+fn what_is_wrong_is_named() {
+    let meta = |key: &'static str, value: Value| move |h: &mut Value| h["__metadata__"][key] = value;
+    assert!(refused(meta("format", json!("pt"))).contains("not a checkpoint of this program"));
+    assert!(refused(meta("version", json!("2"))).contains("version Some(\"2\") cannot be read"));
+    assert!(refused(meta("step", json!("-1"))).contains("metadata `step`"));
+    assert!(refused(meta("metrics", json!("{"))).contains("metadata `metrics`"));
+    assert!(refused(meta("config", json!("{}"))).contains("metadata `config`: missing field"));
+    let mut bad = config();
+    bad.environment.speed = -1.0;
+    let bad = serde_json::to_string(&bad).unwrap();
+    assert_eq!(
+        refused(meta("config", json!(bad))),
+        "metadata `config`: environment.speed: -1 is not valid; expected a number from 0 to 1"
+    );
+    assert!(refused(|h| drop(h.as_object_mut().unwrap().remove("__metadata__"))).contains("not a checkpoint"));
+}
+
+#[test]
+fn tensors_must_be_those_of_the_configuration() {
+    let renamed = |from: &'static str, to: &'static str| {
+        refused(move |h| {
+            let tensor = h.as_object_mut().unwrap().remove(from).unwrap();
+            h[to] = tensor;
+        })
+    };
+    assert_eq!(renamed("agent.fc.bias", "agent.fc.bais"), "tensor `agent.fc.bias` is missing");
+    assert!(renamed("mixer.b1.bias", "other.bias").contains("`mixer.b1.bias` is missing"));
+    let (mut header, mut data) = parts(&example(config()).to_bytes());
+    header["extra"] = json!({"dtype": "F32", "shape": [1], "data_offsets": [data.len(), data.len() + 4]});
+    data.extend([0; 4]);
+    let error = Checkpoint::from_bytes(&file(&header, &data)).unwrap_err();
+    assert_eq!(error, Error::Unexpected { name: "extra".into() });
+    let reshaped = refused(|h| h["agent.rnn.weight_hh"]["shape"] = json!([64, 192]));
+    assert_eq!(reshaped, "tensor `agent.rnn.weight_hh` has shape [64, 192]; expected [192, 64]");
+    assert_eq!(refused(|h| h["agent.fc.bias"]["dtype"] = json!("I32")), "tensor `agent.fc.bias` has type I32; expected F32");
+    // Another configuration is another set of parameters.
+    let mut other = config();
+    other.training.mixer = MixerKind::Qmix;
+    let other = serde_json::to_string(&other).unwrap();
+    assert!(refused(|h| h["__metadata__"]["config"] = json!(other)).contains("tensor `mixer."));
+}
+
+#[test]
+fn values_must_be_numbers_of_sensible_size() {
+    for bad in [f32::NAN, f32::INFINITY, -f32::INFINITY, 1e30] {
+        let (header, mut data) = parts(&example(config()).to_bytes());
+        let at = header["agent.fc.weight"]["data_offsets"][0].as_u64().unwrap() as usize;
+        data[at + 8..at + 12].copy_from_slice(&bad.to_le_bytes());
+        let error = Checkpoint::from_bytes(&file(&header, &data)).unwrap_err().to_string();
+        assert!(error.starts_with("tensor `agent.fc.weight`: value 2 is "), "{error}");
+        let mut flat = weights(&config());
+        flat[9] = bad;
+        assert!(matches!(Checkpoint::new(config(), 0, None, flat), Err(Error::Value { .. })));
+    }
+    assert!(Checkpoint::new(config(), 0, None, vec![0.0; 3]).is_err());
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(200))]
+
+    #[test]
+    fn no_bytes_panic(cut in 0.0..1.0_f64, flips in prop::collection::vec((0.0..1.0_f64, 0..8_u32), 0..4), head: bool) {
+        let mut bytes = example(config()).to_bytes();
+        // Half of the damage goes to the header, which is a small part of the file.
+        let reach = if head { parts(&bytes).0.to_string().len() + 8 } else { bytes.len() };
+        for (at, bit) in &flips {
+            bytes[(at * reach as f64) as usize] ^= 1 << bit;
+        }
+        if flips.len() % 2 == 0 {
+            bytes.truncate((cut * bytes.len() as f64) as usize);
+            prop_assert!(Checkpoint::from_bytes(&bytes).is_err(), "a truncated file is never whole");
+        } else if let Ok(checkpoint) = Checkpoint::from_bytes(&bytes) {
+            prop_assert!(checkpoint.parameters().iter().all(|x| x.is_finite()));
+            checkpoint.policy();
+        }
+    }
+
+    #[test]
+    fn noise_is_refused(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
+        prop_assert!(Checkpoint::from_bytes(&bytes).is_err());
+    }
+}
