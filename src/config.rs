@@ -17,6 +17,12 @@ pub struct Config {
     pub data_dir: PathBuf,
     /// Cores that training may use together.
     pub cpu_budget: usize,
+    /// Failed attempts after which a job has failed.
+    pub max_attempts: u32,
+    /// Time between snapshots of a running job.
+    pub snapshot_every: Duration,
+    /// The binary that workers run; absent: this one.
+    pub worker: Option<PathBuf>,
     /// A session idle for longer expires.
     pub session_ttl: Duration,
     /// Most open sessions.
@@ -42,6 +48,9 @@ impl Config {
             http_addr: SocketAddr::from(([127, 0, 0, 1], 8080)),
             data_dir: data_dir.into(),
             cpu_budget: cores,
+            max_attempts: 3,
+            snapshot_every: Duration::from_secs(10),
+            worker: None,
             session_ttl: Duration::from_secs(600),
             max_sessions: 100_000,
             max_message_size: 4 << 20,
@@ -58,6 +67,8 @@ impl Config {
     /// The first one that cannot be used.
     pub fn validate(&self) -> Result<(), Invalid> {
         in_range("--cpu-budget", self.cpu_budget, 1..=4096)?;
+        in_range("--max-attempts", self.max_attempts, 1..=1000)?;
+        in_range("--snapshot-every (seconds)", self.snapshot_every.as_secs_f64(), 0.0..=1e9)?;
         in_range("--session-ttl (seconds)", self.session_ttl.as_secs_f64(), 0.001..=1e9)?;
         in_range("--max-sessions", self.max_sessions, 1..=100_000_000)?;
         in_range("--max-message-size", self.max_message_size, 1024..=1 << 30)?;

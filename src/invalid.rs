@@ -14,6 +14,8 @@ pub struct Invalid {
     pub value: String,
     /// What would have been accepted.
     pub expected: String,
+    /// Whether the document does not even parse into its schema: an unknown field, a wrong type.
+    pub schema: bool,
 }
 
 impl Invalid {
@@ -26,7 +28,12 @@ impl Invalid {
         if value.chars().count() > Self::SHOWN {
             value = value.chars().take(Self::SHOWN).chain("...".chars()).collect();
         }
-        Self { field: field.into(), value, expected: expected.into() }
+        Self { field: field.into(), value, expected: expected.into(), schema: false }
+    }
+
+    /// The same for what does not parse into the schema.
+    pub fn schema(field: impl Into<String>, value: impl Display, expected: impl Into<String>) -> Self {
+        Self { schema: true, ..Self::new(field, value, expected) }
     }
 
     /// The same error with `prefix.` in front of the field.

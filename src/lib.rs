@@ -25,6 +25,7 @@ pub mod cli;
 pub mod config;
 pub mod env;
 pub mod invalid;
+pub mod jobs;
 pub mod learner;
 pub mod nn;
 pub mod policy;

@@ -309,14 +309,14 @@ fn overridden<T: Serialize + DeserializeOwned>(section: &str, base: &T, patch: &
     for (key, value) in patch {
         let name = LETTERS.iter().find(|(letter, _)| letter == key).map_or(key.as_str(), |(_, name)| name);
         if !known.iter().any(|k| k == name) {
-            return Err(Invalid::new(format!("{section}.{key}"), "an unknown field", format!("one of {}", known.join(", "))));
+            return Err(Invalid::schema(format!("{section}.{key}"), "an unknown field", format!("one of {}", known.join(", "))));
         }
         if name != key && patch.contains_key(name) {
             return Err(Invalid::new(format!("{section}.{key}"), "a second value", format!("either {key} or {name}, not both")));
         }
         fields[name] = value.clone();
         if let Err(e) = T::deserialize(&fields) {
-            return Err(Invalid::new(format!("{section}.{key}"), value, e.to_string()));
+            return Err(Invalid::schema(format!("{section}.{key}"), value, e.to_string()));
         }
     }
     Ok(serde_json::from_value(fields).expect("checked field by field"))

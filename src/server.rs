@@ -1,11 +1,12 @@
 //! Listeners, background work, shutdown: one process on one data directory.
 //!
-//! Shutdown in order: readiness goes off and new work is refused; requests in flight are answered; then the listeners are
+//! Shutdown in order: readiness goes off and new work is refused; training jobs are snapshotted and queued; requests in
+//! flight are answered; then the listeners are
 //! gone and the data directory is free for another server.
 
 use std::fs::{File, TryLockError};
 use std::future::Future;
-use std::net::SocketAddr;
+use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -20,6 +21,7 @@ use tonic_health::server::{HealthReporter, HealthService};
 use crate::api::{grpc, rest};
 use crate::config::Config;
 use crate::invalid::Invalid;
+use crate::jobs::{Jobs, LocalProcess, Settings};
 use crate::service::{App, policies};
 use crate::serving::{Clock, Engine, Registry, Sessions, SessionsConfig};
 use crate::store::{self, Store};
@@ -59,6 +61,9 @@ pub enum Error {
     /// Policies could not be loaded.
     #[error("loading policies: {0}")]
     Policies(#[source] crate::service::Error),
+    /// The system does not tell which program this is, so no worker can be started.
+    #[error("finding the program of workers: {0}")]
+    Worker(#[source] std::io::Error),
     /// The system refuses a thread.
     #[error("starting the engine: {0}")]
     Engine(#[source] std::io::Error),
@@ -156,8 +161,20 @@ impl DataDir {
 pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<App>, Error> {
     config.validate()?;
     let sessions = SessionsConfig { ttl: config.session_ttl, max: config.max_sessions };
+    let store = Store::open(&data.path).await?;
+    let executor = match &config.worker {
+        Some(program) => LocalProcess { program: program.clone() },
+        None => LocalProcess::same_program().map_err(Error::Worker)?,
+    };
+    let settings = Settings {
+        max_attempts: config.max_attempts,
+        snapshot_every: config.snapshot_every,
+        pause_grace: config.drain_timeout,
+        ..Settings::new(config.cpu_budget)
+    };
     let app = App {
-        store: Store::open(&data.path).await?,
+        jobs: Jobs::open(store.clone(), settings, Arc::new(executor)).await?,
+        store,
         registry: Registry::default(),
         sessions: Sessions::new(sessions, clock.clone()),
         engine: Engine::start(config.engine_threads, config.engine_queue).map_err(Error::Engine)?,
@@ -203,6 +220,7 @@ pub async fn run(
     let router = rest::router(app.clone(), metrics.clone(), config.max_message_size);
     let serve_rest = axum::serve(http, router).with_graceful_shutdown(stop.clone().cancelled_owned());
 
+    let scheduling = tokio::spawn(app.jobs.clone().run(format!("http://{}", from_here(endpoints.grpc))));
     let housekeeping = tokio::spawn(housekeeping(app.clone(), metrics, config.session_ttl));
     data.publish(endpoints)?;
     tracing::info!(grpc = %endpoints.grpc, http = %endpoints.http, policies = app.registry.len(), "serving");
@@ -212,6 +230,8 @@ pub async fn run(
         tracing::info!("draining");
         app.draining.begin();
         report(ServingStatus::NotServing).await;
+        // Workers send their snapshots, so they are waited for while everything still answers.
+        app.jobs.drain(config.drain_timeout + Duration::from_secs(5)).await;
         stop.cancel();
         tokio::time::sleep(config.drain_timeout).await;
         tracing::warn!(after = ?config.drain_timeout, "gave up on requests in flight");
@@ -223,10 +243,19 @@ pub async fn run(
         served = serve => served.map(|_| ()),
         () = drain => Ok(()),
     };
+    scheduling.abort();
     housekeeping.abort();
     data.withdraw();
     tracing::info!("stopped");
     served
+}
+
+/// How a process on this machine reaches a listener: one on all addresses is reached on the loopback.
+fn from_here(mut addr: SocketAddr) -> SocketAddr {
+    if addr.ip().is_unspecified() {
+        addr.set_ip(if addr.is_ipv4() { Ipv4Addr::LOCALHOST.into() } else { Ipv6Addr::LOCALHOST.into() });
+    }
+    addr
 }
 
 /// What has to be done now and then, however quiet it is.

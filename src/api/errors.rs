@@ -11,8 +11,8 @@ use crate::service::Error;
 /// gRPC and HTTP status of an error.
 fn row(error: &Error) -> (Code, StatusCode) {
     match error {
-        Error::Invalid(_) => (Code::InvalidArgument, StatusCode::BAD_REQUEST),
-        Error::Schema(_) => (Code::InvalidArgument, StatusCode::UNPROCESSABLE_ENTITY),
+        Error::Invalid(e) if !e.schema => (Code::InvalidArgument, StatusCode::BAD_REQUEST),
+        Error::Invalid(_) | Error::Schema(_) => (Code::InvalidArgument, StatusCode::UNPROCESSABLE_ENTITY),
         Error::NotFound { .. } => (Code::NotFound, StatusCode::NOT_FOUND),
         Error::Precondition { .. } => (Code::FailedPrecondition, StatusCode::CONFLICT),
         Error::Conflict { .. } => (Code::AlreadyExists, StatusCode::CONFLICT),

@@ -31,6 +31,12 @@ pub struct ServeArgs {
     /// Cores that training jobs may use together [default: all]
     #[arg(long, env = "QEDGIX_CPU_BUDGET", value_name = "CORES")]
     cpu_budget: Option<usize>,
+    /// Failed attempts after which a job has failed
+    #[arg(long, env = "QEDGIX_MAX_ATTEMPTS", default_value_t = 3)]
+    max_attempts: u32,
+    /// Time between snapshots of a running job; after a crash it goes on from the last one
+    #[arg(long, env = "QEDGIX_SNAPSHOT_EVERY", default_value = "10s", value_parser = duration)]
+    snapshot_every: Duration,
     /// A session idle for longer expires: seconds, or 90s, 10m, 2h
     #[arg(long, env = "QEDGIX_SESSION_TTL", default_value = "10m", value_parser = duration)]
     session_ttl: Duration,
@@ -97,6 +103,8 @@ impl ServeArgs {
             grpc_addr: self.grpc_addr,
             http_addr: self.http_addr,
             cpu_budget: self.cpu_budget.unwrap_or(default.cpu_budget),
+            max_attempts: self.max_attempts,
+            snapshot_every: self.snapshot_every,
             session_ttl: self.session_ttl,
             max_sessions: self.max_sessions,
             max_message_size: self.max_message_size,

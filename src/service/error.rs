@@ -69,8 +69,8 @@ impl Error {
     /// Stable machine-readable code, the same on every transport.
     pub fn code(&self) -> &'static str {
         match self {
-            Self::Invalid(_) => "invalid_argument",
-            Self::Schema(_) => "invalid_schema",
+            Self::Invalid(e) if !e.schema => "invalid_argument",
+            Self::Invalid(_) | Self::Schema(_) => "invalid_schema",
             Self::NotFound { .. } => "not_found",
             Self::Precondition { code, .. } | Self::Conflict { code, .. } => code,
             Self::Busy { .. } => "resource_exhausted",

@@ -2,13 +2,16 @@
 
 pub mod act;
 mod error;
+pub mod jobs;
 pub mod policies;
 pub mod sessions;
+pub mod worker;
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
 pub use error::Error;
 
+use crate::jobs::Jobs;
 use crate::serving::{Clock, Engine, Registry, Sessions};
 use crate::store::Store;
 
@@ -16,6 +19,8 @@ use crate::store::Store;
 pub struct App {
     /// Durable state.
     pub store: Store,
+    /// The scheduler.
+    pub jobs: Jobs,
     /// Policies that can be asked.
     pub registry: Registry,
     /// Fleets whose memory the server keeps.

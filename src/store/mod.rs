@@ -1,12 +1,23 @@
 //! The only SQL: one SQLite file in WAL mode, one writer, embedded migrations. What was acknowledged survives `kill -9`.
 
+mod attempts;
+mod checkpoints;
+mod jobs;
+mod metrics;
 mod policies;
+mod snapshots;
 
+pub use attempts::{Attempt, Ending, Lease, LeaseRecord, Outcome};
+pub use checkpoints::{Checkpoint, CheckpointKind, NewCheckpoint};
+pub use jobs::{Changed, Job, JobId, JobKind, JobSpec, JobState, NewJob, Submitted, Verb, Wanted};
+pub use metrics::{Metric, MetricCursor, MetricRow};
 pub use policies::{NewPolicyVersion, PolicyAlias, PolicyVersion};
+pub use snapshots::{OpenSnapshot, Snapshot};
 
 use std::path::Path;
 use std::time::Duration;
 
+use jiff::Timestamp;
 use sqlx::SqlitePool;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
 
@@ -62,4 +73,15 @@ impl Store {
         let read = SqlitePoolOptions::new().max_connections(4).connect_with(options.read_only(true)).await?;
         Ok(Self { read, write })
     }
+}
+
+/// A result of the store.
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+fn corrupt(what: &str, id: impl std::fmt::Display, reason: impl std::fmt::Display) -> Error {
+    Error::Corrupt { what: format!("{what} {id}"), reason: reason.to_string() }
+}
+
+fn timestamp(milliseconds: i64) -> Result<Timestamp> {
+    Timestamp::from_millisecond(milliseconds).map_err(|e| corrupt("time", milliseconds, e))
 }

@@ -3,9 +3,11 @@
 
 mod fleet;
 mod graph;
+pub mod jobs;
 pub mod request;
 pub mod response;
 mod scene;
+pub mod structs;
 
 use fleet::Ids;
 

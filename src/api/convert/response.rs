@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use jiff::Timestamp;
-use serde_json::Value;
 
+use super::structs::to_struct;
 use crate::policy::Needs;
 use crate::service::{act, policies};
 use crate::serving::{Kind, PolicyRef, SessionInfo};
@@ -88,8 +88,8 @@ impl From<policies::Described> for v1::Policy {
             detection_range: policy.policy.detection_range(),
             aliases,
             versions,
-            config: document(&policy.config),
-            metrics: document(&policy.metrics),
+            config: to_struct(&policy.config),
+            metrics: to_struct(&policy.metrics),
             created_at: Some(timestamp(policy.created_at)),
         }
     }
@@ -99,29 +99,6 @@ fn duration(duration: Duration) -> prost_types::Duration {
     prost_types::Duration { seconds: duration.as_secs() as i64, nanos: duration.subsec_nanos() as i32 }
 }
 
-fn timestamp(time: Timestamp) -> prost_types::Timestamp {
+pub(super) fn timestamp(time: Timestamp) -> prost_types::Timestamp {
     prost_types::Timestamp { seconds: time.as_second(), nanos: time.subsec_nanosecond() }
-}
-
-fn document(value: &Value) -> Option<prost_types::Struct> {
-    match struct_value(value).kind {
-        Some(prost_types::value::Kind::StructValue(document)) => Some(document),
-        _ => None,
-    }
-}
-
-fn struct_value(value: &Value) -> prost_types::Value {
-    use prost_types::value::Kind;
-    let kind = match value {
-        Value::Null => Kind::NullValue(0),
-        Value::Bool(b) => Kind::BoolValue(*b),
-        Value::Number(n) => Kind::NumberValue(n.as_f64().unwrap_or(f64::NAN)),
-        Value::String(s) => Kind::StringValue(s.clone()),
-        Value::Array(values) => Kind::ListValue(prost_types::ListValue { values: values.iter().map(struct_value).collect() }),
-        Value::Object(fields) => {
-            let fields = fields.iter().map(|(name, value)| (name.clone(), struct_value(value))).collect();
-            Kind::StructValue(prost_types::Struct { fields })
-        }
-    };
-    prost_types::Value { kind: Some(kind) }
 }

@@ -1,7 +1,9 @@
 //! gRPC: all services on one router, health and reflection included.
 
 mod envelope;
+mod job;
 mod policy;
+mod worker;
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -14,7 +16,8 @@ use crate::service::App;
 use crate::wire::{DESCRIPTORS, v1};
 
 /// Names of the services that health tells about.
-pub const SERVICES: &[&str] = &[v1::policy_service_server::SERVICE_NAME];
+pub const SERVICES: &[&str] =
+    &[v1::policy_service_server::SERVICE_NAME, v1::job_service_server::SERVICE_NAME, v1::worker_service_server::SERVICE_NAME];
 
 /// All services. A message larger than `max_message` bytes is refused.
 ///
@@ -29,6 +32,8 @@ pub fn routes<H: Health>(app: &Arc<App>, health: HealthServer<H>, max_message: u
     let mut routes = Routes::builder();
     routes
         .add_service(policy::service(app.clone()).max_decoding_message_size(max_message))
+        .add_service(job::service(app.clone()).max_decoding_message_size(max_message))
+        .add_service(worker::service(app.clone()).max_decoding_message_size(max_message.max(worker::LARGEST_MESSAGE)))
         .add_service(health)
         .add_service(reflection().build_v1().expect(BUILT_IN))
         .add_service(reflection().build_v1alpha().expect(BUILT_IN));

@@ -2,6 +2,7 @@
 
 mod act;
 pub mod extract;
+mod jobs;
 mod ops;
 mod policies;
 mod sessions;
@@ -36,6 +37,7 @@ pub fn router(app: Arc<App>, metrics: PrometheusHandle, max_body: usize) -> Rout
         .route("/v1/sessions/{id}", get(sessions::get).delete(sessions::close))
         .route("/v1/policies", get(policies::list))
         .route("/v1/policies/{policy}", get(policies::get))
+        .merge(jobs::router())
         .fallback(|request: Request| async move { Error::not_found("endpoint", request.uri().path()).into_response() })
         .method_not_allowed_fallback(|request: Request| async move {
             let detail = format!("{} does not answer {}", request.uri().path(), request.method());

@@ -1,0 +1,74 @@
+//! `qedgix.v1.JobService`.
+
+use std::sync::Arc;
+
+use tonic::{Request, Response, Status};
+
+use crate::api::convert::jobs::state_filter;
+use crate::api::convert::structs::from_struct;
+use crate::service::{App, Error, jobs};
+use crate::store::Verb;
+use crate::wire::v1;
+use crate::wire::v1::job_service_server::{JobService, JobServiceServer};
+
+/// The service.
+pub fn service(app: Arc<App>) -> JobServiceServer<impl JobService> {
+    JobServiceServer::new(Service(app))
+}
+
+struct Service(Arc<App>);
+
+type Answer<T> = Result<Response<T>, Status>;
+
+impl Service {
+    async fn change(&self, id: &str, verb: Verb) -> Answer<v1::Job> {
+        Ok(Response::new(jobs::change(&self.0, id, verb).await?.into()))
+    }
+}
+
+/// Absent where empty, as proto3 strings are.
+fn given(text: &str) -> Option<&str> {
+    (!text.is_empty()).then_some(text)
+}
+
+#[tonic::async_trait]
+impl JobService for Service {
+    async fn submit_job(&self, request: Request<v1::SubmitJobRequest>) -> Answer<v1::Job> {
+        let v1::SubmitJobRequest { spec, idempotency_key } = request.into_inner();
+        let document = from_struct("spec", spec.unwrap_or_default()).map_err(Error::from)?;
+        let key = given(&idempotency_key).map(str::to_owned);
+        let (job, _) = jobs::submit(&self.0, document, key).await?;
+        Ok(Response::new(job.into()))
+    }
+
+    async fn get_job(&self, request: Request<v1::GetJobRequest>) -> Answer<v1::Job> {
+        Ok(Response::new(jobs::get(&self.0, &request.into_inner().id).await?.into()))
+    }
+
+    async fn list_jobs(&self, request: Request<v1::ListJobsRequest>) -> Answer<v1::ListJobsResponse> {
+        let v1::ListJobsRequest { state, page_size, page_token } = request.into_inner();
+        let state = state_filter(state).map_err(Error::from)?;
+        let page = jobs::list(&self.0, state, page_size, given(&page_token)).await?;
+        let jobs = page.items.into_iter().map(Into::into).collect();
+        Ok(Response::new(v1::ListJobsResponse { jobs, next_page_token: page.next.unwrap_or_default() }))
+    }
+
+    async fn cancel_job(&self, request: Request<v1::CancelJobRequest>) -> Answer<v1::Job> {
+        self.change(&request.into_inner().id, Verb::Cancel).await
+    }
+
+    async fn pause_job(&self, request: Request<v1::PauseJobRequest>) -> Answer<v1::Job> {
+        self.change(&request.into_inner().id, Verb::Pause).await
+    }
+
+    async fn resume_job(&self, request: Request<v1::ResumeJobRequest>) -> Answer<v1::Job> {
+        self.change(&request.into_inner().id, Verb::Resume).await
+    }
+
+    async fn get_job_metrics(&self, request: Request<v1::GetJobMetricsRequest>) -> Answer<v1::GetJobMetricsResponse> {
+        let v1::GetJobMetricsRequest { id, name, page_size, page_token } = request.into_inner();
+        let page = jobs::metrics(&self.0, &id, given(&name), page_size, given(&page_token)).await?;
+        let rows = page.items.into_iter().map(Into::into).collect();
+        Ok(Response::new(v1::GetJobMetricsResponse { rows, next_page_token: page.next.unwrap_or_default() }))
+    }
+}

@@ -1,0 +1,127 @@
+//! `qedgix.v1.WorkerService`.
+
+use std::pin::Pin;
+use std::sync::Arc;
+
+use futures::Stream;
+use tonic::metadata::MetadataMap;
+use tonic::{Request, Response, Status, Streaming};
+
+use crate::invalid::Invalid;
+use crate::service::worker::{self, Announced, CheckpointUpload, Credentials, SnapshotUpload};
+use crate::service::{App, Error};
+use crate::store::{Lease, Metric};
+use crate::wire::v1;
+use crate::wire::v1::worker_service_server::{WorkerService, WorkerServiceServer};
+
+/// Largest message of a worker, in bytes, whatever the limit for others is: a chunk and its envelope.
+pub const LARGEST_MESSAGE: usize = 4 << 20;
+
+/// The service.
+pub fn service(app: Arc<App>) -> WorkerServiceServer<impl WorkerService> {
+    WorkerServiceServer::new(Service(app))
+}
+
+struct Service(Arc<App>);
+
+type Answer<T> = Result<Response<T>, Status>;
+
+impl Service {
+    async fn lease(&self, metadata: &MetadataMap) -> Result<Lease, Error> {
+        const MISSING: Error = Error::Unauthenticated("a worker shows qedgix-job, qedgix-attempt and authorization: Bearer");
+        let text = |key| metadata.get(key).and_then(|value| value.to_str().ok()).ok_or(MISSING);
+        let token = text("authorization")?.strip_prefix("Bearer ").ok_or(MISSING)?;
+        let (job, attempt) = (text("qedgix-job")?.to_owned(), text("qedgix-attempt")?.to_owned());
+        worker::authenticate(&self.0, &Credentials { job, attempt, token: token.to_owned() }).await
+    }
+}
+
+fn headless() -> Error {
+    Invalid::new("part", "out of order", "one header, then data").into()
+}
+
+#[tonic::async_trait]
+impl WorkerService for Service {
+    async fn fetch(&self, request: Request<v1::FetchRequest>) -> Answer<v1::FetchResponse> {
+        let lease = self.lease(request.metadata()).await?;
+        let work = worker::fetch(&self.0, lease).await?;
+        Ok(Response::new(v1::FetchResponse {
+            config: serde_json::to_string(&work.config).map_err(Error::internal)?,
+            threads: work.threads as u32,
+            snapshot_step: work.snapshot.map(|snapshot| snapshot.step),
+            snapshot_every_ms: work.snapshot_every.as_millis() as u64,
+        }))
+    }
+
+    type DownloadSnapshotStream = Pin<Box<dyn Stream<Item = Result<v1::Chunk, Status>> + Send>>;
+
+    async fn download_snapshot(&self, request: Request<v1::DownloadSnapshotRequest>) -> Answer<Self::DownloadSnapshotStream> {
+        let lease = self.lease(request.metadata()).await?;
+        let snapshot = worker::snapshot(&self.0, lease).await?;
+        let app = Arc::clone(&self.0);
+        let chunks = futures::stream::try_unfold(0, move |number| {
+            let (app, snapshot) = (Arc::clone(&app), snapshot.clone());
+            async move {
+                let chunk = worker::snapshot_chunk(&app, &snapshot, number).await?;
+                Ok(chunk.map(|data| (v1::Chunk { data: data.into() }, number + 1)))
+            }
+        });
+        Ok(Response::new(Box::pin(chunks)))
+    }
+
+    async fn report(&self, request: Request<v1::ReportRequest>) -> Answer<v1::ReportResponse> {
+        let lease = self.lease(request.metadata()).await?;
+        let v1::ReportRequest { metrics, step } = request.into_inner();
+        let metrics: Vec<Metric> = metrics.into_iter().map(Into::into).collect();
+        worker::report(&self.0, lease, &metrics, step).await?;
+        Ok(Response::new(v1::ReportResponse {}))
+    }
+
+    async fn upload_snapshot(
+        &self,
+        request: Request<Streaming<v1::UploadSnapshotRequest>>,
+    ) -> Answer<v1::UploadSnapshotResponse> {
+        use v1::upload_snapshot_request::Part;
+        let lease = self.lease(request.metadata()).await?;
+        let mut parts = request.into_inner();
+        let Some(Part::Header(header)) = parts.message().await?.and_then(|m| m.part) else { return Err(headless().into()) };
+        let announced = Announced { size: header.size, sha256: header.sha256 };
+        let mut upload = SnapshotUpload::begin(&self.0, lease, header.step, announced).await?;
+        while let Some(message) = parts.message().await? {
+            let Some(Part::Data(data)) = message.part else { return Err(headless().into()) };
+            upload.push(&self.0, data).await?;
+        }
+        upload.complete(&self.0).await?;
+        Ok(Response::new(v1::UploadSnapshotResponse {}))
+    }
+
+    async fn upload_checkpoint(
+        &self,
+        request: Request<Streaming<v1::UploadCheckpointRequest>>,
+    ) -> Answer<v1::UploadCheckpointResponse> {
+        use v1::upload_checkpoint_request::Part;
+        let lease = self.lease(request.metadata()).await?;
+        let mut parts = request.into_inner();
+        let Some(Part::Header(header)) = parts.message().await?.and_then(|m| m.part) else { return Err(headless().into()) };
+        let size = header.size;
+        let mut upload = CheckpointUpload::begin(lease, header.try_into().map_err(Error::from)?, size)?;
+        while let Some(message) = parts.message().await? {
+            let Some(Part::Data(data)) = message.part else { return Err(headless().into()) };
+            upload.push(data).await?;
+        }
+        let id = upload.complete(&self.0).await?;
+        Ok(Response::new(v1::UploadCheckpointResponse { id: id.to_string() }))
+    }
+
+    async fn heartbeat(&self, request: Request<v1::HeartbeatRequest>) -> Answer<v1::HeartbeatResponse> {
+        let lease = self.lease(request.metadata()).await?;
+        let directive = worker::heartbeat(&self.0, lease).await?;
+        Ok(Response::new(v1::HeartbeatResponse { directive: v1::Directive::from(directive).into() }))
+    }
+
+    async fn finish(&self, request: Request<v1::FinishRequest>) -> Answer<v1::FinishResponse> {
+        let lease = self.lease(request.metadata()).await?;
+        worker::finish(&self.0, lease, request.into_inner().try_into().map_err(Error::from)?).await?;
+        Ok(Response::new(v1::FinishResponse {}))
+    }
+}

@@ -1,0 +1,102 @@
+//! Runs workers as child processes of the server.
+
+use std::path::PathBuf;
+use std::process::{ExitStatus, Stdio};
+use std::time::Duration;
+
+use futures::FutureExt;
+use futures::future::BoxFuture;
+use tokio::io::{AsyncRead, AsyncReadExt};
+use tokio::process::{Child, Command};
+
+use super::executor::{Executor, Exit, Launch, LogTail};
+use super::worker::{ENV_ATTEMPT, ENV_JOB, ENV_SERVER, ENV_TOKEN};
+
+/// Starts `PROGRAM worker` for each attempt.
+///
+/// The worker's standard input is a pipe that the server holds: when the server dies, however it dies, the pipe closes and
+/// the worker ends. The token goes through the environment, because command lines are for everybody to see.
+#[derive(Clone, Debug)]
+pub struct LocalProcess {
+    /// The `qedgix` binary.
+    pub program: PathBuf,
+}
+
+impl LocalProcess {
+    /// With workers of the very binary that runs, even where an upgrade has replaced its file.
+    ///
+    /// # Errors
+    /// The system does not know which file it is.
+    pub fn same_program() -> std::io::Result<Self> {
+        let linux = PathBuf::from("/proc/self/exe");
+        Ok(Self { program: if linux.exists() { linux } else { std::env::current_exe()? } })
+    }
+}
+
+impl Executor for LocalProcess {
+    fn start(&self, launch: Launch) -> BoxFuture<'_, std::io::Result<BoxFuture<'static, Exit>>> {
+        async move {
+            let mut command = Command::new(&self.program);
+            command
+                .args(["worker", "--tethered"])
+                .env(ENV_SERVER, &launch.server)
+                .env(ENV_JOB, launch.lease.id.to_string())
+                .env(ENV_ATTEMPT, launch.lease.attempt.to_string())
+                .env(ENV_TOKEN, &launch.token)
+                .stdin(Stdio::piped())
+                .stdout(Stdio::piped())
+                .stderr(Stdio::piped())
+                .kill_on_drop(true);
+            // A group of its own: Ctrl-C in the server's terminal reaches the server alone, which then drains.
+            #[cfg(unix)]
+            command.process_group(0).arg0("qedgix");
+            let child = command.spawn()?;
+            Ok(attend(child, launch).boxed())
+        }
+        .boxed()
+    }
+}
+
+/// How long output may still come after the process has ended: a grandchild may hold the pipes open.
+const LAST_WORDS: Duration = Duration::from_secs(1);
+
+async fn attend(mut child: Child, launch: Launch) -> Exit {
+    // Held until the process has ended; dropping it is what tells the worker that the server is gone.
+    let tether = child.stdin.take();
+    let output = (child.stdout.take(), child.stderr.take());
+    let copying = tokio::spawn(async move {
+        let log = &launch.log;
+        tokio::join!(copy(output.0, log), copy(output.1, log));
+    });
+    let status = tokio::select! {
+        status = child.wait() => status,
+        () = launch.kill.cancelled() => {
+            let killed = child.start_kill();
+            if let Err(e) = killed {
+                tracing::warn!(job = %launch.lease.id, error = %e, "the worker could not be killed");
+            }
+            child.wait().await
+        }
+    };
+    drop(tether);
+    // Its outcome is of no interest: what was read is in the log.
+    let _ = tokio::time::timeout(LAST_WORDS, copying).await;
+    Exit(status.map_or_else(|e| format!("lost: {e}"), describe))
+}
+
+async fn copy(from: Option<impl AsyncRead + Unpin>, log: &LogTail) {
+    let Some(mut from) = from else { return };
+    let mut buffer = [0; 4096];
+    while let Ok(n @ 1..) = from.read(&mut buffer).await {
+        log.push(&buffer[..n]);
+    }
+}
+
+fn describe(status: ExitStatus) -> String {
+    #[cfg(unix)]
+    if let Some(signal) = std::os::unix::process::ExitStatusExt::signal(&status) {
+        let hint = if signal == 9 { " (SIGKILL; the system kills so when memory runs out)" } else { "" };
+        return format!("killed by signal {signal}{hint}");
+    }
+    status.code().map_or_else(|| status.to_string(), |code| format!("exit code {code}"))
+}

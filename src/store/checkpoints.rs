@@ -1,0 +1,167 @@
+//! Checkpoints that jobs produce: the best policy of each job and its last, as safetensors.
+
+use std::collections::BTreeMap;
+
+use jiff::Timestamp;
+use sqlx::FromRow;
+use uuid::Uuid;
+
+use super::attempts::live;
+use super::jobs::named;
+use super::{JobId, Lease, Result, Store, corrupt, timestamp};
+
+named! {
+    /// Which of a job's policies a checkpoint is.
+    CheckpointKind {
+        /// The one that evaluated best.
+        Best = "best",
+        /// The one at the end of training.
+        Last = "last",
+    }
+}
+
+/// A checkpoint to keep.
+#[derive(Clone, Debug)]
+pub struct NewCheckpoint {
+    /// Which of the job's policies.
+    pub kind: CheckpointKind,
+    /// Environment steps it was taken at.
+    pub step: u64,
+    /// SHA-256 of `bytes`, lower-case hexadecimal.
+    pub sha256: String,
+    /// Figures it was taken at.
+    pub metrics: BTreeMap<String, f64>,
+    /// Safetensors.
+    pub bytes: Vec<u8>,
+}
+
+/// A checkpoint without its bytes.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Checkpoint {
+    /// Its name; a better policy gets another.
+    pub id: Uuid,
+    /// Whose.
+    pub job: JobId,
+    /// Which of the job's policies.
+    pub kind: CheckpointKind,
+    /// Attempt that took it.
+    pub attempt: u32,
+    /// Environment steps it was taken at.
+    pub step: u64,
+    /// SHA-256, lower-case hexadecimal.
+    pub sha256: String,
+    /// Bytes.
+    pub size: u64,
+    /// Figures it was taken at.
+    pub metrics: BTreeMap<String, f64>,
+    /// The job's resolved training configuration.
+    pub config: serde_json::Value,
+    /// When it was uploaded.
+    pub created_at: Timestamp,
+}
+
+#[derive(FromRow)]
+struct CheckpointRow {
+    id: String,
+    job: String,
+    kind: String,
+    attempt: i64,
+    step: i64,
+    sha256: String,
+    size: i64,
+    metrics: String,
+    config: String,
+    created_at: i64,
+}
+
+impl TryFrom<CheckpointRow> for Checkpoint {
+    type Error = super::Error;
+
+    fn try_from(row: CheckpointRow) -> Result<Self> {
+        Ok(Self {
+            id: Uuid::try_parse(&row.id).map_err(|e| corrupt("checkpoint", &row.id, e))?,
+            job: JobId::parse(&row.job).ok_or_else(|| corrupt("job", &row.job, "not an id"))?,
+            kind: CheckpointKind::read(&row.kind)?,
+            attempt: row.attempt as u32,
+            step: row.step as u64,
+            sha256: row.sha256,
+            size: row.size as u64,
+            metrics: serde_json::from_str(&row.metrics).map_err(|e| corrupt("checkpoint", &row.id, e))?,
+            config: serde_json::from_str(&row.config).map_err(|e| corrupt("checkpoint", &row.id, e))?,
+            created_at: timestamp(row.created_at)?,
+        })
+    }
+}
+
+/// Checkpoints of one job, or one of them.
+const SELECT: &str = "SELECT c.id, j.id AS job, c.kind, c.attempt, c.step, c.sha256, c.size, c.metrics, c.config, c.created_at
+    FROM checkpoints c JOIN jobs j ON j.number = c.job
+    WHERE (?1 IS NULL OR j.id = ?1) AND (?2 IS NULL OR c.id = ?2) ORDER BY c.created_at, c.id";
+
+impl Store {
+    /// Keeps a checkpoint in place of the former one of its kind, and tells its id: the former one's, if it is the same.
+    /// `None` when the lease lasts no longer.
+    ///
+    /// # Errors
+    /// The database.
+    pub async fn keep_checkpoint(&self, lease: Lease, new: NewCheckpoint, now: Timestamp) -> Result<Option<Uuid>> {
+        let metrics = serde_json::to_string(&new.metrics).map_err(|e| corrupt("checkpoint", new.kind, e))?;
+        let mut tx = self.write.begin().await?;
+        if !live(&mut tx, lease).await? {
+            return Ok(None);
+        }
+        let sql = "SELECT id FROM checkpoints WHERE job = ? AND kind = ? AND sha256 = ? AND step = ?";
+        let same: Option<String> = sqlx::query_scalar(sql)
+            .bind(lease.job)
+            .bind(new.kind.as_str())
+            .bind(&new.sha256)
+            .bind(new.step as i64)
+            .fetch_optional(&mut *tx)
+            .await?;
+        if let Some(id) = same {
+            return Ok(Some(Uuid::try_parse(&id).map_err(|e| corrupt("checkpoint", &id, e))?));
+        }
+        let id = Uuid::now_v7();
+        let sql = "REPLACE INTO checkpoints (id, job, kind, attempt, step, sha256, config, metrics, created_at, size, bytes)
+                   SELECT ?, number, ?, ?, ?, ?, spec -> '$.config', ?, ?, ?, ? FROM jobs WHERE number = ?";
+        sqlx::query(sql)
+            .bind(id.to_string())
+            .bind(new.kind.as_str())
+            .bind(lease.attempt)
+            .bind(new.step as i64)
+            .bind(new.sha256)
+            .bind(metrics)
+            .bind(now.as_millisecond())
+            .bind(new.bytes.len() as i64)
+            .bind(new.bytes)
+            .bind(lease.job)
+            .execute(&mut *tx)
+            .await?;
+        tx.commit().await?;
+        Ok(Some(id))
+    }
+
+    /// Checkpoints of a job, oldest first.
+    ///
+    /// # Errors
+    /// The database.
+    pub async fn checkpoints(&self, job: JobId) -> Result<Vec<Checkpoint>> {
+        let rows: Vec<CheckpointRow> =
+            sqlx::query_as(SELECT).bind(job.to_string()).bind(None::<String>).fetch_all(&self.read).await?;
+        rows.into_iter().map(Checkpoint::try_from).collect()
+    }
+
+    /// One checkpoint and its bytes.
+    ///
+    /// # Errors
+    /// The database.
+    pub async fn checkpoint(&self, id: Uuid) -> Result<Option<(Checkpoint, Vec<u8>)>> {
+        let mut tx = self.read.begin().await?;
+        let row: Option<CheckpointRow> =
+            sqlx::query_as(SELECT).bind(None::<String>).bind(id.to_string()).fetch_optional(&mut *tx).await?;
+        let Some(row) = row else { return Ok(None) };
+        let sql = "SELECT bytes FROM checkpoints WHERE id = ?";
+        let bytes = sqlx::query_scalar(sql).bind(id.to_string()).fetch_one(&mut *tx).await?;
+        Ok(Some((row.try_into()?, bytes)))
+    }
+}

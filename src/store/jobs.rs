@@ -1,0 +1,404 @@
+//! Jobs as records: what was asked, which state it is in, and the rules by which states change.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use sqlx::{FromRow, Sqlite, SqliteConnection, Transaction};
+use uuid::Uuid;
+
+use super::{Error, Result, Store, corrupt, timestamp};
+use crate::recipe::TrainConfig;
+
+/// Names a job for ever.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
+#[serde(transparent)]
+pub struct JobId(pub Uuid);
+
+impl JobId {
+    /// The id written as `text`, in its usual form only.
+    pub fn parse(text: &str) -> Option<Self> {
+        let id = Uuid::try_parse(text).ok()?;
+        (id.to_string() == text).then_some(Self(id))
+    }
+}
+
+impl fmt::Display for JobId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(f)
+    }
+}
+
+/// An enum stored, sent and shown by name.
+macro_rules! named {
+    ($(#[$doc:meta])* $type:ident { $($(#[$variant_doc:meta])* $variant:ident = $name:literal,)+ }) => {
+        $(#[$doc])*
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
+        pub enum $type {
+            $($(#[$variant_doc])* #[serde(rename = $name)] $variant,)+
+        }
+
+        impl $type {
+            /// All names.
+            pub const NAMES: &[&str] = &[$($name),+];
+
+            /// Its name.
+            pub fn as_str(self) -> &'static str {
+                match self { $(Self::$variant => $name,)+ }
+            }
+
+            /// The one called `name`.
+            pub fn parse(name: &str) -> Option<Self> {
+                match name { $($name => Some(Self::$variant),)+ _ => None }
+            }
+
+            /// The one called `name` in the database.
+            #[allow(dead_code, reason = "some are only written")]
+            pub(super) fn read(name: &str) -> crate::store::Result<Self> {
+                Self::parse(name).ok_or_else(|| crate::store::corrupt(stringify!($type), name, "unknown"))
+            }
+        }
+
+        impl std::fmt::Display for $type {
+            fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str(self.as_str())
+            }
+        }
+    };
+}
+pub(super) use named;
+
+named! {
+    /// What a job does.
+    JobKind {
+        /// Trains a policy.
+        Train = "train",
+        /// Evaluates policies.
+        Evaluate = "evaluate",
+        /// Trains many policies.
+        Sweep = "sweep",
+    }
+}
+
+named! {
+    /// Where a job is in its life.
+    JobState {
+        /// Waits for its turn.
+        Queued = "queued",
+        /// Has a worker.
+        Running = "running",
+        /// Waits to be resumed.
+        Paused = "paused",
+        /// Ended because somebody said so.
+        Cancelled = "cancelled",
+        /// Ended with all done.
+        Succeeded = "succeeded",
+        /// Ended because its attempts failed.
+        Failed = "failed",
+    }
+}
+
+impl JobState {
+    /// Whether nothing will change any more.
+    pub fn ended(self) -> bool {
+        matches!(self, Self::Cancelled | Self::Succeeded | Self::Failed)
+    }
+}
+
+named! {
+    /// What a running job was asked for.
+    Wanted {
+        /// To end.
+        Cancel = "cancel",
+        /// To make room.
+        Pause = "pause",
+    }
+}
+
+/// What a job was asked to do, every default filled in.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct JobSpec {
+    /// What it does.
+    pub kind: JobKind,
+    /// Name for people, and of the policy it publishes.
+    pub name: Option<String>,
+    /// Labels for people.
+    pub labels: BTreeMap<String, String>,
+    /// Threads it may use.
+    pub threads: usize,
+    /// Higher goes first.
+    pub priority: i64,
+    /// The whole training configuration.
+    pub config: TrainConfig,
+}
+
+/// A job as it stands.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Job {
+    /// Its name for ever.
+    pub id: JobId,
+    /// Order of arrival.
+    pub number: i64,
+    /// Where it is in its life.
+    pub state: JobState,
+    /// What it was asked for and has not done yet.
+    pub wanted: Option<Wanted>,
+    /// Why it failed, or what became of its last attempt.
+    pub reason: Option<String>,
+    /// What it does.
+    pub spec: JobSpec,
+    /// Attempts begun.
+    pub attempts: u32,
+    /// Attempts that failed.
+    pub failures: u32,
+    /// Environment steps done.
+    pub step: u64,
+    /// `NAME:VERSION` it was published as.
+    pub policy: Option<String>,
+    /// When it was submitted.
+    pub created_at: Timestamp,
+    /// When its first attempt began.
+    pub started_at: Option<Timestamp>,
+    /// When it ended.
+    pub ended_at: Option<Timestamp>,
+}
+
+#[derive(FromRow)]
+struct JobRow {
+    number: i64,
+    id: String,
+    state: String,
+    wanted: Option<String>,
+    reason: Option<String>,
+    spec: String,
+    attempts: i64,
+    failures: i64,
+    step: i64,
+    policy: Option<String>,
+    created_at: i64,
+    started_at: Option<i64>,
+    ended_at: Option<i64>,
+}
+
+impl TryFrom<JobRow> for Job {
+    type Error = Error;
+
+    fn try_from(row: JobRow) -> Result<Self> {
+        Ok(Self {
+            id: JobId::parse(&row.id).ok_or_else(|| corrupt("job", &row.id, "not an id"))?,
+            number: row.number,
+            state: JobState::read(&row.state)?,
+            wanted: row.wanted.as_deref().map(Wanted::read).transpose()?,
+            reason: row.reason,
+            spec: serde_json::from_str(&row.spec).map_err(|e| corrupt("job", &row.id, e))?,
+            attempts: row.attempts as u32,
+            failures: row.failures as u32,
+            step: row.step as u64,
+            policy: row.policy,
+            created_at: timestamp(row.created_at)?,
+            started_at: row.started_at.map(timestamp).transpose()?,
+            ended_at: row.ended_at.map(timestamp).transpose()?,
+        })
+    }
+}
+
+/// A job to be.
+#[derive(Clone, Debug)]
+pub struct NewJob {
+    /// Its name.
+    pub id: JobId,
+    /// What it does.
+    pub spec: JobSpec,
+    /// When it was submitted.
+    pub now: Timestamp,
+    /// The sender's key, and the SHA-256 of what came with it.
+    pub idempotency: Option<(String, [u8; 32])>,
+}
+
+/// What became of a submission.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Submitted {
+    /// It is in the queue.
+    New(Job),
+    /// It was submitted before, under the same key.
+    Again(Job),
+    /// The key came before with another body.
+    Conflict,
+}
+
+/// What somebody wants of a job.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verb {
+    /// End it.
+    Cancel,
+    /// Take it off the machine.
+    Pause,
+    /// Put it back into the queue.
+    Resume,
+    /// Forget it.
+    Delete,
+}
+
+/// What became of a verb.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Changed {
+    /// Done, or begun; the job as it is now.
+    Done(Box<Job>),
+    /// Not in this state.
+    Refused(Box<Job>),
+    /// There is no such job.
+    Missing,
+}
+
+/// A change of state, with what the event log needs.
+pub(super) struct Transition<'a> {
+    pub(super) job: i64,
+    pub(super) to: JobState,
+    pub(super) attempt: u32,
+    pub(super) reason: Option<&'a str>,
+    pub(super) now: Timestamp,
+}
+
+/// Moves a job to another state and says so in its events. A job that ends keeps no snapshot.
+pub(super) async fn transition(db: &mut SqliteConnection, t: Transition<'_>) -> Result<()> {
+    let now = t.now.as_millisecond();
+    let ended = t.to.ended().then_some(now);
+    let started = (t.to == JobState::Running).then_some(now);
+    let sql = "UPDATE jobs SET state = ?2, wanted = NULL, reason = ?3, ended_at = ?4, started_at = coalesce(started_at, ?5)
+               WHERE number = ?1";
+    sqlx::query(sql).bind(t.job).bind(t.to.as_str()).bind(t.reason).bind(ended).bind(started).execute(&mut *db).await?;
+    let sql = "INSERT INTO events (job, at, state, attempt, reason) VALUES (?, ?, ?, ?, ?)";
+    sqlx::query(sql).bind(t.job).bind(now).bind(t.to.as_str()).bind(t.attempt).bind(t.reason).execute(&mut *db).await?;
+    if t.to.ended() {
+        sqlx::query("DELETE FROM snapshots WHERE job = ?").bind(t.job).execute(&mut *db).await?;
+    }
+    Ok(())
+}
+
+pub(super) async fn find(db: &mut SqliteConnection, id: JobId) -> Result<Option<Job>> {
+    let row: Option<JobRow> =
+        sqlx::query_as("SELECT * FROM jobs WHERE id = ?").bind(id.to_string()).fetch_optional(&mut *db).await?;
+    row.map(Job::try_from).transpose()
+}
+
+async fn known(db: &mut SqliteConnection, id: JobId) -> Result<Job> {
+    find(db, id).await?.ok_or_else(|| corrupt("job", id, "vanished within a transaction"))
+}
+
+impl Store {
+    /// Puts a job into the queue; committed when this returns.
+    ///
+    /// # Errors
+    /// The database.
+    pub async fn submit_job(&self, new: NewJob) -> Result<Submitted> {
+        let mut tx = self.write.begin().await?;
+        if let Some((key, body)) = &new.idempotency {
+            let sql = "SELECT k.body, j.id FROM idempotency_keys k JOIN jobs j ON j.number = k.job WHERE k.key = ?";
+            let first: Option<(Vec<u8>, String)> = sqlx::query_as(sql).bind(key).fetch_optional(&mut *tx).await?;
+            if let Some((first, id)) = first {
+                if first != body {
+                    return Ok(Submitted::Conflict);
+                }
+                let id = JobId::parse(&id).ok_or_else(|| corrupt("job", &id, "not an id"))?;
+                return Ok(Submitted::Again(known(&mut tx, id).await?));
+            }
+        }
+        let job = insert(&mut tx, &new).await?;
+        tx.commit().await?;
+        Ok(Submitted::New(job))
+    }
+
+    /// The job `id`.
+    ///
+    /// # Errors
+    /// The database.
+    pub async fn job(&self, id: JobId) -> Result<Option<Job>> {
+        find(&mut *self.read.acquire().await?, id).await
+    }
+
+    /// Jobs, newest first: those in `state`, older than number `before`, at most `limit`.
+    ///
+    /// # Errors
+    /// The database.
+    pub async fn jobs(&self, state: Option<JobState>, before: Option<i64>, limit: u32) -> Result<Vec<Job>> {
+        let sql = "SELECT * FROM jobs WHERE (?1 IS NULL OR state = ?1) AND (?2 IS NULL OR number < ?2)
+                   ORDER BY number DESC LIMIT ?3";
+        let rows: Vec<JobRow> =
+            sqlx::query_as(sql).bind(state.map(JobState::as_str)).bind(before).bind(limit).fetch_all(&self.read).await?;
+        rows.into_iter().map(Job::try_from).collect()
+    }
+
+    /// The job whose turn it is: highest priority, then first come.
+    ///
+    /// # Errors
+    /// The database.
+    pub async fn head_of_queue(&self) -> Result<Option<Job>> {
+        let sql = "SELECT * FROM jobs WHERE state = 'queued' ORDER BY priority DESC, number LIMIT 1";
+        let row: Option<JobRow> = sqlx::query_as(sql).fetch_optional(&self.read).await?;
+        row.map(Job::try_from).transpose()
+    }
+
+    /// Does what `verb` says, if the job's state allows it; a running job is marked and changes when its worker has stopped.
+    ///
+    /// # Errors
+    /// The database.
+    pub async fn change_job(&self, id: JobId, verb: Verb, now: Timestamp) -> Result<Changed> {
+        use JobState::{Cancelled, Paused, Queued, Running};
+        let mut tx = self.write.begin().await?;
+        let Some(job) = find(&mut tx, id).await? else { return Ok(Changed::Missing) };
+        match (verb, job.state, job.wanted) {
+            (Verb::Cancel, Cancelled, _)
+            | (Verb::Cancel, Running, Some(Wanted::Cancel))
+            | (Verb::Pause, Paused, _)
+            | (Verb::Pause, Running, Some(Wanted::Pause))
+            | (Verb::Resume, Queued, _)
+            | (Verb::Resume, Running, None) => return Ok(Changed::Done(Box::new(job))),
+            (Verb::Cancel, Queued | Paused, _) => change_now(&mut tx, &job, Cancelled, now).await?,
+            (Verb::Pause, Queued, _) => change_now(&mut tx, &job, Paused, now).await?,
+            (Verb::Resume, Paused, _) => change_now(&mut tx, &job, Queued, now).await?,
+            (Verb::Cancel, Running, _) => mark(&mut tx, &job, Wanted::Cancel).await?,
+            (Verb::Pause, Running, None) => mark(&mut tx, &job, Wanted::Pause).await?,
+            (Verb::Delete, state, _) if state.ended() => {
+                sqlx::query("DELETE FROM jobs WHERE number = ?").bind(job.number).execute(&mut *tx).await?;
+                tx.commit().await?;
+                return Ok(Changed::Done(Box::new(job)));
+            }
+            _ => return Ok(Changed::Refused(Box::new(job))),
+        }
+        let job = known(&mut tx, id).await?;
+        tx.commit().await?;
+        Ok(Changed::Done(Box::new(job)))
+    }
+}
+
+async fn insert(tx: &mut Transaction<'_, Sqlite>, new: &NewJob) -> Result<Job> {
+    let spec = serde_json::to_string(&new.spec).map_err(|e| corrupt("job", new.id, e))?;
+    let now = new.now.as_millisecond();
+    let sql = "INSERT INTO jobs (id, state, spec, threads, priority, created_at) VALUES (?, 'queued', ?, ?, ?, ?)";
+    let number = sqlx::query(sql)
+        .bind(new.id.to_string())
+        .bind(spec)
+        .bind(new.spec.threads as i64)
+        .bind(new.spec.priority)
+        .bind(now)
+        .execute(&mut **tx)
+        .await?
+        .last_insert_rowid();
+    transition(tx, Transition { job: number, to: JobState::Queued, attempt: 0, reason: None, now: new.now }).await?;
+    if let Some((key, body)) = &new.idempotency {
+        let sql = "INSERT INTO idempotency_keys (key, body, job, created_at) VALUES (?, ?, ?, ?)";
+        sqlx::query(sql).bind(key).bind(body.as_slice()).bind(number).bind(now).execute(&mut **tx).await?;
+    }
+    known(tx, new.id).await
+}
+
+async fn change_now(tx: &mut Transaction<'_, Sqlite>, job: &Job, to: JobState, now: Timestamp) -> Result<()> {
+    transition(tx, Transition { job: job.number, to, attempt: job.attempts, reason: None, now }).await
+}
+
+async fn mark(tx: &mut Transaction<'_, Sqlite>, job: &Job, wanted: Wanted) -> Result<()> {
+    let sql = "UPDATE jobs SET wanted = ? WHERE number = ?";
+    sqlx::query(sql).bind(wanted.as_str()).bind(job.number).execute(&mut **tx).await?;
+    Ok(())
+}

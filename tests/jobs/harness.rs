@@ -1,0 +1,209 @@
+//! A server in this process, on free ports, whose workers are the test itself.
+
+use std::future::Future;
+use std::net::SocketAddr;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use futures::FutureExt;
+use futures::future::BoxFuture;
+use qedgix::config::Config;
+use qedgix::jobs::{Executor, Exit, Jobs, Launch, Settings};
+use qedgix::server::{self, DataDir, Listeners};
+use qedgix::service::{App, Draining};
+use qedgix::serving::{Clock, Engine, Registry, Sessions, SessionsConfig};
+use qedgix::store::Store;
+use qedgix::wire::v1::job_service_client::JobServiceClient;
+use qedgix::wire::v1::worker_service_client::WorkerServiceClient;
+use reqwest::{Method, StatusCode};
+use serde_json::{Value, json};
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::JoinHandle;
+use tonic::metadata::MetadataValue;
+use tonic::transport::Channel;
+
+/// Longest that anything in these tests may take; only a failure ever waits for it.
+pub const PATIENCE: Duration = Duration::from_secs(30);
+
+/// A worker that the scheduler has started, played by the test.
+pub struct Worker {
+    pub launch: Launch,
+    exit: oneshot::Sender<Exit>,
+}
+
+impl Worker {
+    /// The process ends by itself.
+    pub fn exit(self, how: &str) {
+        self.exit.send(Exit(how.into())).expect("the scheduler waits for the exit");
+    }
+
+    /// The process lasts until the scheduler kills it.
+    pub async fn killed(self) {
+        within(self.launch.kill.cancelled()).await;
+        self.exit("killed by signal 9");
+    }
+
+    pub fn job(&self) -> String {
+        self.launch.lease.id.to_string()
+    }
+}
+
+/// Hands every worker to the test.
+struct Manual(mpsc::UnboundedSender<Worker>);
+
+impl Executor for Manual {
+    fn start(&self, launch: Launch) -> BoxFuture<'_, std::io::Result<BoxFuture<'static, Exit>>> {
+        let (exit, ended) = oneshot::channel();
+        self.0.send(Worker { launch, exit }).expect("the test receives workers");
+        async move { Ok(async move { ended.await.unwrap_or(Exit("forgotten".into())) }.boxed()) }.boxed()
+    }
+}
+
+pub struct Server {
+    pub app: Arc<App>,
+    pub http: String,
+    pub grpc: String,
+    pub workers: mpsc::UnboundedReceiver<Worker>,
+    client: reqwest::Client,
+    server: JoinHandle<()>,
+}
+
+impl Server {
+    pub async fn start(data_dir: &Path, cpu_budget: usize) -> Self {
+        Self::start_with(data_dir, cpu_budget, |_| {}).await
+    }
+
+    pub async fn start_with(data_dir: &Path, cpu_budget: usize, adjust: impl FnOnce(&mut Settings)) -> Self {
+        let free = SocketAddr::from(([127, 0, 0, 1], 0));
+        let config = Config { grpc_addr: free, http_addr: free, ..Config::new(data_dir) };
+        let data = DataDir::take(data_dir).unwrap();
+        let listeners = Listeners::bind(&config).await.unwrap();
+        let endpoints = listeners.endpoints().unwrap();
+        let (sender, workers) = mpsc::unbounded_channel();
+        let store = Store::open(data_dir).await.unwrap();
+        let mut settings = Settings::new(cpu_budget);
+        adjust(&mut settings);
+        let clock = Clock::system();
+        let app = Arc::new(App {
+            jobs: Jobs::open(store.clone(), settings, Arc::new(Manual(sender))).await.unwrap(),
+            store,
+            registry: Registry::default(),
+            sessions: Sessions::new(SessionsConfig { ttl: config.session_ttl, max: 1 }, clock.clone()),
+            engine: Engine::start(1, 1).unwrap(),
+            clock,
+            draining: Draining::default(),
+        });
+        let serving = Arc::clone(&app);
+        let server = tokio::spawn(async move {
+            server::run(&config, &data, serving, listeners, std::future::pending()).await.unwrap();
+        });
+        Self {
+            app,
+            http: format!("http://{}", endpoints.http),
+            grpc: format!("http://{}", endpoints.grpc),
+            workers,
+            client: reqwest::Client::new(),
+            server,
+        }
+    }
+
+    /// The end of the server, without any chance to clean up.
+    pub async fn crash(&mut self) {
+        self.server.abort();
+        // Aborted: that is its result.
+        let _ = (&mut self.server).await;
+    }
+
+    /// The next worker that is started.
+    pub async fn worker(&mut self) -> Worker {
+        within(self.workers.recv()).await.expect("the scheduler lives")
+    }
+
+    pub fn request(&self, method: Method, path: &str) -> reqwest::RequestBuilder {
+        self.client.request(method, format!("{}{path}", self.http))
+    }
+
+    pub async fn get(&self, path: &str) -> Value {
+        expect(self.request(Method::GET, path), StatusCode::OK).await
+    }
+
+    pub async fn post(&self, path: &str) -> Value {
+        expect(self.request(Method::POST, path), StatusCode::OK).await
+    }
+
+    /// Submits a job and returns its id.
+    pub async fn submit(&self, spec: &Value) -> String {
+        let job = expect(self.request(Method::POST, "/v1/jobs").json(spec), StatusCode::CREATED).await;
+        job["id"].as_str().unwrap().to_owned()
+    }
+
+    pub async fn state(&self, id: &str) -> String {
+        self.get(&format!("/v1/jobs/{id}")).await["state"].as_str().unwrap().to_owned()
+    }
+
+    /// The job as soon as it is in this state.
+    pub async fn reaches(&self, id: &str, state: &str) -> Value {
+        within(async {
+            loop {
+                let job = self.get(&format!("/v1/jobs/{id}")).await;
+                if job["state"] == state {
+                    return job;
+                }
+                tokio::time::sleep(Duration::from_millis(5)).await;
+            }
+        })
+        .await
+    }
+
+    pub async fn jobs(&self) -> JobServiceClient<Channel> {
+        JobServiceClient::connect(self.grpc.clone()).await.unwrap()
+    }
+
+    pub async fn worker_client(&self) -> WorkerServiceClient<Channel> {
+        WorkerServiceClient::connect(self.grpc.clone()).await.unwrap()
+    }
+}
+
+/// The smallest job.
+pub fn tiny() -> Value {
+    json!({
+        "algorithm": "vdn",
+        "environment": {"slots": 10, "uavs": 2, "users": 2},
+        "training": {"steps": 400, "envs": 2, "batch": 2, "buffer": 20, "eval_every": 200, "eval_episodes": 2},
+    })
+}
+
+/// A job with this name.
+pub fn named(name: &str) -> Value {
+    with(&json!({"name": name}))
+}
+
+/// The smallest job with these fields.
+pub fn with(fields: &Value) -> Value {
+    let mut job = tiny();
+    job.as_object_mut().unwrap().extend(fields.as_object().unwrap().clone());
+    job
+}
+
+/// A request with the credentials of an attempt.
+pub fn signed<T>(launch: &Launch, token: &str, message: T) -> tonic::Request<T> {
+    let mut request = tonic::Request::new(message);
+    let metadata = request.metadata_mut();
+    let text = |text: String| -> MetadataValue<_> { text.parse().unwrap() };
+    metadata.insert("qedgix-job", text(launch.lease.id.to_string()));
+    metadata.insert("qedgix-attempt", text(launch.lease.attempt.to_string()));
+    metadata.insert("authorization", text(format!("Bearer {token}")));
+    request
+}
+
+pub async fn expect(request: reqwest::RequestBuilder, status: StatusCode) -> Value {
+    let response = request.send().await.unwrap();
+    let (got, text) = (response.status(), response.text().await.unwrap());
+    assert_eq!(got, status, "{text}");
+    serde_json::from_str(&text).unwrap_or(Value::Null)
+}
+
+pub async fn within<T>(future: impl Future<Output = T>) -> T {
+    tokio::time::timeout(PATIENCE, future).await.expect("it happens in time")
+}

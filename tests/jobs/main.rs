@@ -1,0 +1,6 @@
+//! Jobs from outside: submission over both transports, scheduling, the protocol of workers.
+
+mod harness;
+mod protocol;
+mod scheduling;
+mod submission;

@@ -1,0 +1,243 @@
+//! Who runs when: order, CPU budget, cancel, pause, failures, restarts, draining.
+
+use std::time::Duration;
+
+use qedgix::jobs::Settings;
+use qedgix::wire::v1;
+use reqwest::{Method, StatusCode};
+use serde_json::json;
+use tonic::Code;
+
+use super::harness::{PATIENCE, Server, Worker, expect, named, signed, tiny, with, within};
+
+async fn finish(server: &Server, worker: &Worker, outcome: v1::Outcome) {
+    let request = v1::FinishRequest { outcome: outcome.into(), reason: "told to".into() };
+    let request = signed(&worker.launch, &worker.launch.token, request);
+    server.worker_client().await.finish(request).await.unwrap();
+}
+
+fn impatient(settings: &mut Settings) {
+    settings.cancel_grace = Duration::ZERO;
+    settings.pause_grace = Duration::ZERO;
+}
+
+#[tokio::test]
+async fn first_in_first_out_within_the_budget() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Server::start(dir.path(), 2).await;
+    let one = server.submit(&named("one")).await;
+    let two = server.submit(&named("two")).await;
+    let wide = server.submit(&with(&json!({"name": "wide", "threads": 2}))).await;
+    let narrow = server.submit(&named("narrow")).await;
+    let (first, second) = (server.worker().await, server.worker().await);
+    assert_eq!((first.job(), second.job()), (one.clone(), two.clone()));
+
+    // One thread is free: `narrow` would fit, but `wide` came first and needs both.
+    finish(&server, &first, v1::Outcome::Succeeded).await;
+    server.reaches(&one, "succeeded").await;
+    first.exit("exit code 0");
+    finish(&server, &second, v1::Outcome::Succeeded).await;
+    // Done, but its process still holds its thread.
+    server.reaches(&two, "succeeded").await;
+    assert_eq!((server.state(&wide).await.as_str(), server.state(&narrow).await.as_str()), ("queued", "queued"));
+    assert!(server.workers.try_recv().is_err());
+    second.exit("exit code 0");
+    let third = server.worker().await;
+    assert_eq!(third.job(), wide);
+    assert_eq!(server.state(&narrow).await, "queued");
+    finish(&server, &third, v1::Outcome::Succeeded).await;
+    third.exit("exit code 0");
+    assert_eq!(server.worker().await.job(), narrow);
+}
+
+#[tokio::test]
+async fn a_higher_priority_goes_first() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Server::start(dir.path(), 1).await;
+    server.submit(&tiny()).await;
+    let running = server.worker().await;
+    let low = server.submit(&with(&json!({"priority": -1}))).await;
+    let normal = server.submit(&tiny()).await;
+    let high = server.submit(&with(&json!({"priority": 5}))).await;
+    let mut order = Vec::new();
+    let mut worker = running;
+    for _ in 0..3 {
+        finish(&server, &worker, v1::Outcome::Succeeded).await;
+        worker.exit("exit code 0");
+        worker = server.worker().await;
+        order.push(worker.job());
+    }
+    assert_eq!(order, [high, normal, low]);
+}
+
+#[tokio::test]
+async fn a_queued_job_is_cancelled_at_once() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Server::start(dir.path(), 1).await;
+    server.submit(&tiny()).await;
+    let _busy = server.worker().await;
+    let waiting = server.submit(&tiny()).await;
+    let job = server.post(&format!("/v1/jobs/{waiting}/cancel")).await;
+    assert_eq!(job["state"], "cancelled");
+    // Again is no error; resuming is.
+    server.post(&format!("/v1/jobs/{waiting}/cancel")).await;
+    let resume = server.request(Method::POST, &format!("/v1/jobs/{waiting}/resume"));
+    expect(resume, StatusCode::CONFLICT).await;
+}
+
+#[tokio::test]
+async fn a_running_job_is_told_of_the_cancel_and_obeys() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Server::start(dir.path(), 1).await;
+    let id = server.submit(&tiny()).await;
+    let worker = server.worker().await;
+    let job = server.post(&format!("/v1/jobs/{id}/cancel")).await;
+    assert_eq!((&job["state"], &job["wanted"]), (&json!("running"), &json!("cancel")));
+    let heartbeat = signed(&worker.launch, &worker.launch.token, v1::HeartbeatRequest {});
+    let answer = server.worker_client().await.heartbeat(heartbeat).await.unwrap().into_inner();
+    assert_eq!(answer.directive(), v1::Directive::Cancel);
+    finish(&server, &worker, v1::Outcome::Stopped).await;
+    let job = server.reaches(&id, "cancelled").await;
+    assert_eq!(job["failures"], 0);
+    worker.exit("exit code 0");
+}
+
+#[tokio::test]
+async fn a_worker_that_does_not_obey_is_killed() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Server::start_with(dir.path(), 1, impatient).await;
+    let id = server.submit(&tiny()).await;
+    let worker = server.worker().await;
+    server.post(&format!("/v1/jobs/{id}/cancel")).await;
+    worker.killed().await;
+    server.reaches(&id, "cancelled").await;
+}
+
+#[tokio::test]
+async fn a_cancel_that_was_acknowledged_beats_a_worker_that_finishes() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Server::start(dir.path(), 1).await;
+    let id = server.submit(&tiny()).await;
+    let worker = server.worker().await;
+    server.post(&format!("/v1/jobs/{id}/cancel")).await;
+    finish(&server, &worker, v1::Outcome::Succeeded).await;
+    assert_eq!(server.state(&id).await, "cancelled");
+}
+
+#[tokio::test]
+async fn a_silent_worker_is_killed_and_its_job_tried_again() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Server::start_with(dir.path(), 1, |s| s.silence = Duration::from_millis(50)).await;
+    let id = server.submit(&tiny()).await;
+    server.worker().await.killed().await;
+    let second = server.worker().await;
+    assert_eq!(second.launch.lease.attempt, 2);
+    let logs = server.get(&format!("/v1/jobs/{id}/logs")).await;
+    assert_eq!(logs["attempts"][0]["outcome"], "failed");
+    assert!(logs["attempts"][0]["reason"].as_str().unwrap().starts_with("nothing was heard"), "{logs}");
+}
+
+#[tokio::test]
+async fn a_worker_that_always_dies_fails_the_job_with_its_reason_and_log() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Server::start(dir.path(), 1).await;
+    let id = server.submit(&tiny()).await;
+    for attempt in 1..=3 {
+        let worker = server.worker().await;
+        assert_eq!(worker.launch.lease.attempt, attempt);
+        worker.launch.log.push(format!("out of luck, time {attempt}\n").as_bytes());
+        let live = server.get(&format!("/v1/jobs/{id}/logs")).await;
+        assert_eq!(live["attempts"][attempt as usize - 1]["log"], format!("out of luck, time {attempt}\n"));
+        worker.exit("exit code 101");
+    }
+    let job = server.reaches(&id, "failed").await;
+    assert_eq!(job["reason"], "the worker ended with exit code 101");
+    assert_eq!((&job["attempts"], &job["failures"]), (&json!(3), &json!(3)));
+    let logs = server.get(&format!("/v1/jobs/{id}/logs")).await;
+    for (i, attempt) in logs["attempts"].as_array().unwrap().iter().enumerate() {
+        assert_eq!(attempt["log"], format!("out of luck, time {}\n", i + 1));
+        assert_eq!(attempt["outcome"], "failed");
+    }
+    assert!(server.workers.try_recv().is_err());
+}
+
+#[tokio::test]
+async fn a_failure_that_a_worker_reports_keeps_its_reason() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Server::start_with(dir.path(), 1, |s| s.max_attempts = 1).await;
+    let id = server.submit(&tiny()).await;
+    let worker = server.worker().await;
+    finish(&server, &worker, v1::Outcome::Failed).await;
+    worker.exit("exit code 1");
+    assert_eq!(server.reaches(&id, "failed").await["reason"], "told to");
+}
+
+#[tokio::test]
+async fn pause_takes_a_job_off_the_machine_and_resume_brings_it_back() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Server::start(dir.path(), 1).await;
+    let id = server.submit(&tiny()).await;
+    let worker = server.worker().await;
+    server.post(&format!("/v1/jobs/{id}/pause")).await;
+    let early = server.request(Method::POST, &format!("/v1/jobs/{id}/resume"));
+    expect(early, StatusCode::CONFLICT).await;
+    finish(&server, &worker, v1::Outcome::Stopped).await;
+    worker.exit("exit code 0");
+    server.reaches(&id, "paused").await;
+    server.post(&format!("/v1/jobs/{id}/resume")).await;
+    let again = server.worker().await;
+    assert_eq!((again.job(), again.launch.lease.attempt), (id.clone(), 2));
+    let logs = server.get(&format!("/v1/jobs/{id}/logs")).await;
+    assert_eq!(logs["attempts"][0]["outcome"], "paused");
+}
+
+#[tokio::test]
+async fn a_restart_queues_what_ran_and_fences_its_worker() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Server::start(dir.path(), 1).await;
+    let id = server.submit(&tiny()).await;
+    let waiting = server.submit(&named("waiting")).await;
+    let old = server.worker().await;
+    server.crash().await;
+    let mut restarted = Server::start(dir.path(), 1).await;
+    let new = restarted.worker().await;
+    assert_eq!((new.job(), new.launch.lease.attempt), (id.clone(), 2));
+    assert_eq!(restarted.state(&waiting).await, "queued");
+    let logs = restarted.get(&format!("/v1/jobs/{id}/logs")).await;
+    assert_eq!(logs["attempts"][0]["outcome"], "interrupted");
+    assert_eq!(restarted.get(&format!("/v1/jobs/{id}")).await["failures"], 0);
+    let heartbeat = signed(&old.launch, &old.launch.token, v1::HeartbeatRequest {});
+    let status = restarted.worker_client().await.heartbeat(heartbeat).await.unwrap_err();
+    assert_eq!(status.code(), Code::FailedPrecondition);
+}
+
+#[tokio::test]
+async fn draining_pauses_workers_and_queues_their_jobs() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Server::start_with(dir.path(), 2, impatient).await;
+    let obedient = server.submit(&named("obedient")).await;
+    let deaf = server.submit(&named("deaf")).await;
+    let (first, second) = (server.worker().await, server.worker().await);
+    server.app.draining.begin();
+    let jobs = server.app.jobs.clone();
+    let drain = tokio::spawn(async move { jobs.drain(PATIENCE).await });
+    within(async {
+        while !server.app.jobs.draining() {
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
+    let heartbeat = signed(&first.launch, &first.launch.token, v1::HeartbeatRequest {});
+    let answer = server.worker_client().await.heartbeat(heartbeat).await.unwrap().into_inner();
+    assert_eq!(answer.directive(), v1::Directive::Pause);
+    finish(&server, &first, v1::Outcome::Stopped).await;
+    first.exit("exit code 0");
+    second.killed().await;
+    within(drain).await.unwrap();
+    for id in [&obedient, &deaf] {
+        let job = server.get(&format!("/v1/jobs/{id}")).await;
+        assert_eq!((&job["state"], &job["failures"]), (&json!("queued"), &json!(0)));
+    }
+    let refused = server.request(Method::POST, "/v1/jobs").json(&tiny());
+    expect(refused, StatusCode::SERVICE_UNAVAILABLE).await;
+}

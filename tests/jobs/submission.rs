@@ -1,0 +1,177 @@
+//! Submitting, listing, deleting; malformed requests; idempotency; both transports agree.
+
+use std::time::Duration;
+
+use qedgix::api::convert::structs::to_struct;
+use qedgix::wire::v1;
+use reqwest::{Method, StatusCode};
+use serde_json::{Value, json};
+use tonic::Code;
+
+use super::harness::{Server, expect, named, tiny, with};
+
+async fn server() -> (tempfile::TempDir, Server) {
+    let dir = tempfile::tempdir().unwrap();
+    let server = Server::start(dir.path(), 2).await;
+    (dir, server)
+}
+
+#[tokio::test]
+async fn a_job_shows_its_whole_configuration_and_can_be_sent_again_as_it_is_shown() {
+    let (_dir, server) = server().await;
+    let id = server.submit(&with(&json!({"name": "first", "labels": {"who": "me"}, "seed": 7}))).await;
+    let job = server.get(&format!("/v1/jobs/{id}")).await;
+    assert_eq!(job["environment"]["detection_range"], 0.28);
+    assert_eq!(job["training"]["steps"], 400);
+    assert_eq!(job["training"]["mixer"], "vdn");
+    assert_eq!((&job["seed"], &job["labels"]["who"], &job["kind"]), (&json!(7), &json!("me"), &json!("train")));
+    assert_eq!(job["progress"], json!({"step": 0, "steps": 400}));
+
+    let fields = ["kind", "algorithm", "preset", "environment", "training", "threads", "priority", "seed", "name", "labels"];
+    let again: Value = fields.iter().map(|f| ((*f).to_owned(), job[f].clone())).collect::<serde_json::Map<_, _>>().into();
+    let twin = server.submit(&again).await;
+    let twin = server.get(&format!("/v1/jobs/{twin}")).await;
+    for field in fields {
+        assert_eq!(twin[field], job[field]);
+    }
+}
+
+#[tokio::test]
+async fn malformed_requests_get_the_error_of_the_table() {
+    let (_dir, server) = server().await;
+    let post =
+        |body: &str| server.request(Method::POST, "/v1/jobs").header("content-type", "application/json").body(body.to_owned());
+    let cases = [
+        ("{\"seed\": 1", 400, "invalid_argument"),
+        ("{} {}", 400, "invalid_argument"),
+        ("[]", 422, "invalid_schema"),
+        ("{\"sede\": 1}", 422, "invalid_schema"),
+        ("{\"environment\": {\"uvas\": 1}}", 422, "invalid_schema"),
+        ("{\"threads\": \"two\"}", 422, "invalid_schema"),
+        ("{\"threads\": 3}", 400, "invalid_argument"),
+        ("{\"kind\": \"sweep\"}", 400, "invalid_argument"),
+        ("{\"environment\": {\"uavs\": 0}}", 400, "invalid_argument"),
+    ];
+    for (body, status, code) in cases {
+        let problem = expect(post(body), StatusCode::from_u16(status).unwrap()).await;
+        assert_eq!(problem["code"], code, "{body}: {problem}");
+    }
+    let large = post(&format!("{{\"name\": \"{}\"}}", "x".repeat(10 << 20)));
+    expect(large, StatusCode::PAYLOAD_TOO_LARGE).await;
+    let problem = expect(post("{\"threads\": 3}"), StatusCode::BAD_REQUEST).await;
+    assert_eq!(problem["field"], "threads");
+    assert!(problem["detail"].as_str().unwrap().contains("1 to 2"), "{problem}");
+
+    for query in ["state=resting", "limit=1001", "limit=-1", "cursor=x", "colour=red"] {
+        expect(server.request(Method::GET, &format!("/v1/jobs?{query}")), StatusCode::BAD_REQUEST).await;
+    }
+    let id = server.submit(&tiny()).await;
+    for query in ["format=xml", "limit=100001", "cursor=loss", "nam=loss"] {
+        let path = format!("/v1/jobs/{id}/metrics?{query}");
+        expect(server.request(Method::GET, &path), StatusCode::BAD_REQUEST).await;
+    }
+}
+
+#[tokio::test]
+async fn unknown_ids_are_not_found() {
+    let (_dir, server) = server().await;
+    let absent = uuid::Uuid::now_v7().to_string();
+    for id in ["1", "..%2f", &absent, &absent.to_uppercase()] {
+        for (method, verb) in [
+            (Method::GET, ""),
+            (Method::DELETE, ""),
+            (Method::POST, "/cancel"),
+            (Method::POST, "/pause"),
+            (Method::POST, "/resume"),
+            (Method::GET, "/metrics"),
+            (Method::GET, "/checkpoints"),
+            (Method::GET, "/logs"),
+        ] {
+            let problem = expect(server.request(method, &format!("/v1/jobs/{id}{verb}")), StatusCode::NOT_FOUND).await;
+            assert_eq!(problem["code"], "not_found");
+        }
+        expect(server.request(Method::GET, &format!("/v1/checkpoints/{id}")), StatusCode::NOT_FOUND).await;
+    }
+}
+
+#[tokio::test]
+async fn an_idempotency_key_means_one_job() {
+    let (_dir, server) = server().await;
+    let submit = |spec: Value| server.request(Method::POST, "/v1/jobs").header("idempotency-key", "k1").json(&spec);
+    let first = expect(submit(tiny()), StatusCode::CREATED).await;
+    let again = expect(submit(tiny()), StatusCode::CREATED).await;
+    assert_eq!(first["id"], again["id"]);
+    let conflict = expect(submit(with(&json!({"seed": 2}))), StatusCode::CONFLICT).await;
+    assert_eq!(conflict["code"], "idempotency_conflict");
+    assert_eq!(server.get("/v1/jobs").await["jobs"].as_array().unwrap().len(), 1);
+
+    // The same key and body over the other transport, too.
+    let mut grpc = server.jobs().await;
+    let request = |spec: Value| v1::SubmitJobRequest { spec: to_struct(&spec), idempotency_key: "k1".into() };
+    let same = grpc.submit_job(request(tiny())).await.unwrap().into_inner();
+    assert_eq!(first["id"], same.id);
+    let status = grpc.submit_job(request(with(&json!({"seed": 2})))).await.unwrap_err();
+    assert_eq!(status.code(), Code::AlreadyExists);
+}
+
+#[tokio::test]
+async fn both_transports_agree() {
+    let (_dir, server) = server().await;
+    let mut grpc = server.jobs().await;
+    let job = grpc.submit_job(v1::SubmitJobRequest { spec: to_struct(&named("twin")), ..Default::default() }).await.unwrap();
+    let job = job.into_inner();
+    let rest = server.get(&format!("/v1/jobs/{}", job.id)).await;
+    let expected = to_struct(&rest).unwrap().fields;
+    for (name, value) in job.spec.unwrap().fields {
+        assert_eq!(expected[&name], value, "{name}");
+    }
+    let refused = |spec: Value| {
+        let mut grpc = grpc.clone();
+        async move {
+            let request = v1::SubmitJobRequest { spec: to_struct(&spec), ..Default::default() };
+            grpc.submit_job(request).await.unwrap_err()
+        }
+    };
+    for spec in [json!({"sede": 1}), json!({"threads": 3}), json!({"seed": 1.5}), json!({"kind": "evaluate"})] {
+        let status = refused(spec.clone()).await;
+        assert_eq!(status.code(), Code::InvalidArgument, "{spec}");
+    }
+    let missing = grpc.get_job(v1::GetJobRequest { id: "nobody".into() }).await.unwrap_err();
+    assert_eq!(missing.code(), Code::NotFound);
+}
+
+#[tokio::test]
+async fn jobs_are_listed_newest_first_page_by_page() {
+    let (_dir, server) = server().await;
+    let mut expected = Vec::new();
+    for i in 0..5 {
+        expected.insert(0, server.submit(&named(&format!("job-{i}"))).await);
+    }
+    let (mut seen, mut path) = (Vec::new(), "/v1/jobs?limit=2".to_owned());
+    loop {
+        let page = server.get(&path).await;
+        seen.extend(page["jobs"].as_array().unwrap().iter().map(|job| job["id"].as_str().unwrap().to_owned()));
+        let Some(cursor) = page["next_cursor"].as_str() else { break };
+        path = format!("/v1/jobs?limit=2&cursor={cursor}");
+    }
+    assert_eq!(seen, expected);
+    let mut grpc = server.jobs().await;
+    let page = grpc.list_jobs(v1::ListJobsRequest { page_size: 2, ..Default::default() }).await.unwrap().into_inner();
+    assert_eq!(page.jobs.iter().map(|job| &job.id).collect::<Vec<_>>(), [&expected[0], &expected[1]]);
+    assert!(!page.next_page_token.is_empty());
+}
+
+#[tokio::test]
+async fn only_what_has_ended_can_be_deleted() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Server::start_with(dir.path(), 1, |s| s.cancel_grace = Duration::ZERO).await;
+    let id = server.submit(&tiny()).await;
+    let path = format!("/v1/jobs/{id}");
+    let problem = expect(server.request(Method::DELETE, &path), StatusCode::CONFLICT).await;
+    assert_eq!(problem["code"], "wrong_state");
+    server.post(&format!("{path}/cancel")).await;
+    server.worker().await.killed().await;
+    server.reaches(&id, "cancelled").await;
+    expect(server.request(Method::DELETE, &path), StatusCode::NO_CONTENT).await;
+    expect(server.request(Method::GET, &path), StatusCode::NOT_FOUND).await;
+}
