@@ -1,6 +1,15 @@
 //! The command line. Each command has a file; every flag is also an environment variable `QEDGIX_*`.
 
+mod bench;
+mod client;
+mod demo;
+mod evaluate;
+mod fly;
+mod progress;
+mod run_args;
 mod serve;
+mod table;
+mod train;
 
 use std::process::ExitCode;
 
@@ -18,6 +27,14 @@ struct Cli {
 enum Command {
     /// Serve policies and run training jobs
     Serve(serve::ServeArgs),
+    /// The whole story on an empty machine: serve, fly, train, fly what was trained
+    Demo(demo::DemoArgs),
+    /// Train a policy, here or as a job of a server
+    Train(train::TrainArgs),
+    /// Compare policies on frozen layouts
+    Evaluate(evaluate::EvaluateArgs),
+    /// Measure how fast the parts are on this machine
+    Bench(bench::BenchArgs),
 }
 
 /// Runs the command that the process was started with.
@@ -33,6 +50,10 @@ pub fn run() -> ExitCode {
     let done = runtime.block_on(async {
         match command {
             Command::Serve(args) => serve::run(args).await,
+            Command::Demo(args) => demo::run(args).await,
+            Command::Train(args) => train::run(args).await,
+            Command::Evaluate(args) => evaluate::run(args).await,
+            Command::Bench(args) => bench::run(args),
         }
     });
     match done {

@@ -2,7 +2,7 @@
 //!
 //! Knows neither wire formats nor SQL; `service` brings policies out of the store and puts answers together.
 
-mod bundled;
+pub mod bundled;
 mod clock;
 mod engine;
 mod error;

@@ -1,0 +1,127 @@
+//! `qedgix bench`: how fast the parts are on this machine.
+
+use std::time::Instant;
+
+use clap::{Args, Subcommand};
+use serde_json::json;
+
+use super::run_args::{RunArgs, all_cores};
+use crate::learner::{Episodes, Learner, Rollout, TrainConfig};
+use crate::recipe::MixerKind;
+
+/// What to measure.
+#[derive(Args, Debug)]
+pub struct BenchArgs {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Subcommand, Debug)]
+enum What {
+    /// Seconds per learner update and per rollout, environment steps per second
+    ///
+    /// What --set leaves open is as in the specification's figures: flat observation without own position, one-hot identity,
+    /// mean aggregation, qmix mixer, a batch of 128 episodes, one update per rollout of 8.
+    Learner(LearnerArgs),
+}
+
+/// Flags of `bench learner`.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  qedgix bench learner --algorithm qedgix --json
+  qedgix bench learner --algorithm qmix --threads 1 --set training.batch=32 --set training.observation=set")]
+pub struct LearnerArgs {
+    #[command(flatten)]
+    run: RunArgs,
+    /// Threads of the update [default: all cores]
+    #[arg(long, env = "QEDGIX_THREADS")]
+    threads: Option<usize>,
+    /// Times each part is run; the median is told
+    #[arg(long, default_value_t = 7, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    repeat: u32,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// The configuration of the specification's figures, where it differs from the preset `practical`.
+const FIGURES: [&str; 6] = [
+    "training.observation=flat",
+    "training.identity=onehot",
+    "training.self_position=false",
+    "training.aggregation=mean",
+    "training.batch=128",
+    "training.updates_per_iteration=1",
+];
+
+/// Runs the command.
+///
+/// # Errors
+/// A configuration that is wrong.
+pub fn run(args: BenchArgs) -> anyhow::Result<()> {
+    match args.what {
+        What::Learner(args) => learner(args),
+    }
+}
+
+fn learner(mut args: LearnerArgs) -> anyhow::Result<()> {
+    let threads = args.threads.unwrap_or_else(all_cores);
+    let mut set: Vec<String> = FIGURES.map(str::to_owned).to_vec();
+    if !matches!(TrainConfig::preset(args.run.algorithm, args.run.preset).training.mixer, MixerKind::Vdn | MixerKind::None) {
+        set.push("training.mixer=qmix".to_owned());
+    }
+    set.append(&mut args.run.set);
+    args.run.set = set;
+    let config = args.run.resolve()?;
+    let (t, repeat) = (&config.training, args.repeat as usize);
+
+    let mut learner = Learner::new(&config, threads)?;
+    let batch = random_episodes(&config, &learner)?;
+    let update_s = median_seconds(repeat, || {
+        learner.update(&batch);
+    });
+    let mut rollout = Rollout::new(&config, learner.agent())?;
+    let rollout_s = median_seconds(repeat, || {
+        rollout.collect(learner.agent(), learner.agent_parameters(), 0.1, 0);
+    });
+    let steps = (t.envs * config.environment.slots) as f64;
+    let env_steps_per_s = steps / (rollout_s + update_s * t.updates_per_iteration as f64);
+    if args.json {
+        let figures = json!({
+            "algorithm": config.algorithm,
+            "threads": threads,
+            "update_s": update_s,
+            "rollout_s": rollout_s,
+            "env_steps_per_s": env_steps_per_s,
+            "config": config,
+        });
+        println!("{figures}");
+    } else {
+        println!("update of {} episodes   {:.2} ms", t.batch, update_s * 1e3);
+        println!("rollout of {} episodes    {:.2} ms", t.envs, rollout_s * 1e3);
+        println!("environment steps per s  {env_steps_per_s:.0}   ({} updates per rollout, {threads} threads)", t.updates_per_iteration);
+    }
+    Ok(())
+}
+
+/// A batch of random flight.
+fn random_episodes(config: &TrainConfig, learner: &Learner) -> anyhow::Result<Episodes> {
+    let mut config = config.clone();
+    config.training.envs = config.training.batch;
+    let mut rollout = Rollout::new(&config, learner.agent())?;
+    Ok(rollout.collect(learner.agent(), learner.agent_parameters(), 1.0, 0).clone())
+}
+
+/// Median seconds of `repeat` calls after one to warm up.
+fn median_seconds(repeat: usize, mut call: impl FnMut()) -> f64 {
+    call();
+    let mut seconds: Vec<f64> = (0..repeat)
+        .map(|_| {
+            let begin = Instant::now();
+            call();
+            begin.elapsed().as_secs_f64()
+        })
+        .collect();
+    seconds.sort_by(f64::total_cmp);
+    seconds[repeat / 2]
+}

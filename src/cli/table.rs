@@ -1,0 +1,51 @@
+//! Tables and little pictures for terminals.
+
+use comfy_table::{CellAlignment, Table, presets};
+
+use crate::learner::Summary;
+
+/// Policies side by side, best first. AoI is in slots.
+pub fn of_policies(rows: &[(String, Summary)]) -> Table {
+    let mut rows: Vec<_> = rows.iter().collect();
+    rows.sort_by(|a, b| a.1.mean_aoi.mean.total_cmp(&b.1.mean_aoi.mean));
+    let mut table = Table::new();
+    table.load_style(presets::UTF8_BORDERS_ONLY_CONDENSED);
+    table.set_header(["policy", "mean AoI", "95 % interval", "p95", "peak", "coverage", "fairness"]);
+    for (name, summary) in rows {
+        let m = &summary.mean;
+        table.add_row([
+            name.clone(),
+            format!("{:.2}", summary.mean_aoi.mean),
+            format!("{:.2} to {:.2}", summary.mean_aoi.low, summary.mean_aoi.high),
+            format!("{:.1}", m.p95_aoi),
+            format!("{:.1}", m.peak_aoi),
+            format!("{:.1} %", 100.0 * m.coverage),
+            format!("{:.2}", m.fairness),
+        ]);
+    }
+    for column in table.column_iter_mut().skip(1) {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+    table
+}
+
+/// A learning curve in one line, lowest value lowest.
+pub fn sparkline(values: &[f64]) -> String {
+    const LEVELS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
+    let low = values.iter().copied().fold(f64::INFINITY, f64::min);
+    let high = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let level = |v: f64| if high > low { ((v - low) / (high - low) * 7.0).round() as usize } else { 0 };
+    values.iter().map(|&v| LEVELS[level(v).min(7)]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sparkline_spans_its_levels() {
+        assert_eq!(sparkline(&[3.0, 1.0, 2.0]), "█▁▅");
+        assert_eq!(sparkline(&[5.0, 5.0]), "▁▁");
+        assert_eq!(sparkline(&[]), "");
+    }
+}

@@ -1,0 +1,182 @@
+//! `qedgix train`: a training run here, or as a job of a server.
+
+use std::fs;
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+
+use anyhow::{Context, bail};
+use clap::Args;
+use serde_json::Value;
+
+use super::client::Client;
+use super::run_args::{RunArgs, all_cores};
+use super::{progress, table};
+use crate::checkpoint::Checkpoint;
+use crate::learner::{Event, Summary, TrainConfig, Trainer, evaluate, layouts, summarize};
+
+/// Flags of `train`.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  qedgix train --algorithm qmix --steps 400000 --out qmix.safetensors
+  qedgix train --uavs 4 --users 8 --set training.learning_rate=5e-4 --metrics curve.csv
+  qedgix train --steps 250000 --snapshot run.snapshot           # stop with ctrl-c ...
+  qedgix train --resume run.snapshot --snapshot run.snapshot    # ... and go on, to the same bits
+  qedgix train --algorithm qedgix --server 127.0.0.1:8080 --name my-policy")]
+pub struct TrainArgs {
+    #[command(flatten)]
+    run: RunArgs,
+    /// Threads; they change the speed, never the result [default: all cores]
+    #[arg(long, env = "QEDGIX_THREADS")]
+    threads: Option<usize>,
+    /// Where the best checkpoint goes
+    #[arg(long, env = "QEDGIX_OUT", default_value = "policy.safetensors")]
+    out: PathBuf,
+    /// Writes the curve as CSV: step, name, value
+    #[arg(long, env = "QEDGIX_METRICS")]
+    metrics: Option<PathBuf>,
+    /// Keeps the state of the run in this file: written at evaluations, and when stopped with ctrl-c
+    #[arg(long, env = "QEDGIX_SNAPSHOT")]
+    snapshot: Option<PathBuf>,
+    /// Goes on from a snapshot; the configuration is the snapshot's
+    #[arg(long, env = "QEDGIX_RESUME", conflicts_with = "server")]
+    resume: Option<PathBuf>,
+    /// Submits the run as a job to the server at HOST:PORT (REST) and follows it
+    #[arg(long, env = "QEDGIX_SERVER", value_name = "HOST:PORT")]
+    server: Option<String>,
+    /// Name of the job, and of the policy that it becomes
+    #[arg(long, env = "QEDGIX_NAME", requires = "server")]
+    name: Option<String>,
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// A configuration that is wrong, a file that cannot be read or written, a job that fails.
+pub async fn run(args: TrainArgs) -> anyhow::Result<()> {
+    let threads = args.threads.unwrap_or_else(all_cores);
+    if let Some(address) = &args.server {
+        let client = Client::new(address)?;
+        let job = submit(&client, &args.run.job(threads, args.name.as_deref())?).await?;
+        println!("policy {}", job["policy"].as_str().unwrap_or("none"));
+        return Ok(());
+    }
+    let trainer = start(&args, threads)?;
+    let stop = trainer.stop_flag();
+    tokio::spawn(async move {
+        if tokio::signal::ctrl_c().await.is_ok() {
+            stop.store(true, Ordering::Relaxed);
+        }
+    });
+    tokio::task::spawn_blocking(move || train(&args, trainer, threads)).await?
+}
+
+/// Submits a job, shows its progress until it ends, and returns it.
+///
+/// # Errors
+/// The job is refused or fails.
+pub async fn submit(client: &Client, job: &Value) -> anyhow::Result<Value> {
+    let accepted = client.post("/v1/jobs", job).await?;
+    let id = accepted["id"].as_str().context("the server's answer has no job id")?;
+    let bar = progress::bar(accepted["steps"].as_u64().unwrap_or(0), "steps");
+    let ended = client
+        .wait_for_job(id, |job| {
+            bar.set_position(job["step"].as_u64().unwrap_or(0));
+            bar.set_message(job["state"].as_str().unwrap_or("?").to_owned());
+        })
+        .await;
+    bar.finish_and_clear();
+    ended
+}
+
+/// The run that the flags ask for, at its beginning or where its snapshot left it.
+fn start(args: &TrainArgs, threads: usize) -> anyhow::Result<Trainer> {
+    let Some(path) = &args.resume else { return Ok(Trainer::new(args.run.resolve()?, threads)?) };
+    let bytes = fs::read(path).with_context(|| format!("--resume {}", path.display()))?;
+    Trainer::restore(&bytes, threads).with_context(|| format!("--resume {}", path.display()))
+}
+
+fn train(args: &TrainArgs, mut trainer: Trainer, threads: usize) -> anyhow::Result<()> {
+    let config = trainer.config().clone();
+    eprintln!("{}", serde_json::to_string(&config)?);
+    let mut curve = args.metrics.as_deref().map(|path| Curve::open(path, args.resume.is_some())).transpose()?;
+    let bar = progress::bar(config.training.steps, "steps");
+    let mut evaluations = Vec::new();
+    let mut finished = false;
+    while let Some(event) = trainer.next() {
+        if let Some(curve) = &mut curve {
+            curve.write(&event)?;
+        }
+        match event {
+            Event::Iteration(i) => {
+                bar.set_position(i.step.min(config.training.steps));
+                bar.set_message(format!("epsilon {:.2}, train {:.1}", i.epsilon, i.mean_aoi));
+            }
+            Event::Evaluation { step, metrics } => {
+                evaluations.push(metrics.mean_aoi);
+                let line = format!("step {step:>8}  mean AoI {:6.2}  {}", metrics.mean_aoi, table::sparkline(&evaluations));
+                // Where nobody sees the bar, the line is the progress.
+                if bar.is_hidden() { eprintln!("{line}") } else { bar.println(line) }
+                if let Some(path) = &args.snapshot {
+                    write_whole(path, &trainer.snapshot())?;
+                }
+            }
+            Event::Diverged { step } => bail!("training diverged at step {step}: a parameter is no longer finite; try a smaller learning rate"),
+            Event::Finished { .. } => finished = true,
+        }
+    }
+    bar.finish_and_clear();
+    if !finished {
+        let Some(path) = &args.snapshot else { bail!("stopped; without --snapshot nothing is kept") };
+        write_whole(path, &trainer.snapshot())?;
+        println!("stopped; go on with --resume {}", path.display());
+        return Ok(());
+    }
+    let best = trainer.best()?.context("a finished run has been evaluated")?;
+    report(&config, &best, &args.out, threads)
+}
+
+/// Writes the checkpoint and flies it on eval-v1.
+fn report(config: &TrainConfig, checkpoint: &Checkpoint, out: &Path, threads: usize) -> anyhow::Result<()> {
+    write_whole(out, &checkpoint.to_bytes())?;
+    let list = layouts("eval-v1")?;
+    let episodes = evaluate(&checkpoint.policy(), &config.environment, &list.seeds(256), threads)?;
+    let rows: Vec<(String, Summary)> = vec![(out.display().to_string(), summarize(&episodes)?)];
+    println!("best weights by validation, from step {}; on {}:", checkpoint.step(), list.name);
+    println!("{}", table::of_policies(&rows));
+    Ok(())
+}
+
+/// Writes a file whole or not at all.
+fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    let mut partial = path.as_os_str().to_owned();
+    partial.push(".partial");
+    fs::write(&partial, bytes).and_then(|()| fs::rename(&partial, path)).with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// A training curve as CSV.
+struct Curve(std::io::BufWriter<fs::File>);
+
+impl Curve {
+    fn open(path: &Path, append: bool) -> anyhow::Result<Self> {
+        let file = fs::OpenOptions::new().create(true).write(true).append(append).truncate(!append).open(path);
+        let file = file.with_context(|| format!("cannot write {}", path.display()))?;
+        let fresh = file.metadata()?.len() == 0;
+        let mut curve = Self(std::io::BufWriter::new(file));
+        if fresh {
+            writeln!(curve.0, "step,name,value")?;
+        }
+        Ok(curve)
+    }
+
+    fn write(&mut self, event: &Event) -> anyhow::Result<()> {
+        for (step, name, value) in event.rows() {
+            writeln!(self.0, "{step},{name},{value}")?;
+        }
+        // A curve is watched while it grows.
+        if matches!(event, Event::Evaluation { .. } | Event::Finished { .. }) {
+            self.0.flush()?;
+        }
+        Ok(())
+    }
+}
