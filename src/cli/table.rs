@@ -9,7 +9,7 @@ pub fn of_policies(rows: &[(String, Summary)]) -> Table {
     let mut rows: Vec<_> = rows.iter().collect();
     rows.sort_by(|a, b| a.1.mean_aoi.mean.total_cmp(&b.1.mean_aoi.mean));
     let mut table = Table::new();
-    table.load_style(presets::UTF8_BORDERS_ONLY_CONDENSED);
+    table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
     table.set_header(["policy", "mean AoI", "95 % interval", "p95", "peak", "coverage", "fairness"]);
     for (name, summary) in rows {
         let m = &summary.mean;
