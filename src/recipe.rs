@@ -246,6 +246,8 @@ impl TrainConfig {
     /// # Errors
     /// The first field that is wrong.
     pub fn validate(&self) -> Result<(), Invalid> {
+        /// Bytes that a replay may take.
+        const LIMIT: usize = 8 << 30;
         self.environment.validate().map_err(|e| e.within("environment"))?;
         self.training.validate().map_err(|e| e.within("training"))?;
         let mixes = self.training.mixer != MixerKind::None;
@@ -256,7 +258,6 @@ impl TrainConfig {
         let (env, t) = (&self.environment, &self.training);
         let episode = (env.slots + 1) * (env.uavs * 8 + env.users * 10) + env.slots * (env.uavs + 4);
         let replay = episode.saturating_mul(t.buffer);
-        const LIMIT: usize = 8 << 30;
         if replay > LIMIT {
             let value = format!("{} (a replay of {} MiB at this size)", t.buffer, replay >> 20);
             return Err(Invalid::new("training.buffer", value, format!("a replay of at most {} MiB", LIMIT >> 20)));

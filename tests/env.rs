@@ -1,5 +1,7 @@
 //! The environment against spec 1: order of a step, every option, recorded dynamics, invariants.
 
+#![allow(clippy::float_cmp, reason = "the expected numbers are exact in binary")]
+
 use proptest::prelude::*;
 use qedgix::env::{BatchEnv, Boundary, EnvConfig, Episode, Layout, Point, Start, StepError};
 use safetensors::SafeTensors;

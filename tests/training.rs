@@ -1,5 +1,7 @@
 //! Training as a whole: it repeats itself bit for bit on any number of threads, and stopping it loses nothing.
 
+#![allow(clippy::float_cmp, reason = "runs repeat themselves bit for bit")]
+
 use std::sync::atomic::Ordering;
 
 use qedgix::env::EpisodeMetrics;
@@ -128,7 +130,7 @@ fn a_stopped_run_goes_on_when_asked() {
     let mut trainer = Trainer::new(small(Algorithm::Vdn), 1).unwrap();
     let stop = trainer.stop_flag();
     let mut told = Vec::new();
-    while let Some(event) = trainer.next() {
+    for event in trainer.by_ref() {
         told.push(event);
         stop.store(told.len() == 7, Ordering::Relaxed);
     }

@@ -90,6 +90,9 @@ impl Checkpoint {
     }
 
     /// The policy that these weights fly.
+    ///
+    /// # Panics
+    /// Never: what the policy asks of its parameters was checked when the checkpoint was made or read.
     pub fn policy(&self) -> Learned {
         let (agent, dims) = (self.config.agent(), self.config.dims());
         let len = Agent::new(agent, dims).layout().len();
@@ -97,6 +100,9 @@ impl Checkpoint {
     }
 
     /// The file.
+    ///
+    /// # Panics
+    /// Never: the configuration is plain data, which always has a JSON form.
     pub fn to_bytes(&self) -> Vec<u8> {
         let json = |value: serde_json::Result<String>| value.expect("plain data with string keys");
         let mut metadata = BTreeMap::from([

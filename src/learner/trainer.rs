@@ -278,6 +278,7 @@ fn epsilon(t: &Training, step: u64) -> f64 {
 }
 
 #[cfg(test)]
+#[allow(clippy::float_cmp, reason = "the ends of the schedule are exact")]
 mod tests {
     use super::*;
     use crate::recipe::{Algorithm, Preset};
