@@ -99,7 +99,10 @@ fn learner(mut args: LearnerArgs) -> anyhow::Result<()> {
     } else {
         println!("update of {} episodes   {:.2} ms", t.batch, update_s * 1e3);
         println!("rollout of {} episodes    {:.2} ms", t.envs, rollout_s * 1e3);
-        println!("environment steps per s  {env_steps_per_s:.0}   ({} updates per rollout, {threads} threads)", t.updates_per_iteration);
+        println!(
+            "environment steps per s  {env_steps_per_s:.0}   ({} updates per rollout, {threads} threads)",
+            t.updates_per_iteration
+        );
     }
     Ok(())
 }

@@ -48,7 +48,8 @@ const JOB: &str = "demo-job";
 /// Anything that does not go as told.
 pub async fn run(args: DemoArgs) -> anyhow::Result<()> {
     let temporary = args.data_dir.is_none();
-    let data_dir = args.data_dir.clone().unwrap_or_else(|| std::env::temp_dir().join(format!("qedgix-demo-{}", uuid::Uuid::now_v7())));
+    let data_dir =
+        args.data_dir.clone().unwrap_or_else(|| std::env::temp_dir().join(format!("qedgix-demo-{}", uuid::Uuid::now_v7())));
     let outcome = story(&args, data_dir.clone()).await;
     if temporary {
         std::fs::remove_dir_all(&data_dir).ok();
@@ -59,7 +60,12 @@ pub async fn run(args: DemoArgs) -> anyhow::Result<()> {
 async fn story(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
     let begin = Instant::now();
     let server = Server::start(&data_dir).await?;
-    println!("A server on an empty data directory\n  gRPC  {}\n  REST  http://{}\n  data  {}\n", server.grpc, server.http, data_dir.display());
+    println!(
+        "A server on an empty data directory\n  gRPC  {}\n  REST  http://{}\n  data  {}\n",
+        server.grpc,
+        server.http,
+        data_dir.display()
+    );
 
     let env = EnvConfig::default();
     let seeds = layouts("eval-v1")?.seeds(args.episodes);
@@ -70,7 +76,8 @@ async fn story(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
         env.slots,
         seeds.len()
     );
-    let mut flight = Flight { server: fly::connect(&server.grpc.to_string()).await?, env, seeds, rows: Vec::new(), flown: Vec::new() };
+    let mut flight =
+        Flight { server: fly::connect(&server.grpc.to_string()).await?, env, seeds, rows: Vec::new(), flown: Vec::new() };
     for (name, _) in bundled::BUNDLED {
         flight.fly(name).await?;
     }
@@ -103,7 +110,10 @@ async fn story(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
     }
     println!("Done in {:.0} s.", begin.elapsed().as_secs_f64());
     if args.keep {
-        println!("\nThe server stays: gRPC {}, REST http://{} (try /v1/jobs, /v1/policies). ctrl-c ends it.", server.grpc, server.http);
+        println!(
+            "\nThe server stays: gRPC {}, REST http://{} (try /v1/jobs, /v1/policies). ctrl-c ends it.",
+            server.grpc, server.http
+        );
         tokio::signal::ctrl_c().await?;
     }
     server.stop().await
@@ -137,7 +147,8 @@ impl Flight {
 /// Prints what the job's metrics say.
 async fn tell_curve(client: &Client, id: &str) -> anyhow::Result<()> {
     let answer = client.get(&format!("/v1/jobs/{id}/metrics?name=eval/mean_aoi")).await?;
-    let values: Vec<f64> = answer["rows"].as_array().into_iter().flatten().filter_map(|row: &Value| row["value"].as_f64()).collect();
+    let values: Vec<f64> =
+        answer["rows"].as_array().into_iter().flatten().filter_map(|row: &Value| row["value"].as_f64()).collect();
     let (first, last) = values.first().zip(values.last()).context("the job reported no evaluation")?;
     println!("   job {id} succeeded; validation mean AoI {first:.1} {} {last:.1}", table::sparkline(&values));
     Ok(())

@@ -58,7 +58,13 @@ pub struct EvaluateArgs {
 /// # Errors
 /// An unknown policy or list, a policy that does not fit, a server that refuses.
 pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
-    let mut env = EnvConfig { uavs: args.uavs, users: args.users, slots: args.slots, detection_range: args.detection_range, ..EnvConfig::default() };
+    let mut env = EnvConfig {
+        uavs: args.uavs,
+        users: args.users,
+        slots: args.slots,
+        detection_range: args.detection_range,
+        ..EnvConfig::default()
+    };
     env.validate()?;
     ensure!(args.episodes > 0, "--episodes: 0 is not valid; expected at least 1");
     let list = layouts(&args.layouts)?;
@@ -76,7 +82,8 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
         } else {
             let policy = open(name, &env)?;
             env.hover = policy.actions() > EnvConfig::COMPASS;
-            evaluate(policy.as_ref(), &env, &seeds, args.threads.unwrap_or_else(all_cores)).with_context(|| format!("policy {name}"))?
+            evaluate(policy.as_ref(), &env, &seeds, args.threads.unwrap_or_else(all_cores))
+                .with_context(|| format!("policy {name}"))?
         };
         flown.push((name.clone(), episodes));
         bar.inc(1);

@@ -10,6 +10,7 @@ mod run_args;
 mod serve;
 mod table;
 mod train;
+mod worker;
 
 use std::process::ExitCode;
 
@@ -35,11 +36,25 @@ enum Command {
     Evaluate(evaluate::EvaluateArgs),
     /// Measure how fast the parts are on this machine
     Bench(bench::BenchArgs),
+    /// Run one job for a server; servers start their workers themselves
+    Worker(worker::WorkerArgs),
 }
 
 /// Runs the command that the process was started with.
 pub fn run() -> ExitCode {
-    let Cli { command } = Cli::parse();
+    match Cli::parse().command {
+        Command::Serve(args) => block_on(serve::run(args)),
+        Command::Demo(args) => block_on(demo::run(args)),
+        Command::Train(args) => block_on(train::run(args)),
+        Command::Evaluate(args) => block_on(evaluate::run(args)),
+        Command::Bench(args) => block_on(async { bench::run(args) }),
+        // It begins without threads and without a runtime.
+        Command::Worker(args) => worker::run(&args),
+    }
+}
+
+/// Runs a command that serves or waits.
+fn block_on(command: impl Future<Output = anyhow::Result<()>>) -> ExitCode {
     let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
         Ok(runtime) => runtime,
         Err(e) => {
@@ -47,16 +62,7 @@ pub fn run() -> ExitCode {
             return ExitCode::FAILURE;
         }
     };
-    let done = runtime.block_on(async {
-        match command {
-            Command::Serve(args) => serve::run(args).await,
-            Command::Demo(args) => demo::run(args).await,
-            Command::Train(args) => train::run(args).await,
-            Command::Evaluate(args) => evaluate::run(args).await,
-            Command::Bench(args) => bench::run(args),
-        }
-    });
-    match done {
+    match runtime.block_on(command) {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
             eprintln!("error: {e:#}");

@@ -4,8 +4,10 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 /// A bar of `length` units called `what`.
 pub fn bar(length: u64, what: &'static str) -> ProgressBar {
-    let style = ProgressStyle::with_template(&format!("{{bar:32}} {{human_pos}}/{{human_len}} {what}  {{elapsed}} (left {{eta}})  {{msg}}"))
-        .expect("the template is valid");
+    let style = ProgressStyle::with_template(&format!(
+        "{{bar:32}} {{human_pos}}/{{human_len}} {what}  {{elapsed}} (left {{eta}})  {{msg}}"
+    ))
+    .expect("the template is valid");
     ProgressBar::new(length).with_style(style)
 }
 

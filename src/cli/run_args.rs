@@ -126,7 +126,8 @@ mod tests {
 
     #[test]
     fn flags_override_the_preset() {
-        let args = parse(&["--algorithm", "qmix", "--steps", "1000", "--set", "training.mixer=qmix", "--set", "environment.hover=true"]);
+        let args =
+            parse(&["--algorithm", "qmix", "--steps", "1000", "--set", "training.mixer=qmix", "--set", "environment.hover=true"]);
         let config = args.expect("flags parse").resolve().expect("valid");
         assert_eq!(config.algorithm, Algorithm::Qmix);
         assert_eq!(config.training.steps, 1000);

@@ -116,12 +116,18 @@ fn train(args: &TrainArgs, mut trainer: Trainer, threads: usize) -> anyhow::Resu
                 evaluations.push(metrics.mean_aoi);
                 let line = format!("step {step:>8}  mean AoI {:6.2}  {}", metrics.mean_aoi, table::sparkline(&evaluations));
                 // Where nobody sees the bar, the line is the progress.
-                if bar.is_hidden() { eprintln!("{line}") } else { bar.println(line) }
+                if bar.is_hidden() {
+                    eprintln!("{line}")
+                } else {
+                    bar.println(line)
+                }
                 if let Some(path) = &args.snapshot {
                     write_whole(path, &trainer.snapshot())?;
                 }
             }
-            Event::Diverged { step } => bail!("training diverged at step {step}: a parameter is no longer finite; try a smaller learning rate"),
+            Event::Diverged { step } => {
+                bail!("training diverged at step {step}: a parameter is no longer finite; try a smaller learning rate")
+            }
             Event::Finished { .. } => finished = true,
         }
     }
@@ -151,7 +157,9 @@ fn report(config: &TrainConfig, checkpoint: &Checkpoint, out: &Path, threads: us
 fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     let mut partial = path.as_os_str().to_owned();
     partial.push(".partial");
-    fs::write(&partial, bytes).and_then(|()| fs::rename(&partial, path)).with_context(|| format!("cannot write {}", path.display()))
+    fs::write(&partial, bytes)
+        .and_then(|()| fs::rename(&partial, path))
+        .with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// A training curve as CSV.

@@ -47,8 +47,13 @@ pub enum Finish {
     Succeeded,
     /// Stopped before the end, as asked.
     Stopped,
-    /// Gave up, for this reason.
-    Failed(String),
+    /// Gave up.
+    Failed {
+        /// Why.
+        reason: String,
+        /// Whether it would come again.
+        permanent: bool,
+    },
 }
 
 /// The attempt that these credentials belong to, if it lasts.
@@ -148,9 +153,9 @@ pub async fn finish(app: &App, lease: Lease, finish: Finish) -> Result<(), Error
     let ending = match finish {
         Finish::Succeeded => Ending::Succeeded(None),
         Finish::Stopped => Ending::Stopped,
-        Finish::Failed(reason) => {
+        Finish::Failed { reason, permanent } => {
             let reason = reason.chars().take(2000).collect();
-            Ending::Failed { reason, max_attempts: app.jobs.settings().max_attempts }
+            Ending::Failed { reason, max_attempts: if permanent { 1 } else { app.jobs.settings().max_attempts } }
         }
     };
     let job = app.store.end_attempt(lease, &ending, app.clock.now()).await?.ok_or_else(|| fenced(lease))?;

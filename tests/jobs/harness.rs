@@ -2,6 +2,7 @@
 
 use std::future::Future;
 use std::net::SocketAddr;
+use std::ops::Deref;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
@@ -62,62 +63,29 @@ impl Executor for Manual {
 
 pub struct Server {
     pub app: Arc<App>,
-    pub http: String,
+    pub rest: Rest,
     pub grpc: String,
     pub workers: mpsc::UnboundedReceiver<Worker>,
-    client: reqwest::Client,
     server: JoinHandle<()>,
 }
 
-impl Server {
-    pub async fn start(data_dir: &Path, cpu_budget: usize) -> Self {
-        Self::start_with(data_dir, cpu_budget, |_| {}).await
-    }
+impl Deref for Server {
+    type Target = Rest;
 
-    pub async fn start_with(data_dir: &Path, cpu_budget: usize, adjust: impl FnOnce(&mut Settings)) -> Self {
-        let free = SocketAddr::from(([127, 0, 0, 1], 0));
-        let config = Config { grpc_addr: free, http_addr: free, ..Config::new(data_dir) };
-        let data = DataDir::take(data_dir).unwrap();
-        let listeners = Listeners::bind(&config).await.unwrap();
-        let endpoints = listeners.endpoints().unwrap();
-        let (sender, workers) = mpsc::unbounded_channel();
-        let store = Store::open(data_dir).await.unwrap();
-        let mut settings = Settings::new(cpu_budget);
-        adjust(&mut settings);
-        let clock = Clock::system();
-        let app = Arc::new(App {
-            jobs: Jobs::open(store.clone(), settings, Arc::new(Manual(sender))).await.unwrap(),
-            store,
-            registry: Registry::default(),
-            sessions: Sessions::new(SessionsConfig { ttl: config.session_ttl, max: 1 }, clock.clone()),
-            engine: Engine::start(1, 1).unwrap(),
-            clock,
-            draining: Draining::default(),
-        });
-        let serving = Arc::clone(&app);
-        let server = tokio::spawn(async move {
-            server::run(&config, &data, serving, listeners, std::future::pending()).await.unwrap();
-        });
-        Self {
-            app,
-            http: format!("http://{}", endpoints.http),
-            grpc: format!("http://{}", endpoints.grpc),
-            workers,
-            client: reqwest::Client::new(),
-            server,
-        }
+    fn deref(&self) -> &Rest {
+        &self.rest
     }
+}
 
-    /// The end of the server, without any chance to clean up.
-    pub async fn crash(&mut self) {
-        self.server.abort();
-        // Aborted: that is its result.
-        let _ = (&mut self.server).await;
-    }
+/// A client of the REST API.
+pub struct Rest {
+    http: String,
+    client: reqwest::Client,
+}
 
-    /// The next worker that is started.
-    pub async fn worker(&mut self) -> Worker {
-        within(self.workers.recv()).await.expect("the scheduler lives")
+impl Rest {
+    pub fn new(http: String) -> Self {
+        Self { http, client: reqwest::Client::new() }
     }
 
     pub fn request(&self, method: Method, path: &str) -> reqwest::RequestBuilder {
@@ -154,6 +122,68 @@ impl Server {
             }
         })
         .await
+    }
+}
+
+impl Server {
+    pub async fn start(data_dir: &Path, cpu_budget: usize) -> Self {
+        Self::start_with(data_dir, cpu_budget, |_| {}).await
+    }
+
+    pub async fn start_with(data_dir: &Path, cpu_budget: usize, adjust: impl FnOnce(&mut Settings)) -> Self {
+        Self::start_on(data_dir, cpu_budget, adjust, None).await
+    }
+
+    /// With workers of this executor; none: the test plays them.
+    pub async fn start_on(
+        data_dir: &Path,
+        cpu_budget: usize,
+        adjust: impl FnOnce(&mut Settings),
+        executor: Option<Arc<dyn Executor>>,
+    ) -> Self {
+        let free = SocketAddr::from(([127, 0, 0, 1], 0));
+        let config = Config { grpc_addr: free, http_addr: free, ..Config::new(data_dir) };
+        let data = DataDir::take(data_dir).unwrap();
+        let listeners = Listeners::bind(&config).await.unwrap();
+        let endpoints = listeners.endpoints().unwrap();
+        let (sender, workers) = mpsc::unbounded_channel();
+        let executor = executor.unwrap_or_else(|| Arc::new(Manual(sender)));
+        let store = Store::open(data_dir).await.unwrap();
+        let mut settings = Settings::new(cpu_budget);
+        adjust(&mut settings);
+        let clock = Clock::system();
+        let app = Arc::new(App {
+            jobs: Jobs::open(store.clone(), settings, executor).await.unwrap(),
+            store,
+            registry: Registry::default(),
+            sessions: Sessions::new(SessionsConfig { ttl: config.session_ttl, max: 1 }, clock.clone()),
+            engine: Engine::start(1, 1).unwrap(),
+            clock,
+            draining: Draining::default(),
+        });
+        let serving = Arc::clone(&app);
+        let server = tokio::spawn(async move {
+            server::run(&config, &data, serving, listeners, std::future::pending()).await.unwrap();
+        });
+        Self {
+            app,
+            rest: Rest::new(format!("http://{}", endpoints.http)),
+            grpc: format!("http://{}", endpoints.grpc),
+            workers,
+            server,
+        }
+    }
+
+    /// The end of the server, without any chance to clean up.
+    pub async fn crash(&mut self) {
+        self.server.abort();
+        // Aborted: that is its result.
+        let _ = (&mut self.server).await;
+    }
+
+    /// The next worker that is started.
+    pub async fn worker(&mut self) -> Worker {
+        within(self.workers.recv()).await.expect("the scheduler lives")
     }
 
     pub async fn jobs(&self) -> JobServiceClient<Channel> {

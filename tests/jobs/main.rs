@@ -1,6 +1,7 @@
 //! Jobs from outside: submission over both transports, scheduling, the protocol of workers.
 
 mod harness;
+mod processes;
 mod protocol;
 mod scheduling;
 mod submission;

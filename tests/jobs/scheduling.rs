@@ -11,7 +11,7 @@ use tonic::Code;
 use super::harness::{PATIENCE, Server, Worker, expect, named, signed, tiny, with, within};
 
 async fn finish(server: &Server, worker: &Worker, outcome: v1::Outcome) {
-    let request = v1::FinishRequest { outcome: outcome.into(), reason: "told to".into() };
+    let request = v1::FinishRequest { outcome: outcome.into(), reason: "told to".into(), permanent: false };
     let request = signed(&worker.launch, &worker.launch.token, request);
     server.worker_client().await.finish(request).await.unwrap();
 }

@@ -229,7 +229,7 @@ impl TryFrom<v1::FinishRequest> for Finish {
         match request.outcome() {
             v1::Outcome::Succeeded => Ok(Self::Succeeded),
             v1::Outcome::Stopped => Ok(Self::Stopped),
-            v1::Outcome::Failed => Ok(Self::Failed(request.reason)),
+            v1::Outcome::Failed => Ok(Self::Failed { reason: request.reason, permanent: request.permanent }),
             v1::Outcome::Unspecified => Err(Invalid::new("outcome", request.outcome, "succeeded, stopped or failed")),
         }
     }

@@ -1,0 +1,338 @@
+//! The real thing: a server process, its worker processes, and what happens when either dies.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::time::Duration;
+
+use qedgix::checkpoint::Checkpoint;
+use qedgix::env::EpisodeMetrics;
+use qedgix::jobs::{LocalProcess, hex};
+use qedgix::learner::{Event, TrainConfig, Trainer, evaluate, layouts};
+use reqwest::{Method, StatusCode};
+use serde_json::{Value, json};
+use sha2::{Digest, Sha256};
+
+use super::harness::{Rest, Server, tiny, within};
+
+const POLL: Duration = Duration::from_millis(5);
+
+/// A `qedgix serve` on free ports; killed when dropped.
+struct Process {
+    child: Child,
+    rest: Rest,
+}
+
+impl Process {
+    async fn start(data_dir: &Path) -> Self {
+        let endpoints = data_dir.join("endpoints.json");
+        // What a killed server has left.
+        let _ = std::fs::remove_file(&endpoints);
+        let child = Command::new(env!("CARGO_BIN_EXE_qedgix"))
+            .args(["serve", "--grpc-addr", "127.0.0.1:0", "--http-addr", "127.0.0.1:0", "--cpu-budget", "1"])
+            .args(["--snapshot-every", "0.05", "--data-dir"])
+            .arg(data_dir)
+            .stdout(Stdio::null())
+            .spawn()
+            .unwrap();
+        let text = within(async {
+            loop {
+                match std::fs::read_to_string(&endpoints) {
+                    Ok(text) => break text,
+                    Err(_) => tokio::time::sleep(POLL).await,
+                }
+            }
+        })
+        .await;
+        let endpoints: Value = serde_json::from_str(&text).unwrap();
+        Self { child, rest: Rest::new(format!("http://{}", endpoints["http"].as_str().unwrap())) }
+    }
+
+    fn kill(&mut self) {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+    }
+
+    /// SIGTERM, and the status it ends with.
+    async fn terminate(&mut self) -> std::process::ExitStatus {
+        signal("TERM", self.child.id());
+        within(async {
+            loop {
+                match self.child.try_wait().unwrap() {
+                    Some(status) => break status,
+                    None => tokio::time::sleep(POLL).await,
+                }
+            }
+        })
+        .await
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        // It may have ended before.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn signal(name: &str, pid: u32) {
+    assert!(Command::new("kill").args([format!("-{name}"), pid.to_string()]).status().unwrap().success());
+}
+
+/// The processes that work at this job.
+fn workers(job: &str) -> Vec<u32> {
+    let needle = format!("QEDGIX_JOB={job}");
+    let of = |entry: PathBuf| {
+        let pid = entry.file_name()?.to_str()?.parse().ok()?;
+        let environment = std::fs::read(entry.join("environ")).ok()?;
+        environment.split(|&b| b == 0).any(|variable| variable == needle.as_bytes()).then_some(pid)
+    };
+    std::fs::read_dir("/proc").unwrap().filter_map(|entry| of(entry.unwrap().path())).collect()
+}
+
+async fn no_worker(job: &str) {
+    within(async {
+        while !workers(job).is_empty() {
+            tokio::time::sleep(POLL).await;
+        }
+    })
+    .await;
+}
+
+/// A job of a few seconds.
+fn job() -> Value {
+    json!({
+        "algorithm": "vdn",
+        "seed": 3,
+        "environment": {"slots": 20, "uavs": 2, "users": 3},
+        "training": {"steps": 24_000, "envs": 4, "batch": 16, "buffer": 200, "eval_every": 2_000, "eval_episodes": 8},
+    })
+}
+
+/// Figures by name and step, to the bit; of the speed, which nothing fixes, only where there are some.
+type Rows = BTreeMap<(String, u64), Option<u64>>;
+
+fn bits(name: &str, value: f64) -> Option<u64> {
+    (name != "env_steps_per_s").then_some(value.to_bits())
+}
+
+/// All rows of a job, from CSV: its numbers are read back exactly.
+async fn rows(rest: &Rest, id: &str) -> Rows {
+    let table = rest.request(Method::GET, &format!("/v1/jobs/{id}/metrics?format=csv")).send().await.unwrap();
+    let mut rows = Rows::new();
+    for line in table.text().await.unwrap().lines().skip(1) {
+        let [name, step, value, _] = line.split(',').collect::<Vec<_>>()[..] else { panic!("{line}") };
+        let row = bits(name, value.parse().unwrap());
+        assert!(rows.insert((name.to_owned(), step.parse().unwrap()), row).is_none(), "{name} at {step} is there twice");
+    }
+    rows
+}
+
+/// The rows and the best policy of the same training, undisturbed, in this process.
+fn undisturbed(spec: &Value) -> (Rows, Checkpoint) {
+    let object = |field: &str| spec[field].as_object().unwrap().clone();
+    let algorithm = serde_json::from_value(spec["algorithm"].clone()).unwrap();
+    let (environment, training) = (object("environment"), object("training"));
+    let seed = spec["seed"].as_u64().unwrap();
+    let config = TrainConfig::resolve(algorithm, Default::default(), &environment, &training, seed).unwrap();
+    let reference = |checkpoint: &Checkpoint| {
+        let seeds = layouts("eval-v1").unwrap().seeds(256);
+        EpisodeMetrics::mean(&evaluate(&checkpoint.policy(), &config.environment, &seeds, 1).unwrap()).mean_aoi
+    };
+    let mut trainer = Trainer::new(config.clone(), 1).unwrap();
+    let mut rows = Rows::new();
+    let mut add = |step, name: &str, value| rows.insert((name.to_owned(), step), bits(name, value));
+    add(0, "eval-v1/mean_aoi", reference(&trainer.checkpoint().unwrap()));
+    for event in trainer.by_ref() {
+        if let Event::Iteration(done) = event {
+            add(done.step, "env_steps_per_s", 0.0);
+        }
+        for (step, name, value) in event.rows() {
+            add(step, name, value);
+        }
+    }
+    let best = trainer.best().unwrap().unwrap();
+    add(trainer.step(), "eval-v1/mean_aoi", reference(&best));
+    (rows, best)
+}
+
+/// Compares row by row, so that a failure shows the row and not all of them.
+fn assert_same(found: &Rows, expected: &Rows) {
+    for (key, value) in expected {
+        assert_eq!(found.get(key), Some(value), "{key:?}");
+    }
+    let more: Vec<_> = found.keys().filter(|key| !expected.contains_key(key)).collect();
+    assert!(more.is_empty(), "rows from nowhere: {more:?}");
+}
+
+/// Waits until the job is past this step.
+async fn passes(rest: &Rest, id: &str, step: u64) {
+    within(async {
+        loop {
+            let job = rest.get(&format!("/v1/jobs/{id}")).await;
+            if job["progress"]["step"].as_u64().unwrap() >= step {
+                assert_eq!(job["state"], "running", "the job must not end before it is disturbed");
+                return;
+            }
+            tokio::time::sleep(POLL).await;
+        }
+    })
+    .await;
+}
+
+/// The attempts, checked to have gone on from a snapshot from the second on.
+async fn attempts(rest: &Rest, id: &str) -> Vec<Value> {
+    let attempts = rest.get(&format!("/v1/jobs/{id}/logs")).await["attempts"].as_array().unwrap().clone();
+    for attempt in &attempts[1..] {
+        let log = attempt["log"].as_str().unwrap();
+        assert!(log.contains("from_step="), "it begins anew: {log}");
+    }
+    attempts
+}
+
+#[tokio::test]
+async fn a_job_runs_to_its_end_in_a_worker() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = Process::start(dir.path()).await;
+    let rest = &server.rest;
+    let id = rest.submit(&job()).await;
+    let done = rest.reaches(&id, "succeeded").await;
+    assert_eq!((&done["attempts"], &done["failures"], &done["progress"]["step"]), (&json!(1), &json!(0), &json!(24_000)));
+    let (expected, best) = undisturbed(&job());
+    assert_same(&rows(rest, &id).await, &expected);
+
+    let list = rest.get(&format!("/v1/jobs/{id}/checkpoints")).await["checkpoints"].as_array().unwrap().clone();
+    let found = list.iter().find(|c| c["kind"] == "best").unwrap();
+    let path = format!("/v1/checkpoints/{}", found["id"].as_str().unwrap());
+    let bytes = rest.request(Method::GET, &path).send().await.unwrap().bytes().await.unwrap();
+    assert_eq!(found["sha256"], hex(&Sha256::digest(&bytes)));
+    assert_eq!(Checkpoint::from_bytes(&bytes).unwrap(), best);
+    assert_eq!(found["metrics"]["eval/mean_aoi"], json!(best.metrics().unwrap().mean_aoi));
+    assert!(list.iter().any(|c| c["kind"] == "last" && c["step"] == 24_000));
+    no_worker(&id).await;
+}
+
+#[tokio::test]
+async fn a_killed_worker_is_replaced_and_nothing_is_missing_or_doubled() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = Process::start(dir.path()).await;
+    let id = server.rest.submit(&job()).await;
+    passes(&server.rest, &id, 6_000).await;
+    for worker in workers(&id) {
+        signal("KILL", worker);
+    }
+    let done = server.rest.reaches(&id, "succeeded").await;
+    assert_eq!((&done["attempts"], &done["failures"]), (&json!(2), &json!(1)));
+    let attempts = attempts(&server.rest, &id).await;
+    assert_eq!(attempts[0]["outcome"], "failed");
+    assert!(attempts[0]["reason"].as_str().unwrap().contains("killed by signal 9"), "{}", attempts[0]["reason"]);
+    assert!(attempts[0]["log"].as_str().unwrap().contains("training"), "{}", attempts[0]["log"]);
+    assert_same(&rows(&server.rest, &id).await, &undisturbed(&job()).0);
+}
+
+#[tokio::test]
+async fn a_killed_server_goes_on_where_it_was() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Process::start(dir.path()).await;
+    let id = server.rest.submit(&job()).await;
+    let waiting = server.rest.submit(&tiny()).await;
+    passes(&server.rest, &id, 6_000).await;
+    server.kill();
+    // Its worker ends by itself.
+    no_worker(&id).await;
+
+    let server = Process::start(dir.path()).await;
+    let done = server.rest.reaches(&id, "succeeded").await;
+    assert_eq!((&done["attempts"], &done["failures"]), (&json!(2), &json!(0)));
+    assert_eq!(attempts(&server.rest, &id).await[0]["outcome"], "interrupted");
+    assert_same(&rows(&server.rest, &id).await, &undisturbed(&job()).0);
+    server.rest.reaches(&waiting, "succeeded").await;
+}
+
+#[tokio::test]
+async fn a_terminated_server_snapshots_its_jobs_and_ends_well() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Process::start(dir.path()).await;
+    let id = server.rest.submit(&job()).await;
+    passes(&server.rest, &id, 4_000).await;
+    assert!(server.terminate().await.success());
+    assert!(workers(&id).is_empty());
+
+    let server = Process::start(dir.path()).await;
+    let done = server.rest.reaches(&id, "succeeded").await;
+    assert_eq!((&done["attempts"], &done["failures"]), (&json!(2), &json!(0)));
+    assert_eq!(attempts(&server.rest, &id).await[0]["outcome"], "interrupted");
+    assert_same(&rows(&server.rest, &id).await, &undisturbed(&job()).0);
+}
+
+#[tokio::test]
+async fn a_paused_job_goes_on_when_resumed_and_a_cancelled_one_stops() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = Process::start(dir.path()).await;
+    let rest = &server.rest;
+    let id = rest.submit(&job()).await;
+    passes(rest, &id, 2_000).await;
+    rest.post(&format!("/v1/jobs/{id}/pause")).await;
+    rest.reaches(&id, "paused").await;
+    no_worker(&id).await;
+    rest.post(&format!("/v1/jobs/{id}/resume")).await;
+    rest.reaches(&id, "succeeded").await;
+    assert_eq!(attempts(rest, &id).await[0]["outcome"], "paused");
+    assert_same(&rows(rest, &id).await, &undisturbed(&job()).0);
+
+    let mut long = job();
+    long["training"]["steps"] = json!(1_000_000_000);
+    let id = rest.submit(&long).await;
+    passes(rest, &id, 80).await;
+    rest.post(&format!("/v1/jobs/{id}/cancel")).await;
+    rest.reaches(&id, "cancelled").await;
+    no_worker(&id).await;
+    let logs = rest.get(&format!("/v1/jobs/{id}/logs")).await;
+    assert_eq!(logs["attempts"][0]["outcome"], "cancelled", "it obeyed: {logs}");
+}
+
+#[tokio::test]
+async fn the_output_and_exit_code_of_a_process_are_kept() {
+    let dir = tempfile::tempdir().unwrap();
+    // A program that dislikes the arguments of a worker.
+    let executor = LocalProcess { program: "/bin/ls".into() };
+    let server = Server::start_on(dir.path(), 1, |_| {}, Some(Arc::new(executor))).await;
+    let id = server.submit(&tiny()).await;
+    let job = server.reaches(&id, "failed").await;
+    assert_eq!(job["reason"], "the worker ended with exit code 2");
+    let logs = server.get(&format!("/v1/jobs/{id}/logs")).await;
+    assert_eq!(logs["attempts"].as_array().unwrap().len(), 3);
+    assert!(logs["attempts"][2]["log"].as_str().unwrap().contains("tethered"), "{logs}");
+
+    let dir = tempfile::tempdir().unwrap();
+    let executor = LocalProcess { program: "/nowhere/qedgix".into() };
+    let server = Server::start_on(dir.path(), 1, |s| s.max_attempts = 1, Some(Arc::new(executor))).await;
+    let id = server.submit(&tiny()).await;
+    let job = server.reaches(&id, "failed").await;
+    assert!(job["reason"].as_str().unwrap().starts_with("the worker could not be started"), "{job}");
+}
+
+#[tokio::test]
+async fn a_worker_without_an_assignment_or_a_server_says_so() {
+    let output = Command::new(env!("CARGO_BIN_EXE_qedgix")).arg("worker").env_remove("QEDGIX_SERVER").output().unwrap();
+    assert!(!output.status.success());
+    assert!(String::from_utf8_lossy(&output.stderr).contains("QEDGIX_SERVER"));
+
+    let dir = tempfile::tempdir().unwrap();
+    let server = Process::start(dir.path()).await;
+    let endpoints: Value = serde_json::from_slice(&std::fs::read(dir.path().join("endpoints.json")).unwrap()).unwrap();
+    let output = Command::new(env!("CARGO_BIN_EXE_qedgix"))
+        .arg("worker")
+        .env("QEDGIX_SERVER", format!("http://{}", endpoints["grpc"].as_str().unwrap()))
+        .env("QEDGIX_JOB", uuid::Uuid::nil().to_string())
+        .env("QEDGIX_ATTEMPT", "1")
+        .env("QEDGIX_TOKEN", "guessed")
+        .output()
+        .unwrap();
+    assert!(!output.status.success());
+    assert!(String::from_utf8_lossy(&output.stderr).contains("attempt is over"), "{output:?}");
+    let jobs = server.rest.request(Method::GET, "/v1/jobs").send().await.unwrap();
+    assert_eq!(jobs.status(), StatusCode::OK);
+}
