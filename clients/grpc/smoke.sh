@@ -1,0 +1,90 @@
+#!/usr/bin/env bash
+# Flies three slots through a server's gRPC with grpcurl and fails on any surprise.
+#
+#   clients/grpc/smoke.sh HOST:PORT
+#
+# GRPCURL: the program (default: grpcurl); the original in Go and the one of the crate grpcurl-rs both do.
+# POLICY:  the policy to fly (default: sweep).
+set -euo pipefail
+
+address=${1:?usage: smoke.sh HOST:PORT}
+grpcurl=${GRPCURL:-grpcurl}
+policy=${POLICY:-sweep}
+service=qedgix.v1.PolicyService
+session=smoke-$$-$(date +%s)
+
+fail() {
+    echo "smoke: $*" >&2
+    exit 1
+}
+
+# Calls a method; answers are compared without the whitespace that the two programs set differently.
+call() {
+    local method=$1 request=$2
+    "$grpcurl" --plaintext -d "$request" "$address" "$service/$method" | tr -d ' \n\t'
+}
+
+expect() {
+    local what=$1 answer=$2 pattern=$3
+    [[ $answer =~ $pattern ]] || fail "$what: expected $pattern in: $answer"
+}
+
+# A slot of three UAVs at the centre and five users, one of them in sight.
+slot() {
+    local step=$1 uavs="" users="" i
+    for i in 1 2 3; do
+        uavs+="{\"id\":\"uav-$i\",\"x\":0.5,\"y\":0.5},"
+    done
+    for i in 1 2 3 4 5; do
+        users+="{\"id\":\"user-$i\",\"x\":0.$((i * 2 - 1)),\"y\":0.6,\"aoi\":$step},"
+    done
+    printf '{"policy":"%s","session_id":"%s","step":%d,"scene":{"uavs":[%s],"users":[%s]}}' \
+        "$policy" "$session" "$step" "${uavs%,}" "${users%,}"
+}
+
+services=$("$grpcurl" --plaintext "$address" list)
+for name in "$service" grpc.health.v1.Health; do
+    grep -qxF "$name" <<<"$services" || fail "the list of services lacks $name: $services"
+done
+
+description=$("$grpcurl" --plaintext "$address" describe "$service")
+for method in Act OpenSession CloseSession ListPolicies GetPolicy; do
+    grep -qE "rpc $method \(" <<<"$description" || fail "$service lacks $method: $description"
+done
+
+health=$("$grpcurl" --plaintext -d "{\"service\":\"$service\"}" "$address" grpc.health.v1.Health/Check)
+grep -qF '"SERVING"' <<<"$health" || fail "not serving: $health"
+
+answer=$(call GetPolicy "{\"policy\":\"$policy\"}")
+expect GetPolicy "$answer" '"digest":"[0-9a-f]{64}"'
+answer=$(call OpenSession "{\"policy\":\"$policy\",\"session_id\":\"$session\",\"seed\":7}")
+expect OpenSession "$answer" "\"sessionId\":\"$session\""
+
+# What is left out of JSON because it is zero: heading 0 and step 0.
+action='\{"uavId":"uav-N"(,"headingIndex":[1-8])?(,"headingDeg":(0|[0-9.]+))?\}'
+last=
+for step in 0 1 2; do
+    last=$(call Act "$(slot "$step")")
+    for i in 1 2 3; do
+        expect "Act, step $step" "$last" "${action/N/$i}"
+    done
+    [ "$step" = 0 ] || expect "Act, step $step" "$last" "\"step\":\"$step\""
+done
+
+headings() { grep -o '"actions":\[[^]]*\]' <<<"$1"; }
+again=$(call Act "$(slot 2)")
+[ "$(headings "$again")" = "$(headings "$last")" ] || fail "step 2 repeated was answered differently: $again, before: $last"
+
+if refused=$(call Act "$(slot 7)" 2>&1); then
+    fail "step 7 after step 2 was answered: $refused"
+fi
+expect "Act, step 7" "$refused" '(FailedPrecondition|FAILED_PRECONDITION)'
+
+answer=$(call CloseSession "{\"session_id\":\"$session\"}")
+expect CloseSession "$answer" '"steps":"3"'
+if refused=$(call CloseSession "{\"session_id\":\"$session\"}" 2>&1); then
+    fail "a closed session was closed again: $refused"
+fi
+expect "CloseSession, again" "$refused" '(NotFound|NOT_FOUND)'
+
+echo "smoke: ok: $policy flew three slots at $address"
