@@ -6,7 +6,6 @@
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
@@ -94,7 +93,7 @@ impl Shared {
 /// The engine; dropping it ends its threads after the work they have begun.
 pub struct Engine {
     shared: Arc<Shared>,
-    threads: Vec<JoinHandle<()>>,
+    threads: usize,
 }
 
 impl Engine {
@@ -104,7 +103,7 @@ impl Engine {
     /// The system refuses a thread.
     pub fn start(threads: usize, capacity: usize) -> std::io::Result<Self> {
         let shared = Arc::new(Shared { queue: Mutex::default(), filled: Condvar::new(), capacity });
-        let mut engine = Self { shared: shared.clone(), threads: Vec::new() };
+        let engine = Self { shared: shared.clone(), threads };
         for i in 0..threads {
             let shared = shared.clone();
             let work = move || {
@@ -112,7 +111,7 @@ impl Engine {
                     compute(queued);
                 }
             };
-            engine.threads.push(std::thread::Builder::new().name(format!("engine-{i}")).spawn(work)?);
+            std::thread::Builder::new().name(format!("engine-{i}")).spawn(work)?;
         }
         Ok(engine)
     }
@@ -145,17 +144,14 @@ impl Engine {
 impl Drop for Engine {
     fn drop(&mut self) {
         self.shared.lock().closed = true;
+        // Not joined: nobody waits for an answer any more, and a policy that hangs must not keep the process.
         self.shared.filled.notify_all();
-        for thread in self.threads.drain(..) {
-            // A thread that panicked has told its caller already.
-            let _ = thread.join();
-        }
     }
 }
 
 impl std::fmt::Debug for Engine {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "Engine({} threads)", self.threads.len())
+        write!(f, "Engine({} threads)", self.threads)
     }
 }
 

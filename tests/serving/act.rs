@@ -1,0 +1,250 @@
+//! The rules of `Act` over gRPC.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use qedgix::policy::Turn;
+use qedgix::policy::baselines::{LIST, World, by_name};
+use qedgix::serving::Observation;
+use qedgix::wire::v1;
+use tonic::Code;
+
+use super::harness::*;
+
+#[tokio::test]
+async fn a_session_flies_and_repeats() {
+    let server = Server::start().await;
+    let mut client = server.grpc().await;
+    let session = client.open_session(open("sweep", "s")).await.unwrap().into_inner();
+    assert_eq!((session.session_id.as_str(), session.steps), ("s", 0));
+    let pinned = session.policy.unwrap();
+    assert_eq!((pinned.name.as_str(), pinned.version, pinned.digest.len()), ("sweep", 1, 64));
+    let mut last = None;
+    for step in 0..3 {
+        let answer = client.act(in_session("s", Some(step), scene(3, 5, step))).await.unwrap().into_inner();
+        assert_eq!(answer.step, step);
+        assert_eq!(answer.actions.len(), 3);
+        assert!(answer.actions.iter().all(|a| a.heading_deg == Some(45.0 * f64::from(a.heading_index)) && a.q_values.is_empty()));
+        assert!(answer.recurrent_state.is_empty(), "memory stays on the server");
+        assert_eq!(answer.policy.as_ref().unwrap(), &pinned);
+        assert_eq!(answer.timings.as_ref().unwrap().batch_size, 1);
+        last = Some(answer);
+    }
+    let again = client.act(in_session("s", Some(2), scene(3, 5, 2))).await.unwrap().into_inner();
+    assert_eq!(Some(&again), last.as_ref());
+    let other = client.act(in_session("s", Some(2), scene(3, 5, 77))).await.unwrap().into_inner();
+    assert_eq!(Some(other), last, "the slot has been flown, whatever the retry observes");
+    for wrong in [0, 1, 4, u64::MAX] {
+        let (code, reason, _) = refused(client.act(in_session("s", Some(wrong), scene(3, 5, 0))).await);
+        assert_eq!((code, reason.as_str()), (Code::FailedPrecondition, "wrong_step"));
+    }
+    let closed = client.close_session(v1::CloseSessionRequest { session_id: "s".into() }).await.unwrap().into_inner();
+    assert_eq!(closed.steps, 3);
+    assert_eq!(refused(client.act(in_session("s", None, scene(3, 5, 3))).await).0, Code::NotFound);
+}
+
+/// Headings of `slots` slots of policy `name`, asked directly.
+fn offline(name: &str, slots: u64, seed: u64) -> Vec<Vec<u8>> {
+    let policy = by_name(name, World::default()).unwrap();
+    let mut memory = vec![0.0; policy.memory_len(3, 5)];
+    policy.start(3, 5, seed, &mut memory);
+    let fly = |step| {
+        let slot = Observation::try_from(scene(3, 5, step)).unwrap().into_slot(&*policy).unwrap();
+        let mut headings = vec![0; 3];
+        policy.act(&mut [Turn { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
+        headings
+    };
+    (0..slots).map(fly).collect()
+}
+
+#[tokio::test]
+async fn a_session_equals_memory_kept_by_the_caller_equals_the_policy_itself() {
+    let server = Server::start().await;
+    let mut client = server.grpc().await;
+    for baseline in &LIST {
+        let name = baseline.name;
+        client.open_session(open(name, name)).await.unwrap();
+        let mut state = Bytes::new();
+        for (step, expected) in offline(name, 30, 0).into_iter().enumerate() {
+            let step = step as u64;
+            let in_order = |answer: &v1::ActResponse| answer.actions.iter().map(|a| a.heading_index as u8).collect::<Vec<_>>();
+            let kept = client.act(in_session(name, None, scene(3, 5, step))).await.unwrap().into_inner();
+            assert_eq!((kept.step, in_order(&kept)), (step, expected.clone()), "{name}, session");
+            let request = v1::ActRequest { step: Some(step), ..held(name, state, scene(3, 5, step)) };
+            let kept = client.act(request).await.unwrap().into_inner();
+            assert_eq!((kept.step, in_order(&kept)), (step, expected), "{name}, held");
+            state = kept.recurrent_state;
+        }
+    }
+}
+
+#[tokio::test]
+async fn memory_kept_by_the_caller_is_judged() {
+    let server = Server::start().await;
+    let mut client = server.grpc().await;
+    let first = client.act(held("sweep", Bytes::new(), scene(3, 5, 0))).await.unwrap().into_inner();
+    let state = first.recurrent_state.clone();
+    let again = client.act(held("sweep", Bytes::new(), scene(3, 5, 0))).await.unwrap().into_inner();
+    assert_eq!(again.recurrent_state, state, "the same request, the same answer");
+
+    let late = v1::ActRequest { step: Some(1), ..held("sweep", Bytes::new(), scene(3, 5, 1)) };
+    assert_eq!(refused(client.act(late).await).1, "wrong_step");
+    let early = v1::ActRequest { step: Some(0), ..held("sweep", state.clone(), scene(3, 5, 1)) };
+    assert_eq!(refused(client.act(early).await).1, "wrong_step");
+
+    let mut other_id = scene(3, 5, 1);
+    other_id.uavs[1].id = "another".into();
+    let mut damaged = state.to_vec();
+    damaged[50] ^= 4;
+    let wrong = [
+        held("nearest", state.clone(), scene(3, 5, 1)),
+        held("sweep", state.clone(), scene(2, 5, 1)),
+        held("sweep", state.clone(), other_id),
+        held("sweep", state.slice(..state.len() - 4), scene(3, 5, 1)),
+        held("sweep", damaged.into(), scene(3, 5, 1)),
+        held("sweep", Bytes::from_static(b"hello"), scene(3, 5, 1)),
+    ];
+    for request in wrong {
+        let (code, _, message) = refused(client.act(request).await);
+        assert_eq!(code, Code::InvalidArgument);
+        assert!(message.starts_with("recurrent_state: "), "{message}");
+    }
+    assert!(refused(client.act(held("", state, scene(3, 5, 1))).await).2.starts_with("policy: "));
+}
+
+#[tokio::test]
+async fn an_episode_stays_with_its_version() {
+    let server = Server::start().await;
+    server.add("p", 1, Arc::new(Deed::Count));
+    server.app.registry.set_alias("p", "prod", 1);
+    let mut client = server.grpc().await;
+    client.open_session(open("p@prod", "s")).await.unwrap();
+    let first = client.act(held("p", Bytes::new(), scene(3, 5, 0))).await.unwrap().into_inner();
+    server.add("p", 2, Arc::new(Deed::Count));
+    server.app.registry.set_alias("p", "prod", 2);
+    let version = |answer: v1::ActResponse| answer.policy.unwrap().version;
+    let pinned = v1::ActRequest { policy: "p@prod".into(), ..in_session("s", None, scene(3, 5, 0)) };
+    assert_eq!(version(client.act(pinned).await.unwrap().into_inner()), 1);
+    let held_on = client.act(held("p", first.recurrent_state.clone(), scene(3, 5, 1))).await.unwrap().into_inner();
+    assert_eq!(version(held_on), 1);
+    assert_eq!(version(client.act(held("p", Bytes::new(), scene(3, 5, 0))).await.unwrap().into_inner()), 2);
+    assert_eq!(refused(client.act(held("p:2", first.recurrent_state, scene(3, 5, 1))).await).0, Code::InvalidArgument);
+    for other in ["p:2", "sweep"] {
+        let request = v1::ActRequest { policy: other.into(), ..in_session("s", None, scene(3, 5, 0)) };
+        let (code, _, message) = refused(client.act(request).await);
+        assert_eq!(code, Code::InvalidArgument);
+        assert!(message.contains("p:1"), "{message}");
+    }
+}
+
+#[tokio::test]
+async fn ids_come_in_any_order_and_are_matched() {
+    let server = Server::start().await;
+    let mut client = server.grpc().await;
+    for id in ["straight", "shuffled"] {
+        client.open_session(open("sweep", id)).await.unwrap();
+    }
+    // Eleven UAVs: bytewise, uav-10 would come before uav-2.
+    for step in 0..12 {
+        let straight = scene(11, 6, step);
+        let mut shuffled = straight.clone();
+        shuffled.uavs.rotate_left(1 + step as usize % 10);
+        shuffled.users.reverse();
+        let order: Vec<String> = shuffled.uavs.iter().map(|u| u.id.clone()).collect();
+        let a = client.act(in_session("straight", Some(step), straight)).await.unwrap().into_inner();
+        let b = client.act(in_session("shuffled", Some(step), shuffled)).await.unwrap().into_inner();
+        assert_eq!(headings(&a), headings(&b), "step {step}");
+        assert_eq!(b.actions.iter().map(|a| a.uav_id.clone()).collect::<Vec<_>>(), order, "in the order of the request");
+    }
+    let mut changed = scene(11, 6, 12);
+    changed.users[3].id = "stranger".into();
+    let (code, _, message) = refused(client.act(in_session("straight", Some(12), changed)).await);
+    assert_eq!(code, Code::InvalidArgument);
+    assert!(message.contains("\"stranger\" is new") && message.contains("\"user-3\" is missing"), "{message}");
+    client.act(in_session("straight", Some(12), scene(11, 6, 12))).await.unwrap();
+}
+
+#[tokio::test]
+async fn a_new_run_resets_and_fences_the_former() {
+    let server = Server::start().await;
+    let mut client = server.grpc().await;
+    client.open_session(open("sweep", "s")).await.unwrap();
+    let run = |run: &str, step| v1::ActRequest { run_id: Some(run.into()), ..in_session("s", Some(step), scene(3, 5, step)) };
+    let first = client.act(run("a", 0)).await.unwrap().into_inner();
+    client.act(run("a", 1)).await.unwrap();
+    assert_eq!(refused(client.act(run("b", 2)).await).1, "wrong_step");
+    let restarted = client.act(run("b", 0)).await.unwrap().into_inner();
+    assert_eq!(headings(&restarted), headings(&first));
+    let (code, reason, message) = refused(client.act(run("a", 2)).await);
+    assert_eq!((code, reason.as_str()), (Code::FailedPrecondition, "run_fenced"));
+    assert!(message.contains("\"a\"") && message.contains("\"b\""), "{message}");
+    client.act(run("b", 1)).await.unwrap();
+}
+
+#[tokio::test]
+async fn idle_sessions_expire_and_say_so() {
+    let server = Server::start().await;
+    let mut client = server.grpc().await;
+    client.open_session(open("sweep", "s")).await.unwrap();
+    server.pass(599);
+    client.act(in_session("s", Some(0), scene(3, 5, 0))).await.unwrap();
+    server.pass(601);
+    let (code, reason, message) = refused(client.act(in_session("s", Some(1), scene(3, 5, 1))).await);
+    assert_eq!((code, reason.as_str()), (Code::FailedPrecondition, "session_expired"));
+    assert!(message.contains("600 s"), "{message}");
+    let closing = client.close_session(v1::CloseSessionRequest { session_id: "s".into() }).await;
+    assert_eq!(refused(closing).1, "session_expired");
+    assert_eq!(refused(client.act(in_session("never", None, scene(3, 5, 1))).await).0, Code::NotFound);
+}
+
+#[tokio::test]
+async fn q_values_on_request_and_hovering_without_degrees() {
+    let server = Server::start().await;
+    server.add("p", 1, Arc::new(Deed::Count));
+    let mut client = server.grpc().await;
+    client.open_session(v1::OpenSessionRequest { seed: Some(8), ..open("p", "s") }).await.unwrap();
+    let request = v1::ActRequest { return_q_values: true, ..in_session("s", Some(0), scene(2, 1, 0)) };
+    let answer = client.act(request).await.unwrap().into_inner();
+    assert_eq!((answer.actions[1].heading_index, answer.actions[1].heading_deg), (8, None));
+    assert_eq!(answer.actions[1].q_values, (9..18).map(|q| q as f32).collect::<Vec<_>>());
+    let answer = client.act(in_session("s", Some(1), scene(2, 1, 0))).await.unwrap().into_inner();
+    assert_eq!((answer.actions[0].heading_index, answer.actions[0].heading_deg), (0, Some(0.0)));
+    assert!(answer.actions[0].q_values.is_empty());
+    assert!(refused(client.act(in_session("s", Some(2), scene(4, 1, 0))).await).2.starts_with("uavs: 4"));
+    let seeded = v1::ActRequest { seed: Some(1), ..in_session("s", Some(2), scene(2, 1, 0)) };
+    assert!(refused(client.act(seeded).await).2.starts_with("seed: "));
+}
+
+#[tokio::test]
+async fn policies_are_listed_in_pages() {
+    let server = Server::start().await;
+    let mut client = server.grpc().await;
+    server.add("sweep", 2, Arc::new(Deed::Count));
+    server.app.registry.set_alias("sweep", "old", 1);
+    let mut names = Vec::new();
+    let mut token = String::new();
+    loop {
+        let request = v1::ListPoliciesRequest { page_size: 2, page_token: token };
+        let page = client.list_policies(request).await.unwrap().into_inner();
+        assert!(page.policies.len() <= 2);
+        names.extend(page.policies.into_iter().map(|p| p.r#ref.unwrap().name));
+        token = page.next_page_token;
+        if token.is_empty() {
+            break;
+        }
+    }
+    assert_eq!(names, ["greedy-global", "nearest", "persistent", "random", "sweep"]);
+    let mut get = async |policy: &str| client.get_policy(v1::GetPolicyRequest { policy: policy.into() }).await;
+    let newest = get("sweep").await.unwrap().into_inner();
+    assert_eq!((newest.r#ref.unwrap().version, newest.versions, newest.aliases.len()), (2, vec![1, 2], 0));
+    let old = get("sweep@old").await.unwrap().into_inner();
+    assert_eq!((old.r#ref.as_ref().unwrap().version, old.headings, old.detection_range), (1, 8, 0.28));
+    assert_eq!((old.kind(), old.needs(), old.aliases.as_slice()), (v1::PolicyKind::Baseline, v1::Needs::OwnPositions, &["old".to_owned()][..]));
+    assert_eq!(get("greedy-global").await.unwrap().into_inner().needs(), v1::Needs::FullScene);
+    for unknown in ["sweep:3", "sweep@new", "swoop"] {
+        assert_eq!(refused(get(unknown).await).0, Code::NotFound, "{unknown}");
+    }
+    for malformed in ["", "sweep:", "sweep:zero", "a b"] {
+        assert_eq!(refused(get(malformed).await).0, Code::InvalidArgument, "{malformed}");
+    }
+}

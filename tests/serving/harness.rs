@@ -1,0 +1,251 @@
+//! A server in this process, a clock to move, policies that wait or panic, and slots to send.
+
+use std::collections::HashMap;
+use std::future::Future;
+use std::sync::{Arc, Condvar, Mutex};
+use std::time::Duration;
+
+use jiff::Timestamp;
+use qedgix::config::Config;
+use qedgix::env::Point;
+use qedgix::invalid::Invalid;
+use qedgix::policy::{Needs, Policy, Turn};
+use qedgix::server::{self, DataDir, Endpoints, Listeners};
+use qedgix::service::App;
+use qedgix::serving::{Clock, Kind, LoadedPolicy, PolicyRef};
+use qedgix::wire::v1;
+use qedgix::wire::v1::policy_service_client::PolicyServiceClient;
+use rand::RngExt;
+use tokio::sync::oneshot;
+use tokio::task::JoinHandle;
+use tonic::transport::Channel;
+use tonic::{Code, Status};
+
+pub struct Server {
+    pub app: Arc<App>,
+    pub endpoints: Endpoints,
+    pub dir: tempfile::TempDir,
+    time: Arc<Mutex<Timestamp>>,
+    stop: Option<oneshot::Sender<()>>,
+    running: JoinHandle<Result<(), server::Error>>,
+}
+
+impl Server {
+    pub async fn start() -> Self {
+        Self::with(|_| {}).await
+    }
+
+    pub async fn with(change: impl FnOnce(&mut Config)) -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let mut config = Config::new(dir.path());
+        config.grpc_addr.set_port(0);
+        config.http_addr.set_port(0);
+        change(&mut config);
+        let time = Arc::new(Mutex::new(Timestamp::UNIX_EPOCH));
+        let told = time.clone();
+        let clock = Clock::new(move || *told.lock().unwrap());
+        let data = DataDir::take(dir.path()).unwrap();
+        let listeners = Listeners::bind(&config).await.unwrap();
+        let endpoints = listeners.endpoints().unwrap();
+        let app = server::open(&config, &data, clock).await.unwrap();
+        let (stop, stopped) = oneshot::channel();
+        let shared = app.clone();
+        let running = tokio::spawn(async move {
+            let shutdown = async {
+                let _ = stopped.await;
+            };
+            server::run(&config, &data, shared, listeners, shutdown).await
+        });
+        Self { app, endpoints, dir, time, stop: Some(stop), running }
+    }
+
+    pub fn pass(&self, seconds: u64) {
+        let mut time = self.time.lock().unwrap();
+        *time = time.checked_add(Duration::from_secs(seconds)).unwrap();
+    }
+
+    pub async fn channel(&self) -> Channel {
+        Channel::from_shared(format!("http://{}", self.endpoints.grpc)).unwrap().connect().await.unwrap()
+    }
+
+    pub async fn grpc(&self) -> PolicyServiceClient<Channel> {
+        PolicyServiceClient::new(self.channel().await)
+    }
+
+    pub fn url(&self, path: &str) -> String {
+        format!("http://{}{path}", self.endpoints.http)
+    }
+
+    pub fn begin_stop(&mut self) {
+        self.stop.take().unwrap().send(()).unwrap();
+    }
+
+    pub async fn stopped(self) {
+        self.running.await.unwrap().unwrap();
+    }
+
+    /// Adds a policy called `name`, to be flown by any fleet.
+    pub fn add(&self, name: &str, version: u64, policy: Arc<dyn Policy>) {
+        self.app.registry.insert(LoadedPolicy {
+            reference: PolicyRef { name: name.into(), version, digest: [version as u8; 32] },
+            policy,
+            kind: Kind::Baseline,
+            description: "of a test".into(),
+            uavs: None,
+            users: None,
+            config: serde_json::Value::Null,
+            metrics: serde_json::Value::Null,
+            created_at: Timestamp::UNIX_EPOCH,
+        });
+    }
+}
+
+/// What a policy of the tests does when it decides.
+pub enum Deed {
+    /// Counts its slots in its memory and flies heading (seed + slot) mod 9 with the Q-values 0, 1, ...
+    Count,
+    /// Panics.
+    Panic,
+    /// Says that it has begun, and waits until the gate is open.
+    Wait(Arc<Gate>),
+}
+
+#[derive(Default)]
+pub struct Gate {
+    state: Mutex<(usize, bool)>,
+    changed: Condvar,
+}
+
+impl Gate {
+    pub fn open(&self) {
+        self.state.lock().unwrap().1 = true;
+        self.changed.notify_all();
+    }
+
+    /// Waits until `fleets` have come to the gate.
+    pub async fn reached(self: &Arc<Self>, fleets: usize) {
+        let gate = self.clone();
+        let wait = move || drop(gate.changed.wait_while(gate.state.lock().unwrap(), |s| s.0 < fleets).unwrap());
+        tokio::task::spawn_blocking(wait).await.unwrap();
+    }
+
+    fn pass(&self) {
+        let mut state = self.state.lock().unwrap();
+        state.0 += 1;
+        self.changed.notify_all();
+        drop(self.changed.wait_while(state, |s| !s.1).unwrap());
+    }
+}
+
+impl Policy for Deed {
+    fn actions(&self) -> usize {
+        9
+    }
+    fn needs(&self) -> Needs {
+        Needs::OwnPositions
+    }
+    fn detection_range(&self) -> f64 {
+        0.28
+    }
+    fn check_fleet(&self, uavs: usize, _: usize) -> Result<(), Invalid> {
+        if uavs <= 3 { Ok(()) } else { Err(Invalid::new("uavs", uavs, "at most 3")) }
+    }
+    fn memory_len(&self, _: usize, _: usize) -> usize {
+        1
+    }
+    fn start(&self, _: usize, _: usize, seed: u64, memory: &mut [f32]) {
+        memory[0] = (seed % 9) as f32;
+    }
+    fn act(&self, turns: &mut [Turn<'_>]) {
+        match self {
+            Self::Count => {}
+            Self::Panic => panic!("a policy of the tests panics"),
+            Self::Wait(gate) => gate.pass(),
+        }
+        for turn in turns {
+            turn.headings.fill(turn.memory[0] as u8 % 9);
+            turn.memory[0] += 1.0;
+            if let Some(q) = &mut turn.q_values {
+                q.iter_mut().enumerate().for_each(|(i, q)| *q = i as f32);
+            }
+        }
+    }
+}
+
+/// A scene of `uavs` UAVs and `users` users, from a seed.
+pub fn scene(uavs: usize, users: usize, seed: u64) -> v1::Scene {
+    let mut rng = qedgix::rng::stream(seed, "test-scene", 0);
+    v1::Scene {
+        uavs: (0..uavs).map(|i| v1::SceneUav { id: format!("uav-{i}"), x: rng.random(), y: rng.random() }).collect(),
+        users: (0..users)
+            .map(|j| v1::SceneUser {
+                id: format!("user-{j}"),
+                x: rng.random(),
+                y: rng.random(),
+                aoi: f64::from(rng.random_range(0..80_u32)),
+            })
+            .collect(),
+    }
+}
+
+/// The graph of a scene: who is within `range` of whom. Users' detections are left out unless `of_users`.
+pub fn graph(scene: &v1::Scene, range: f64, of_users: bool) -> v1::Graph {
+    let uavs = scene.uavs.iter().map(|u| (u.id.clone(), [u.x, u.y], None));
+    let all: Vec<(String, Point, Option<f64>)> =
+        uavs.chain(scene.users.iter().map(|u| (u.id.clone(), [u.x, u.y], Some(u.aoi)))).collect();
+    let nodes = all.iter().map(|(id, at, aoi)| {
+        let sees = all.iter().filter(|(other, _, _)| other != id && (aoi.is_none() || of_users)).filter_map(|(target, p, aoi)| {
+            let (x, y) = (p[0] - at[0], p[1] - at[1]);
+            let seen = x * x + y * y <= range * range;
+            seen.then(|| v1::Detection { target_id: target.clone(), rel_x: x, rel_y: y, aoi: *aoi })
+        });
+        v1::Node {
+            id: id.clone(),
+            kind: if aoi.is_none() { v1::NodeKind::Uav.into() } else { v1::NodeKind::User.into() },
+            detections: sees.collect(),
+            position: aoi.is_none().then_some(v1::Position { x: at[0], y: at[1] }),
+            aoi: *aoi,
+        }
+    });
+    v1::Graph { nodes: nodes.collect() }
+}
+
+/// A request of a scene to a session.
+pub fn in_session(id: &str, step: Option<u64>, scene: v1::Scene) -> v1::ActRequest {
+    v1::ActRequest {
+        observation: Some(v1::act_request::Observation::Scene(scene)),
+        memory: Some(v1::act_request::Memory::SessionId(id.into())),
+        step,
+        ..Default::default()
+    }
+}
+
+/// A request of a scene with memory that the caller keeps.
+pub fn held(policy: &str, state: bytes::Bytes, scene: v1::Scene) -> v1::ActRequest {
+    v1::ActRequest {
+        policy: policy.into(),
+        observation: Some(v1::act_request::Observation::Scene(scene)),
+        memory: Some(v1::act_request::Memory::RecurrentState(state)),
+        ..Default::default()
+    }
+}
+
+pub fn open(policy: &str, id: &str) -> v1::OpenSessionRequest {
+    v1::OpenSessionRequest { policy: policy.into(), session_id: id.into(), run_id: None, seed: Some(0) }
+}
+
+pub fn headings(answer: &v1::ActResponse) -> HashMap<String, u32> {
+    answer.actions.iter().map(|a| (a.uav_id.clone(), a.heading_index)).collect()
+}
+
+/// The status and stable code of an error.
+pub fn refused<T>(answer: Result<tonic::Response<T>, Status>) -> (Code, String, String) {
+    let status = answer.map(|_| ()).expect_err("this has to be refused");
+    let code = status.metadata().get("qedgix-code").map_or("", |code| code.to_str().unwrap()).to_owned();
+    (status.code(), code, status.message().to_owned())
+}
+
+/// `future`, which must not hang: a bound that is far beyond what it takes.
+pub async fn soon<T>(future: impl Future<Output = T>) -> T {
+    tokio::time::timeout(Duration::from_secs(60), future).await.expect("this hangs")
+}

@@ -1,0 +1,272 @@
+//! Malformed and oversized messages, deadlines, full queues and panics over gRPC: the table of errors, and no harm done.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::{Buf, BufMut, Bytes};
+use qedgix::wire::v1;
+use tonic::codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder};
+use tonic::{Code, Request, Status};
+
+use super::harness::*;
+
+/// Sends and receives messages as they are.
+#[derive(Default)]
+struct Raw;
+
+impl Codec for Raw {
+    type Encode = Bytes;
+    type Decode = Bytes;
+    type Encoder = Self;
+    type Decoder = Self;
+    fn encoder(&mut self) -> Self {
+        Self
+    }
+    fn decoder(&mut self) -> Self {
+        Self
+    }
+}
+
+impl Encoder for Raw {
+    type Item = Bytes;
+    type Error = Status;
+    fn encode(&mut self, item: Bytes, dst: &mut EncodeBuf<'_>) -> Result<(), Status> {
+        dst.put(item);
+        Ok(())
+    }
+}
+
+impl Decoder for Raw {
+    type Item = Bytes;
+    type Error = Status;
+    fn decode(&mut self, src: &mut DecodeBuf<'_>) -> Result<Option<Bytes>, Status> {
+        Ok(Some(src.copy_to_bytes(src.remaining())))
+    }
+}
+
+async fn raw(server: &Server, path: &'static str, message: Bytes) -> (Code, String, String) {
+    let mut client = tonic::client::Grpc::new(server.channel().await);
+    client.ready().await.unwrap();
+    refused(client.unary(Request::new(message), path.parse().unwrap(), Raw).await)
+}
+
+#[tokio::test]
+async fn messages_that_do_not_decode_or_are_too_large() {
+    let server = Server::start().await;
+    let act = "/qedgix.v1.PolicyService/Act";
+    for garbage in [&b"\xff\xff\xff\xff"[..], b"\x12\x7f", b"\x0a\x02\xff\xfe"] {
+        let (code, reason, message) = raw(&server, act, Bytes::from_static(garbage)).await;
+        assert_eq!((code, reason.as_str()), (Code::InvalidArgument, "invalid_argument"), "{message}");
+    }
+    let (code, reason, message) = raw(&server, act, vec![0; 10_000_000].into()).await;
+    assert_eq!((code, reason.as_str()), (Code::ResourceExhausted, "too_large"), "{message}");
+    assert!(message.contains("4194304"), "{message}");
+    for unknown in ["/qedgix.v1.PolicyService/Nothing", "/no.such.Service/Act"] {
+        assert_eq!(raw(&server, unknown, Bytes::new()).await.0, Code::Unimplemented);
+    }
+}
+
+type Change = fn(&mut v1::ActRequest);
+
+fn nodes(request: &mut v1::ActRequest) -> &mut Vec<v1::Node> {
+    match &mut request.observation {
+        Some(v1::act_request::Observation::Graph(graph)) => &mut graph.nodes,
+        _ => unreachable!("these requests hold graphs"),
+    }
+}
+
+fn in_scene(request: &mut v1::ActRequest) -> &mut v1::Scene {
+    match &mut request.observation {
+        Some(v1::act_request::Observation::Scene(scene)) => scene,
+        _ => unreachable!("these requests hold scenes"),
+    }
+}
+
+#[tokio::test]
+async fn scenes_that_cannot_be_used_name_their_field() {
+    let server = Server::start().await;
+    let mut client = server.grpc().await;
+    let cases: &[(&str, Change)] = &[
+        ("observation: nothing", |r| r.observation = None),
+        ("scene: no UAV", |r| in_scene(r).uavs.clear()),
+        ("scene: 9000 nodes", |r| in_scene(r).users = scene(1, 8997, 0).users),
+        ("users: 0", |r| in_scene(r).users.clear()),
+        ("scene.uavs[1].x: NaN", |r| in_scene(r).uavs[1].x = f64::NAN),
+        ("scene.uavs[0].y: inf", |r| in_scene(r).uavs[0].y = f64::INFINITY),
+        ("scene.users[2].x: 1e300", |r| in_scene(r).users[2].x = 1e300),
+        ("scene.users[2].aoi: -1", |r| in_scene(r).users[2].aoi = -1.0),
+        ("scene.users[2].aoi: NaN", |r| in_scene(r).users[2].aoi = f64::NAN),
+        ("scene.users[2].aoi: 1e20", |r| in_scene(r).users[2].aoi = 1e20),
+        ("scene.uavs[2].id: \"\"", |r| in_scene(r).uavs[2].id.clear()),
+        ("scene.users[0].id: \"xxx", |r| in_scene(r).users[0].id = "x".repeat(129)),
+        ("scene.uavs[1].id: \"uav-0\"", |r| in_scene(r).uavs[1].id = "uav-0".into()),
+        ("scene.users[1].id: \"uav-0\"", |r| in_scene(r).users[1].id = "uav-0".into()),
+        ("policy: \"no such:policy\"", |r| r.policy = "no such:policy".into()),
+        ("run_id: \"\"", |r| r.run_id = Some(String::new())),
+        ("session_id: \"\"", |r| r.memory = Some(v1::act_request::Memory::SessionId(String::new()))),
+    ];
+    for (begins, change) in cases {
+        let mut request = held("sweep", Bytes::new(), scene(3, 5, 1));
+        change(&mut request);
+        let (code, reason, message) = refused(client.act(request).await);
+        assert_eq!((code, reason.as_str()), (Code::InvalidArgument, "invalid_argument"), "{message}");
+        assert!(message.starts_with(begins), "{begins}, but: {message}");
+    }
+    // As many nodes as are allowed, all in one place: refused for what they would cost, not for their number.
+    let mut request = held("sweep", Bytes::new(), scene(100, 3996, 1));
+    in_scene(&mut request).uavs.iter_mut().for_each(|u| (u.x, u.y) = (0.5, 0.5));
+    in_scene(&mut request).users.iter_mut().for_each(|u| (u.x, u.y) = (0.5, 0.5));
+    assert!(refused(client.act(request).await).2.starts_with("scene: a crowd"));
+}
+
+#[tokio::test]
+async fn graphs_that_cannot_be_used_name_their_field() {
+    let server = Server::start().await;
+    let mut client = server.grpc().await;
+    let at = |id: &str, x: f64| v1::SceneUav { id: id.into(), x, y: 0.5 };
+    let user = |id: &str, x: f64| v1::SceneUser { id: id.into(), x, y: 0.5, aoi: 4.0 };
+    // Nodes 0 and 1 are UAVs, 2 and 3 users; all see each other, in the order of the list.
+    let scene = v1::Scene { uavs: vec![at("a", 0.5), at("b", 0.55)], users: vec![user("u", 0.6), user("w", 0.65)] };
+    let request = || v1::ActRequest {
+        policy: "sweep".into(),
+        observation: Some(v1::act_request::Observation::Graph(graph(&scene, 0.28, true))),
+        ..Default::default()
+    };
+    client.act(request()).await.unwrap();
+    let cases: &[(&str, Change)] = &[
+        ("graph.nodes: no UAV", |r| nodes(r).clear()),
+        ("graph.nodes[1].kind: 0", |r| nodes(r)[1].kind = 0),
+        ("graph.nodes[1].kind: 17", |r| nodes(r)[1].kind = 17),
+        ("graph.nodes[3].id: \"u\"", |r| nodes(r)[3].id = "u".into()),
+        ("graph.nodes[2].id: \"\"", |r| nodes(r)[2].id.clear()),
+        ("graph.nodes[0].detections[1].target_id: \"x\"", |r| nodes(r)[0].detections[1].target_id = "x".into()),
+        ("graph.nodes[0].detections[1].target_id: \"a\"", |r| nodes(r)[0].detections[1].target_id = "a".into()),
+        ("graph.nodes[0].detections[2].target_id: a target a second", |r| nodes(r)[0].detections[2].target_id = "u".into()),
+        ("graph.nodes[2].detections[0].rel_x: NaN", |r| nodes(r)[2].detections[0].rel_x = f64::NAN),
+        ("graph.nodes[2].detections[0].rel_y: -inf", |r| nodes(r)[2].detections[0].rel_y = f64::NEG_INFINITY),
+        ("graph.nodes[0].detections[1].aoi: nothing", |r| nodes(r)[0].detections[1].aoi = None),
+        ("graph.nodes[0].detections[0].aoi: 4", |r| nodes(r)[0].detections[0].aoi = Some(4.0)),
+        ("graph.nodes[0].detections[1].aoi: -2", |r| nodes(r)[0].detections[1].aoi = Some(-2.0)),
+        ("graph.nodes[2].aoi: NaN", |r| nodes(r)[2].aoi = Some(f64::NAN)),
+        ("graph.nodes[0].aoi: 3", |r| nodes(r)[0].aoi = Some(3.0)),
+        ("graph.nodes[2].position: ", |r| nodes(r)[2].position = Some(v1::Position { x: 0.0, y: 0.0 })),
+        ("graph.nodes[1].position: nothing", |r| nodes(r)[1].position = None),
+        ("graph.nodes[1].position.x: NaN", |r| nodes(r)[1].position = Some(v1::Position { x: f64::NAN, y: 0.0 })),
+        ("graph: a graph", |r| r.policy = "greedy-global".into()),
+    ];
+    for (begins, change) in cases {
+        let mut request = request();
+        change(&mut request);
+        let (code, _, message) = refused(client.act(request).await);
+        assert_eq!(code, Code::InvalidArgument, "{message}");
+        assert!(message.starts_with(begins), "{begins}, but: {message}");
+    }
+    let contradictions: &[(&str, Change)] = &[
+        ("said of the same user elsewhere", |r| nodes(r)[1].detections[1].aoi = Some(5.0)),
+        ("negation of what its target reports", |r| nodes(r)[1].detections[0].rel_x = 0.05),
+        ("within the policy's detection range of 0.28", |r| {
+            nodes(r)[0].detections.pop();
+            nodes(r)[3].detections[0].rel_x = -0.2801;
+        }),
+    ];
+    for (contains, change) in contradictions {
+        let mut request = request();
+        change(&mut request);
+        let (code, _, message) = refused(client.act(request).await);
+        assert_eq!(code, Code::InvalidArgument, "{message}");
+        assert!(message.contains(contains), "{contains}, but: {message}");
+    }
+}
+
+#[tokio::test]
+async fn a_deadline_is_kept_in_the_queue_and_changes_nothing() {
+    let server = Server::with(|config| config.engine_threads = 1).await;
+    let gate = Arc::new(Gate::default());
+    server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
+    let mut client = server.grpc().await;
+    client.open_session(open("slow", "s")).await.unwrap();
+    client.open_session(open("sweep", "t")).await.unwrap();
+    let short = |session: &str| {
+        let mut request = Request::new(in_session(session, Some(0), scene(2, 2, 0)));
+        request.set_timeout(Duration::from_millis(30));
+        request
+    };
+    let (code, reason, _) = refused(client.act(short("s")).await);
+    assert_eq!((code, reason.as_str()), (Code::DeadlineExceeded, "deadline_exceeded"), "while it computes");
+    assert_eq!(refused(client.act(short("t")).await).0, Code::DeadlineExceeded, "behind it");
+    gate.open();
+    for session in ["s", "t"] {
+        let answer = soon(client.act(in_session(session, Some(0), scene(2, 2, 0)))).await.unwrap().into_inner();
+        assert_eq!(answer.step, 0, "the slot was not flown before");
+    }
+}
+
+#[tokio::test]
+async fn a_retry_that_overtakes_its_first_attempt_gets_the_same_answer() {
+    let server = Server::start().await;
+    let gate = Arc::new(Gate::default());
+    server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
+    let mut client = server.grpc().await;
+    client.open_session(open("slow", "s")).await.unwrap();
+    let attempt = || {
+        let mut client = client.clone();
+        tokio::spawn(async move { client.act(in_session("s", Some(0), scene(2, 2, 0))).await.unwrap().into_inner() })
+    };
+    let first = attempt();
+    gate.reached(1).await;
+    let second = attempt();
+    gate.open();
+    let (first, second) = (soon(first).await.unwrap(), soon(second).await.unwrap());
+    assert_eq!(first, second);
+    let next = client.act(in_session("s", None, scene(2, 2, 0))).await.unwrap().into_inner();
+    assert_eq!(next.step, 1, "the memory advanced once");
+}
+
+#[tokio::test]
+async fn a_full_queue_is_said_and_empties() {
+    let server = Server::with(|config| (config.engine_threads, config.engine_queue) = (1, 1)).await;
+    let gate = Arc::new(Gate::default());
+    server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
+    let client = server.grpc().await;
+    let attempt = || {
+        let mut client = client.clone();
+        Box::pin(tokio::spawn(async move { client.act(held("slow", Bytes::new(), scene(2, 2, 0))).await }))
+    };
+    let first = attempt();
+    gate.reached(1).await;
+    let (answered, waiting) = match soon(futures::future::select(attempt(), attempt())).await {
+        futures::future::Either::Left(pair) => pair,
+        futures::future::Either::Right(pair) => pair,
+    };
+    let status = answered.unwrap().unwrap_err();
+    assert_eq!(status.code(), Code::ResourceExhausted);
+    assert_eq!(status.metadata().get("retry-after").unwrap(), "1");
+    gate.open();
+    assert!(soon(first).await.unwrap().is_ok());
+    assert!(soon(waiting).await.unwrap().is_ok());
+}
+
+#[tokio::test]
+async fn sessions_are_bounded() {
+    let server = Server::with(|config| config.max_sessions = 1).await;
+    let mut client = server.grpc().await;
+    client.open_session(open("sweep", "a")).await.unwrap();
+    assert_eq!(refused(client.open_session(open("sweep", "b")).await).0, Code::ResourceExhausted);
+    server.pass(601);
+    client.open_session(open("sweep", "b")).await.unwrap();
+    assert_eq!(refused(client.open_session(open("nearest", "b")).await).0, Code::AlreadyExists);
+    assert_eq!(refused(client.open_session(open("swoop", "c")).await).0, Code::NotFound);
+}
+
+#[tokio::test]
+async fn a_policy_that_panics_is_an_internal_error_and_no_more() {
+    let server = Server::with(|config| config.engine_threads = 1).await;
+    server.add("panics", 1, Arc::new(Deed::Panic));
+    let mut client = server.grpc().await;
+    client.open_session(open("panics", "s")).await.unwrap();
+    for _ in 0..3 {
+        let (code, reason, message) = refused(client.act(in_session("s", Some(0), scene(2, 2, 0))).await);
+        assert_eq!((code, reason.as_str(), message.as_str()), (Code::Internal, "internal", "internal error"));
+    }
+    client.act(held("sweep", Bytes::new(), scene(2, 2, 0))).await.unwrap();
+}

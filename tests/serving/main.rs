@@ -1,0 +1,9 @@
+//! Serving from the outside: policies, sessions and errors over real gRPC and REST, on free ports, with a clock that the
+//! tests move.
+
+mod act;
+mod conversion;
+mod harness;
+mod limits;
+mod rest;
+mod server;

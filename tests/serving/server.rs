@@ -1,0 +1,101 @@
+//! A server as a whole: health, reflection, drain, its data directory and its settings.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use qedgix::config::Config;
+use qedgix::server::{self, DataDir, ENDPOINTS};
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_client::HealthClient;
+use tonic_health::pb::{HealthCheckRequest, HealthCheckResponse};
+use tonic_reflection::pb::v1::server_reflection_request::MessageRequest;
+use tonic_reflection::pb::v1::server_reflection_response::MessageResponse;
+use tonic_reflection::pb::{v1, v1alpha};
+
+use super::harness::*;
+
+#[tokio::test]
+async fn draining_answers_what_is_in_flight_and_refuses_the_rest() {
+    let mut server = Server::start().await;
+    let gate = Arc::new(Gate::default());
+    server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
+    let mut client = server.grpc().await;
+    let mut health = HealthClient::new(server.channel().await);
+    let watch = HealthCheckRequest { service: "qedgix.v1.PolicyService".into() };
+    let mut states = health.watch(watch).await.unwrap().into_inner();
+    let state = |state: Option<HealthCheckResponse>| state.unwrap().status();
+    assert_eq!(state(states.message().await.unwrap()), ServingStatus::Serving);
+    let mut flying = client.clone();
+    let in_flight = tokio::spawn(async move { flying.act(held("slow", Bytes::new(), scene(2, 2, 0))).await });
+    gate.reached(1).await;
+    let endpoints = server.dir.path().join(ENDPOINTS);
+    assert!(std::fs::read_to_string(&endpoints).unwrap().contains(&server.endpoints.grpc.to_string()));
+    server.begin_stop();
+    assert_eq!(state(soon(states.message()).await.unwrap()), ServingStatus::NotServing);
+    drop(states);
+    let refusal = client.act(held("sweep", Bytes::new(), scene(2, 2, 0))).await.unwrap_err();
+    assert_eq!(refusal.code(), tonic::Code::Unavailable);
+    assert!(server.app.ready().await.is_err());
+    gate.open();
+    assert_eq!(soon(in_flight).await.unwrap().unwrap().into_inner().actions.len(), 2);
+    soon(server.stopped()).await;
+    assert!(!endpoints.exists());
+}
+
+#[tokio::test]
+async fn health_tells_of_every_service() {
+    let server = Server::start().await;
+    let mut health = HealthClient::new(server.channel().await);
+    for service in ["", "qedgix.v1.PolicyService"] {
+        let answer = health.check(HealthCheckRequest { service: service.into() }).await.unwrap().into_inner();
+        assert_eq!(answer.status(), ServingStatus::Serving, "{service}");
+    }
+    let unknown = health.check(HealthCheckRequest { service: "no.such.Service".into() }).await;
+    assert_eq!(unknown.unwrap_err().code(), tonic::Code::NotFound);
+}
+
+#[tokio::test]
+async fn reflection_in_both_versions() {
+    let server = Server::start().await;
+    let ask = || MessageRequest::ListServices(String::new());
+    let request = v1::ServerReflectionRequest { host: String::new(), message_request: Some(ask()) };
+    let mut client = v1::server_reflection_client::ServerReflectionClient::new(server.channel().await);
+    let stream = client.server_reflection_info(tokio_stream::once(request)).await.unwrap();
+    let answer = stream.into_inner().message().await.unwrap().unwrap().message_response.unwrap();
+    let MessageResponse::ListServicesResponse(list) = answer else { panic!("not a list: {answer:?}") };
+    assert!(list.service.iter().any(|s| s.name == "qedgix.v1.PolicyService"), "{list:?}");
+
+    let ask = v1alpha::server_reflection_request::MessageRequest::FileContainingSymbol("qedgix.v1.ActRequest".into());
+    let request = v1alpha::ServerReflectionRequest { host: String::new(), message_request: Some(ask) };
+    let mut client = v1alpha::server_reflection_client::ServerReflectionClient::new(server.channel().await);
+    let stream = client.server_reflection_info(tokio_stream::once(request)).await.unwrap();
+    let answer = stream.into_inner().message().await.unwrap().unwrap().message_response.unwrap();
+    assert!(matches!(answer, v1alpha::server_reflection_response::MessageResponse::FileDescriptorResponse(_)), "{answer:?}");
+}
+
+#[tokio::test]
+async fn a_data_directory_belongs_to_one_server() {
+    let server = Server::start().await;
+    let second = DataDir::take(server.dir.path()).unwrap_err();
+    assert!(matches!(&second, server::Error::InUse(path) if path == server.dir.path()), "{second}");
+    assert!(second.to_string().contains("--data-dir"), "{second}");
+    let file = server.dir.path().join("lock");
+    assert!(matches!(DataDir::take(&file), Err(server::Error::File { .. })), "a file is no directory");
+}
+
+#[test]
+fn settings_are_checked() {
+    let refused = |change: fn(&mut Config)| {
+        let mut config = Config::new("unused");
+        change(&mut config);
+        config.validate().unwrap_err().field
+    };
+    assert!(Config::new("unused").validate().is_ok());
+    assert_eq!(refused(|c| c.grpc_addr = "0.0.0.0:50051".parse().unwrap()), "--grpc-addr");
+    assert_eq!(refused(|c| c.http_addr = "192.0.2.1:80".parse().unwrap()), "--http-addr");
+    assert_eq!(refused(|c| c.cpu_budget = 0), "--cpu-budget");
+    assert_eq!(refused(|c| c.max_sessions = 0), "--max-sessions");
+    let mut open = Config::new("unused");
+    (open.insecure, open.http_addr) = (true, "0.0.0.0:80".parse().unwrap());
+    assert!(open.validate().is_ok());
+}
