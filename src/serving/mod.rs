@@ -13,7 +13,6 @@ mod reference;
 mod registry;
 mod sessions;
 
-pub use bundled::BUNDLED;
 pub use clock::Clock;
 pub use engine::{Engine, Outcome, Task, Timings};
 pub use error::Error;

@@ -239,7 +239,10 @@ async fn policies_are_listed_in_pages() {
     assert_eq!((newest.r#ref.unwrap().version, newest.versions, newest.aliases.len()), (2, vec![1, 2], 0));
     let old = get("sweep@old").await.unwrap().into_inner();
     assert_eq!((old.r#ref.as_ref().unwrap().version, old.headings, old.detection_range), (1, 8, 0.28));
-    assert_eq!((old.kind(), old.needs(), old.aliases.as_slice()), (v1::PolicyKind::Baseline, v1::Needs::OwnPositions, &["old".to_owned()][..]));
+    assert_eq!(
+        (old.kind(), old.needs(), old.aliases.as_slice()),
+        (v1::PolicyKind::Baseline, v1::Needs::OwnPositions, &["old".to_owned()][..])
+    );
     assert_eq!(get("greedy-global").await.unwrap().into_inner().needs(), v1::Needs::FullScene);
     for unknown in ["sweep:3", "sweep@new", "swoop"] {
         assert_eq!(refused(get(unknown).await).0, Code::NotFound, "{unknown}");

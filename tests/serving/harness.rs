@@ -36,7 +36,17 @@ impl Server {
     }
 
     pub async fn with(change: impl FnOnce(&mut Config)) -> Self {
-        let dir = tempfile::tempdir().unwrap();
+        Self::on(tempfile::tempdir().unwrap(), change).await
+    }
+
+    /// Waits until the server has stopped, and starts another on its data directory.
+    pub async fn restarted(self) -> Self {
+        self.running.await.unwrap().unwrap();
+        drop(self.app);
+        Self::on(self.dir, |_| {}).await
+    }
+
+    async fn on(dir: tempfile::TempDir, change: impl FnOnce(&mut Config)) -> Self {
         let mut config = Config::new(dir.path());
         config.grpc_addr.set_port(0);
         config.http_addr.set_port(0);
@@ -194,11 +204,12 @@ pub fn graph(scene: &v1::Scene, range: f64, of_users: bool) -> v1::Graph {
     let all: Vec<(String, Point, Option<f64>)> =
         uavs.chain(scene.users.iter().map(|u| (u.id.clone(), [u.x, u.y], Some(u.aoi)))).collect();
     let nodes = all.iter().map(|(id, at, aoi)| {
-        let sees = all.iter().filter(|(other, _, _)| other != id && (aoi.is_none() || of_users)).filter_map(|(target, p, aoi)| {
-            let (x, y) = (p[0] - at[0], p[1] - at[1]);
-            let seen = x * x + y * y <= range * range;
-            seen.then(|| v1::Detection { target_id: target.clone(), rel_x: x, rel_y: y, aoi: *aoi })
-        });
+        let sees =
+            all.iter().filter(|(other, _, _)| other != id && (aoi.is_none() || of_users)).filter_map(|(target, p, aoi)| {
+                let (x, y) = (p[0] - at[0], p[1] - at[1]);
+                let seen = x * x + y * y <= range * range;
+                seen.then(|| v1::Detection { target_id: target.clone(), rel_x: x, rel_y: y, aoi: *aoi })
+            });
         v1::Node {
             id: id.clone(),
             kind: if aoi.is_none() { v1::NodeKind::Uav.into() } else { v1::NodeKind::User.into() },

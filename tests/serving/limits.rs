@@ -1,7 +1,6 @@
 //! Malformed and oversized messages, deadlines, full queues and panics over gRPC: the table of errors, and no harm done.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use bytes::{Buf, BufMut, Bytes};
 use qedgix::wire::v1;
@@ -93,10 +92,10 @@ async fn scenes_that_cannot_be_used_name_their_field() {
         ("users: 0", |r| in_scene(r).users.clear()),
         ("scene.uavs[1].x: NaN", |r| in_scene(r).uavs[1].x = f64::NAN),
         ("scene.uavs[0].y: inf", |r| in_scene(r).uavs[0].y = f64::INFINITY),
-        ("scene.users[2].x: 1e300", |r| in_scene(r).users[2].x = 1e300),
+        ("scene.users[2].x: 1000000", |r| in_scene(r).users[2].x = 1e300),
         ("scene.users[2].aoi: -1", |r| in_scene(r).users[2].aoi = -1.0),
         ("scene.users[2].aoi: NaN", |r| in_scene(r).users[2].aoi = f64::NAN),
-        ("scene.users[2].aoi: 1e20", |r| in_scene(r).users[2].aoi = 1e20),
+        ("scene.users[2].aoi: 1000000000", |r| in_scene(r).users[2].aoi = 1e20),
         ("scene.uavs[2].id: \"\"", |r| in_scene(r).uavs[2].id.clear()),
         ("scene.users[0].id: \"xxx", |r| in_scene(r).users[0].id = "x".repeat(129)),
         ("scene.uavs[1].id: \"uav-0\"", |r| in_scene(r).uavs[1].id = "uav-0".into()),
@@ -178,6 +177,27 @@ async fn graphs_that_cannot_be_used_name_their_field() {
     }
 }
 
+/// Sends an Act with a `grpc-timeout` and no timer of its own; returns `grpc-status` and `qedgix-code`.
+async fn act_within(server: &Server, timeout: &'static str, request: v1::ActRequest) -> (String, String) {
+    use prost::Message;
+    let socket = tokio::net::TcpStream::connect(server.endpoints.grpc).await.unwrap();
+    let (client, connection) = h2::client::handshake(socket).await.unwrap();
+    tokio::spawn(connection);
+    let head = axum::http::Request::post(format!("http://{}/qedgix.v1.PolicyService/Act", server.endpoints.grpc))
+        .header("content-type", "application/grpc")
+        .header("te", "trailers")
+        .header("grpc-timeout", timeout);
+    let (answer, mut body) = client.ready().await.unwrap().send_request(head.body(()).unwrap(), false).unwrap();
+    let mut framed = bytes::BytesMut::new();
+    framed.put_u8(0);
+    framed.put_u32(request.encoded_len() as u32);
+    request.encode(&mut framed).unwrap();
+    body.send_data(framed.freeze(), true).unwrap();
+    let answer = soon(answer).await.unwrap();
+    let header = |name: &str| answer.headers().get(name).map_or("", |value| value.to_str().unwrap()).to_owned();
+    (header("grpc-status"), header("qedgix-code"))
+}
+
 #[tokio::test]
 async fn a_deadline_is_kept_in_the_queue_and_changes_nothing() {
     let server = Server::with(|config| config.engine_threads = 1).await;
@@ -186,19 +206,18 @@ async fn a_deadline_is_kept_in_the_queue_and_changes_nothing() {
     let mut client = server.grpc().await;
     client.open_session(open("slow", "s")).await.unwrap();
     client.open_session(open("sweep", "t")).await.unwrap();
-    let short = |session: &str| {
-        let mut request = Request::new(in_session(session, Some(0), scene(2, 2, 0)));
-        request.set_timeout(Duration::from_millis(30));
-        request
-    };
-    let (code, reason, _) = refused(client.act(short("s")).await);
-    assert_eq!((code, reason.as_str()), (Code::DeadlineExceeded, "deadline_exceeded"), "while it computes");
-    assert_eq!(refused(client.act(short("t")).await).0, Code::DeadlineExceeded, "behind it");
+    for (session, while_it) in [("s", "computes"), ("t", "waits for the engine"), ("t", "has time for nothing")] {
+        let timeout = if while_it == "has time for nothing" { "1n" } else { "30m" };
+        let (status, code) = act_within(&server, timeout, in_session(session, Some(0), scene(2, 2, 0))).await;
+        assert_eq!((status.as_str(), code.as_str()), ("4", "deadline_exceeded"), "while it {while_it}");
+    }
     gate.open();
     for session in ["s", "t"] {
         let answer = soon(client.act(in_session(session, Some(0), scene(2, 2, 0)))).await.unwrap().into_inner();
         assert_eq!(answer.step, 0, "the slot was not flown before");
     }
+    let (status, _) = act_within(&server, "99999999H", in_session("t", Some(1), scene(2, 2, 0))).await;
+    assert_eq!(status, "", "the status of an answer comes after it");
 }
 
 #[tokio::test]

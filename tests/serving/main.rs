@@ -5,5 +5,6 @@ mod act;
 mod conversion;
 mod harness;
 mod limits;
+mod published;
 mod rest;
 mod server;

@@ -74,7 +74,8 @@ async fn both_transports_agree() {
         assert!(answer["timings"]["compute"].as_str().unwrap().ends_with('s'));
     }
     assert_eq!(rest.get("/v1/sessions/r").await.1["steps"], 5);
-    let names: Vec<Value> = rest.get("/v1/sessions").await.1["sessions"].as_array().unwrap().iter().map(|s| s["session_id"].clone()).collect();
+    let names: Vec<Value> =
+        rest.get("/v1/sessions").await.1["sessions"].as_array().unwrap().iter().map(|s| s["session_id"].clone()).collect();
     assert_eq!(names, [json!("g"), json!("r")]);
     let page = rest.get("/v1/sessions?page_size=1").await.1;
     assert_eq!((page["sessions"].as_array().unwrap().len(), &page["next_page_token"]), (1, &json!("g")));
@@ -227,7 +228,11 @@ async fn probes_metrics_and_policies() {
     rest.post("/v1/act", &json!({})).await;
     let text = rest.get("/metrics").await.1;
     let text = text.as_str().unwrap();
-    for line in ["qedgix_requests_total{transport=\"http\",method=\"POST /v1/act\",code=\"400\"}", "qedgix_request_seconds_bucket", "qedgix_policy_versions"] {
+    for line in [
+        "qedgix_requests_total{transport=\"http\",method=\"POST /v1/act\",code=\"400\"}",
+        "qedgix_request_seconds_bucket",
+        "qedgix_policy_versions",
+    ] {
         assert!(text.contains(line), "{line} in {text}");
     }
     server.app.draining.begin();

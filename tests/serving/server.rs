@@ -19,13 +19,12 @@ async fn draining_answers_what_is_in_flight_and_refuses_the_rest() {
     let mut server = Server::start().await;
     let gate = Arc::new(Gate::default());
     server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
-    let mut client = server.grpc().await;
+    let mut flying = server.grpc().await;
     let mut health = HealthClient::new(server.channel().await);
     let watch = HealthCheckRequest { service: "qedgix.v1.PolicyService".into() };
     let mut states = health.watch(watch).await.unwrap().into_inner();
     let state = |state: Option<HealthCheckResponse>| state.unwrap().status();
     assert_eq!(state(states.message().await.unwrap()), ServingStatus::Serving);
-    let mut flying = client.clone();
     let in_flight = tokio::spawn(async move { flying.act(held("slow", Bytes::new(), scene(2, 2, 0))).await });
     gate.reached(1).await;
     let endpoints = server.dir.path().join(ENDPOINTS);
@@ -33,13 +32,26 @@ async fn draining_answers_what_is_in_flight_and_refuses_the_rest() {
     server.begin_stop();
     assert_eq!(state(soon(states.message()).await.unwrap()), ServingStatus::NotServing);
     drop(states);
-    let refusal = client.act(held("sweep", Bytes::new(), scene(2, 2, 0))).await.unwrap_err();
-    assert_eq!(refusal.code(), tonic::Code::Unavailable);
     assert!(server.app.ready().await.is_err());
     gate.open();
     assert_eq!(soon(in_flight).await.unwrap().unwrap().into_inner().actions.len(), 2);
     soon(server.stopped()).await;
     assert!(!endpoints.exists());
+}
+
+#[tokio::test]
+async fn new_work_is_refused_while_draining() {
+    let server = Server::start().await;
+    let mut client = server.grpc().await;
+    client.open_session(open("sweep", "s")).await.unwrap();
+    server.app.draining.begin();
+    for refusal in [
+        refused(client.act(in_session("s", None, scene(2, 2, 0))).await),
+        refused(client.act(held("sweep", Bytes::new(), scene(2, 2, 0))).await),
+        refused(client.open_session(open("sweep", "t")).await),
+    ] {
+        assert_eq!((refusal.0, refusal.1.as_str()), (tonic::Code::Unavailable, "draining"));
+    }
 }
 
 #[tokio::test]
