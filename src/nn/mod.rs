@@ -6,29 +6,33 @@
 
 mod adam;
 mod batch;
-mod edgeconv;
+mod edge;
 mod embedding;
 mod graph;
 mod gru;
 mod kernels;
+mod layer;
 mod linear;
 pub mod matmul;
 mod mlp;
 mod norm;
 mod params;
 mod real;
+mod rgcn;
 
 pub use adam::{Adam, norm_squared};
 pub use batch::{Batch, Rows, RowsMut};
-pub use edgeconv::{EdgeConv, EdgeConvCache, EdgeScratch};
+pub use edge::{EdgeCache, EdgeNet, EdgeScratch, Pairing};
 pub use embedding::{Embedding, EmbeddingGrad};
 pub use graph::Graph;
 pub use gru::Gru;
 pub use kernels::{elu, leaky_relu, leaky_relu_back, relu, relu_back, simd};
+pub use layer::{GraphLayer, LayerCache, LayerScratch};
 pub use linear::Linear;
 pub use mlp::{Mlp, MlpCache};
 pub use params::{Init, Layout, Parameter, Weights};
 pub use real::Real;
+pub use rgcn::{Rgcn, RgcnCache};
 
 /// H, the width of hidden activations.
 pub const HIDDEN: usize = 64;

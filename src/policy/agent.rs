@@ -12,7 +12,7 @@ use super::geometry::GeometryConfig;
 use crate::invalid::Invalid;
 use crate::nn::matmul::Start;
 use crate::nn::{
-    Batch, EdgeConv, EdgeConvCache, EdgeScratch, Gru, HIDDEN, Layout, Linear, Mlp, MlpCache, Real, Rows, Weights, leaky_relu,
+    Batch, GraphLayer, Gru, HIDDEN, LayerCache, LayerScratch, Layout, Linear, Mlp, MlpCache, Real, Rows, Weights, leaky_relu,
     leaky_relu_back, relu, relu_back,
 };
 
@@ -48,7 +48,7 @@ pub struct Agent {
 #[derive(Clone, Debug)]
 enum Body {
     Plain { head: Linear },
-    Graph { w1: Linear, w2: Linear, layers: Vec<EdgeConv>, head: Mlp<HIDDEN> },
+    Graph { w1: Linear, w2: Linear, layers: Vec<GraphLayer>, head: Mlp<HIDDEN> },
 }
 
 /// Activations of one forward pass, and scratch of its backward pass.
@@ -64,7 +64,7 @@ pub struct AgentCache<T: Real> {
     gates: Batch<T>,
     /// Input of each graph layer; the last is the output of the last.
     y: Vec<Batch<T>>,
-    layers: Vec<EdgeConvCache<T>>,
+    layers: Vec<LayerCache<T>>,
     head: MlpCache<T>,
     scratch: Scratch<T>,
 }
@@ -76,7 +76,7 @@ struct Scratch<T: Real> {
     dy: Batch<T>,
     next: Batch<T>,
     observation: Batch<T>,
-    edges: EdgeScratch<T>,
+    layer: LayerScratch<T>,
 }
 
 impl<T: Real> AgentCache<T> {
@@ -104,14 +104,18 @@ impl Agent {
         let input = observation + dims.actions + identity_width(config.identity, m) + position;
         let fc = Linear::new(&mut layout, "agent.fc", input, HIDDEN);
         let rnn = Gru::new(&mut layout, "agent.rnn");
+        let mean = config.aggregation == Aggregation::Mean;
+        let layer: &dyn Fn(&mut Layout, &str) -> GraphLayer = match config.gnn {
+            Gnn::None | Gnn::EdgeConv => &|layout, name| GraphLayer::edge_conv(layout, name, mean),
+            Gnn::AggGnn => &|layout, name| GraphLayer::agg_gnn(layout, name),
+            Gnn::Rgcn => &|layout, name| GraphLayer::rgcn(layout, name),
+        };
         let body = if config.gnn == Gnn::None {
             Body::Plain { head: Linear::new(&mut layout, "agent.head", HIDDEN, dims.actions) }
         } else {
             let w1 = Linear::new(&mut layout, "agent.w1", HIDDEN, HIDDEN);
             let w2 = Linear::new(&mut layout, "agent.w2", observation, HIDDEN);
-            let mean = config.aggregation == Aggregation::Mean;
-            let layer = |l: usize| EdgeConv::new(&mut layout, &format!("agent.layers.{l}"), mean);
-            let layers = (0..config.layers).map(layer).collect();
+            let layers = (0..config.layers).map(|l| layer(&mut layout, &format!("agent.layers.{l}"))).collect();
             Body::Graph { w1, w2, layers, head: Mlp::new(&mut layout, "agent.head", 2 * HIDDEN, dims.actions) }
         };
         Self { config, dims, layout, sets, fc, rnn, body, observation }
@@ -217,7 +221,7 @@ impl Agent {
                 c.user_obs.reset(self.observation, rows - uavs);
                 self.observe(w, inputs, uavs, c.user_obs.as_mut_slice(), self.observation);
                 c.y.resize_with(layers.len() + 1, Batch::default);
-                c.layers.resize_with(layers.len(), EdgeConvCache::default);
+                c.layers.resize_with(layers.len(), LayerCache::default);
                 c.y[0].reset(HIDDEN, rows);
                 w1.forward(w, h, c.y[0].range_mut(0..uavs));
                 w2.forward(w, c.user_obs.rows(), c.y[0].range_mut(uavs..rows));
@@ -261,8 +265,8 @@ impl Agent {
                     if l + 1 < layers.len() {
                         relu_back(c.y[l + 1].as_slice(), s.dy.as_mut_slice());
                     }
-                    let forward = (graph, c.y[l].rows(), &c.layers[l]);
-                    layer.backward(w.flat, forward, &mut s.dy, &mut s.edges, (grads, &mut s.next));
+                    let forward = (graph, c.y[l].rows(), &mut c.layers[l]);
+                    layer.backward(w, forward, &mut s.dy, &mut s.layer, (grads, &mut s.next));
                     std::mem::swap(&mut s.dy, &mut s.next);
                 }
                 leaky_relu_back(c.y[0].as_slice(), s.dy.as_mut_slice());

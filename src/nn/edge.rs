@@ -1,9 +1,11 @@
-//! `EdgeConv` in its factored form (spec 3), exact up to rounding:
+//! A network on pairs of neighbours, f = Linear(2H, 96), LayerNorm, ReLU, Linear(96, H), aggregated over neighbours, in
+//! its factored form (spec 3), exact up to rounding:
 //!
-//!     x'_i = agg_j f(x_i || x_j - x_i),  f = Linear(2H, 96), LayerNorm, ReLU, Linear(96, H)
-//!     u_i = (Wa - Wb) x_i + b,  v_j = Wb x_j            per node: f's first Linear is linear in x_i and x_j
-//!     a_i = agg_j relu(LayerNorm(u_i + v_j))            per edge, never stored; backward recomputes it
-//!     x'_i = W' a_i + b'                                per node: f's last Linear commutes with the sum
+//!     EdgeConv    x'_i = agg_j f(x_i || x_j - x_i)      u_i = (Wa - Wb) x_i + b
+//!     messages    m_i  = agg_j f(x_i || x_j)            u_i = Wa x_i + b
+//!     v_j = Wb x_j                                per node: f's first Linear is linear in x_i and x_j
+//!     a_i = agg_j relu(LayerNorm(u_i + v_j))      per edge, never stored; backward recomputes it
+//!     x'_i = W' a_i + b'                          per node: f's last Linear commutes with the sum
 //!
 //! A node without neighbours gets 0. Nodes computed are a prefix of the nodes read (see [`Graph`]).
 
@@ -20,18 +22,28 @@ use super::real::Real;
 /// Width of f's hidden layer.
 const W: usize = 96;
 
-/// One layer.
+/// What f sees of a neighbour.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pairing {
+    /// x_j - x_i, as `EdgeConv`.
+    Difference,
+    /// x_j.
+    Plain,
+}
+
+/// The network and how it is aggregated.
 #[derive(Clone, Copy, Debug)]
-pub struct EdgeConv {
+pub struct EdgeNet {
     first: Linear,
     norm: Norm<W>,
     last: Linear,
+    pairing: Pairing,
     mean: bool,
 }
 
 /// What backward needs: u, v, a, and (mean, 1 / deviation) per edge.
 #[derive(Debug, Default)]
-pub struct EdgeConvCache<T: Real> {
+pub struct EdgeCache<T: Real> {
     u: Batch<T>,
     v: Batch<T>,
     a: Batch<T>,
@@ -46,24 +58,25 @@ pub struct EdgeScratch<T: Real> {
     dv: Batch<T>,
 }
 
-impl EdgeConv {
-    /// Adds `name.f.0`, `name.f.1`, `name.f.3`; aggregation is the mean or the sum over neighbours.
-    pub fn new(layout: &mut Layout, name: &str, mean: bool) -> Self {
+impl EdgeNet {
+    /// Adds `name.0`, `name.1`, `name.3`; aggregation is the mean or the sum over neighbours.
+    pub fn new(layout: &mut Layout, name: &str, pairing: Pairing, mean: bool) -> Self {
         Self {
-            first: Linear::new(layout, &format!("{name}.f.0"), 2 * H, W),
-            norm: Norm::new(layout, &format!("{name}.f.1")),
-            last: Linear::new(layout, &format!("{name}.f.3"), W, H),
+            first: Linear::new(layout, &format!("{name}.0"), 2 * H, W),
+            norm: Norm::new(layout, &format!("{name}.1")),
+            last: Linear::new(layout, &format!("{name}.3"), W, H),
+            pairing,
             mean,
         }
     }
 
-    /// Writes Wa - Wb and Wb, transposed, (H, W) each, and the last layer's transposed weight.
+    /// Writes what makes u and v of x, transposed, (H, W) each, and the last layer's transposed weight.
     pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
         self.last.prepare(flat, turned);
-        let (difference, neighbour) = self.first.weight_grad(turned).split_at_mut(H * W);
+        let (own, neighbour) = self.first.weight_grad(turned).split_at_mut(H * W);
         for (o, row) in self.first.weight(flat).as_chunks::<{ 2 * H }>().0.iter().enumerate() {
             for i in 0..H {
-                difference[i * W + o] = row[i] - row[H + i];
+                own[i * W + o] = if self.pairing == Pairing::Difference { row[i] - row[H + i] } else { row[i] };
                 neighbour[i * W + o] = row[H + i];
             }
         }
@@ -75,7 +88,7 @@ impl EdgeConv {
         w: Weights<'_, T>,
         graph: &Graph,
         x: Rows<'_, T>,
-        cache: &mut EdgeConvCache<T>,
+        cache: &mut EdgeCache<T>,
         y: RowsMut<'_, T>,
     ) {
         let nodes = y.len;
@@ -83,14 +96,14 @@ impl EdgeConv {
         cache.v.reset(W, x.len);
         cache.a.reset(W, nodes);
         cache.stats.resize(graph.offsets[nodes] as usize, [T::ZERO; 2]);
-        let (difference, neighbour) = self.first.weight_turned(w).split_at(H * W);
+        let (own, neighbour) = self.first.weight_turned(w).split_at(H * W);
         let lhs = Lhs::rows(x.data, x.stride);
         let out = Out { data: cache.u.as_mut_slice(), stride: W };
-        matmul((nodes, H, W), lhs, Rhs { data: difference, stride: W }, out, Start::Bias(self.first.bias(w)));
+        matmul((nodes, H, W), lhs, Rhs { data: own, stride: W }, out, Start::Bias(self.first.bias(w)));
         let out = Out { data: cache.v.as_mut_slice(), stride: W };
         matmul((x.len, H, W), lhs, Rhs { data: neighbour, stride: W }, out, Start::Zero);
         let affine = self.norm.affine(w.flat);
-        let EdgeConvCache { u, v, a, stats } = cache;
+        let EdgeCache { u, v, a, stats } = cache;
         let (u, v) = (u.as_slice().as_chunks().0, v.as_slice().as_chunks().0);
         simd(
             #[inline(always)]
@@ -115,7 +128,7 @@ impl EdgeConv {
     pub fn backward<T: Real>(
         &self,
         flat: &[T],
-        (graph, x, cache): (&Graph, Rows<'_, T>, &EdgeConvCache<T>),
+        (graph, x, cache): (&Graph, Rows<'_, T>, &EdgeCache<T>),
         dy: &mut Batch<T>,
         scratch: &mut EdgeScratch<T>,
         (grads, dx): (&mut [T], &mut Batch<T>),
@@ -149,10 +162,13 @@ impl EdgeConv {
         );
         self.norm.add_grads(&sums, grads);
 
-        // u takes Wa - Wb and v takes Wb: Wa sees du, Wb sees dv - du.
         self.first.backward_bias(du.rows(), grads);
         self.first.backward_part((0, H), x, du.rows(), grads);
-        dv.as_mut_slice().iter_mut().zip(du.as_slice()).for_each(|(v, &u)| *v -= u);
+        if self.pairing == Pairing::Difference {
+            // u takes Wa - Wb and v takes Wb, so Wb sees dv - du.
+            let (dv, du) = (dv.as_mut_slice().iter_mut(), du.as_slice());
+            dv.zip(du).for_each(|(v, &u)| *v -= u);
+        }
         self.first.backward_part((H, H), x, dv.rows(), grads);
         dx.reset(H, x.len);
         self.first.backward_input(flat, (H, H), dv.rows(), dx.rows_mut(), Start::Zero);

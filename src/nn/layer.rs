@@ -1,0 +1,114 @@
+//! The graph layers an agent can be built of (spec 3), behind one door.
+
+use super::HIDDEN as H;
+use super::batch::{Batch, Rows, RowsMut};
+use super::edge::{EdgeCache, EdgeNet, EdgeScratch, Pairing};
+use super::graph::Graph;
+use super::matmul::Start;
+use super::mlp::{Mlp, MlpCache};
+use super::params::{Layout, Weights};
+use super::real::Real;
+use super::rgcn::{Rgcn, RgcnCache};
+
+/// Width of the hidden layer of update networks.
+const W: usize = 96;
+
+/// A graph layer, H wide at both ends.
+#[derive(Clone, Copy, Debug)]
+pub enum GraphLayer {
+    /// Qedgix.
+    EdgeConv(EdgeNet),
+    /// The paper's Algorithm 3: x'_i = update(x_i || mean_j com(x_i || x_j)).
+    AggGnn {
+        /// Messages.
+        com: EdgeNet,
+        /// What is made of them.
+        update: Mlp<W>,
+    },
+    /// The paper's Algorithm 4.
+    Rgcn(Rgcn),
+}
+
+/// What backward needs; each kind of layer uses its part.
+#[derive(Debug, Default)]
+pub struct LayerCache<T: Real> {
+    edge: EdgeCache<T>,
+    message: Batch<T>,
+    update: MlpCache<T>,
+    rgcn: RgcnCache<T>,
+}
+
+/// Scratch of backward, shared by all layers.
+#[derive(Debug, Default)]
+pub struct LayerScratch<T: Real> {
+    edge: EdgeScratch<T>,
+    message: Batch<T>,
+}
+
+impl GraphLayer {
+    /// `name.f.*`.
+    pub fn edge_conv(layout: &mut Layout, name: &str, mean: bool) -> Self {
+        Self::EdgeConv(EdgeNet::new(layout, &format!("{name}.f"), Pairing::Difference, mean))
+    }
+
+    /// `name.com.*` and `name.update.*`.
+    pub fn agg_gnn(layout: &mut Layout, name: &str) -> Self {
+        let com = EdgeNet::new(layout, &format!("{name}.com"), Pairing::Plain, true);
+        Self::AggGnn { com, update: Mlp::new(layout, &format!("{name}.update"), 2 * H, H) }
+    }
+
+    /// `name.root.*` and `name.rel`.
+    pub fn rgcn(layout: &mut Layout, name: &str) -> Self {
+        Self::Rgcn(Rgcn::new(layout, name))
+    }
+
+    /// See [`Weights`].
+    pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
+        match self {
+            Self::EdgeConv(net) => net.prepare(flat, turned),
+            Self::AggGnn { com, update } => {
+                com.prepare(flat, turned);
+                update.prepare(flat, turned);
+            }
+            Self::Rgcn(net) => net.prepare(flat, turned),
+        }
+    }
+
+    /// x' of the first `y.len` nodes from x of all of them.
+    pub fn forward<T: Real>(&self, w: Weights<'_, T>, graph: &Graph, x: Rows<'_, T>, c: &mut LayerCache<T>, y: RowsMut<'_, T>) {
+        match self {
+            Self::EdgeConv(net) => net.forward(w, graph, x, &mut c.edge, y),
+            Self::AggGnn { com, update } => {
+                c.message.reset(H, y.len);
+                com.forward(w, graph, x, &mut c.edge, c.message.rows_mut());
+                let own = Rows { len: y.len, ..x };
+                update.forward(w, (own, c.message.rows(), H), &mut c.update, y);
+            }
+            Self::Rgcn(net) => net.forward(w, graph, x, &mut c.rgcn, y),
+        }
+    }
+
+    /// Adds all gradients and writes dx of all nodes read. Spoils `dy` and the cache.
+    pub fn backward<T: Real>(
+        &self,
+        w: Weights<'_, T>,
+        (graph, x, c): (&Graph, Rows<'_, T>, &mut LayerCache<T>),
+        dy: &mut Batch<T>,
+        s: &mut LayerScratch<T>,
+        (grads, dx): (&mut [T], &mut Batch<T>),
+    ) {
+        match self {
+            Self::EdgeConv(net) => net.backward(w.flat, (graph, x, &c.edge), dy, &mut s.edge, (grads, dx)),
+            Self::AggGnn { com, update } => {
+                let own = Rows { len: dy.len(), ..x };
+                update.backward(w.flat, (own, c.message.rows(), H), dy.rows(), &mut c.update, grads);
+                let d = update.d_first(&c.update);
+                s.message.reset(H, dy.len());
+                update.first.backward_input(w.flat, (H, H), d, s.message.rows_mut(), Start::Zero);
+                com.backward(w.flat, (graph, x, &c.edge), &mut s.message, &mut s.edge, (grads, dx));
+                update.first.backward_input(w.flat, (0, H), d, dx.range_mut(0..dy.len()), Start::Add);
+            }
+            Self::Rgcn(net) => net.backward(w, (graph, x, &mut c.rgcn), dy.rows(), (grads, dx)),
+        }
+    }
+}

@@ -1,0 +1,119 @@
+//! Relational graph convolution (the paper's Algorithm 4): x'_i = W_0 x_i + b + sum_r mean_{j in N_r(i)} x_j R_r.
+//!
+//! The relation is the kinds of both ends: first-first, mixed, second-second. So a node has two means, over its
+//! neighbours of the first kind and over those of the second, and products run once per node.
+
+use super::HIDDEN as H;
+use super::batch::{Batch, Rows, RowsMut};
+use super::graph::Graph;
+use super::linear::{Linear, transpose};
+use super::matmul::{Lhs, Out, Rhs, Start, matmul};
+use super::params::{Init, Layout, Weights};
+use super::real::Real;
+
+/// One layer.
+#[derive(Clone, Copy, Debug)]
+pub struct Rgcn {
+    root: Linear,
+    rel: usize,
+}
+
+/// Means over neighbours of the first and of the second kind; in backward their gradients.
+#[derive(Debug, Default)]
+pub struct RgcnCache<T: Real> {
+    means: Batch<T>,
+}
+
+impl Rgcn {
+    /// Adds `name.root` and `name.rel` (3, H, H), which multiplies from the right.
+    pub fn new(layout: &mut Layout, name: &str) -> Self {
+        let root = Linear::new(layout, &format!("{name}.root"), H, H);
+        Self { root, rel: layout.add(format!("{name}.rel"), &[3, H, H], Init::Normal(1.0 / (H as f64).sqrt())) }
+    }
+
+    /// Transposes, which only backward needs of the relations.
+    pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
+        self.root.prepare(flat, turned);
+        for at in (self.rel..).step_by(H * H).take(3) {
+            transpose(&flat[at..][..H * H], H, &mut turned[at..][..H * H]);
+        }
+    }
+
+    /// The two runs of nodes with the same kind, each with its relations to the first and to the second kind.
+    fn runs(graph: &Graph, nodes: usize) -> [(std::ops::Range<usize>, [usize; 2]); 2] {
+        let first = graph.first_kind().min(nodes);
+        [(0..first, [0, 1]), (first..nodes, [1, 2])]
+    }
+
+    /// x' of the first `y.len` nodes.
+    pub fn forward<T: Real>(
+        &self,
+        w: Weights<'_, T>,
+        graph: &Graph,
+        x: Rows<'_, T>,
+        cache: &mut RgcnCache<T>,
+        y: RowsMut<'_, T>,
+    ) {
+        let nodes = y.len;
+        cache.means.reset_zero(2 * H, nodes);
+        for (i, means) in cache.means.as_mut_slice().chunks_exact_mut(2 * H).enumerate() {
+            for (kind, j, share) in neighbours(graph, i) {
+                let x = &x.data[j * x.stride..][..H];
+                means[kind * H..][..H].iter_mut().zip(x).for_each(|(m, &x)| *m = x.mul_add(share, *m));
+            }
+        }
+        let stride = y.stride;
+        self.root.forward(w, Rows { len: nodes, ..x }, RowsMut { data: &mut *y.data, ..y });
+        for (run, relations) in Self::runs(graph, nodes) {
+            for (kind, r) in relations.into_iter().enumerate() {
+                let means = Lhs::rows(cache.means.range(run.clone()).from_column(kind * H).data, 2 * H);
+                let rel = Rhs { data: &w.flat[self.rel + r * H * H..][..H * H], stride: H };
+                matmul((run.len(), H, H), means, rel, Out { data: &mut y.data[run.start * stride..], stride }, Start::Add);
+            }
+        }
+    }
+
+    /// Adds all gradients and writes dx of all nodes read. Spoils the cache.
+    pub fn backward<T: Real>(
+        &self,
+        w: Weights<'_, T>,
+        (graph, x, cache): (&Graph, Rows<'_, T>, &mut RgcnCache<T>),
+        dy: Rows<'_, T>,
+        (grads, dx): (&mut [T], &mut Batch<T>),
+    ) {
+        dx.reset_zero(H, x.len);
+        self.root.backward(w.flat, Rows { len: dy.len, ..x }, dy, grads, Some(dx.range_mut(0..dy.len)));
+        for (run, relations) in Self::runs(graph, dy.len) {
+            for (kind, r) in relations.into_iter().enumerate() {
+                let at = self.rel + r * H * H;
+                let d = &dy.data[run.start * dy.stride..];
+                let means = cache.means.range_mut(run.clone());
+                let column = (kind * H).min(means.data.len());
+                let out = Out { data: &mut grads[at..][..H * H], stride: H };
+                let rhs = Rhs { data: d, stride: dy.stride };
+                matmul((H, run.len(), H), Lhs::transposed(&means.data[column..], 2 * H), rhs, out, Start::Add);
+                let out = Out { data: &mut means.data[column..], stride: 2 * H };
+                let turned = Rhs { data: &w.turned[at..][..H * H], stride: H };
+                matmul((run.len(), H, H), Lhs::rows(d, dy.stride), turned, out, Start::Zero);
+            }
+        }
+        for (i, means) in cache.means.as_slice().chunks_exact(2 * H).enumerate() {
+            for (kind, j, share) in neighbours(graph, i) {
+                let d = &means[kind * H..][..H];
+                dx.row_mut(j).iter_mut().zip(d).for_each(|(x, &d)| *x = d.mul_add(share, *x));
+            }
+        }
+    }
+}
+
+/// Neighbours of a node: kind, index, and weight in the mean over that kind.
+fn neighbours<T: Real>(graph: &Graph, i: usize) -> impl Iterator<Item = (usize, usize, T)> {
+    let all = graph.neighbours(i);
+    let kind = |&&j: &&u32| usize::from(j as usize >= graph.first_kind());
+    let second = all.iter().filter(|j| kind(j) == 1).count();
+    let shares = [all.len() - second, second].map(|n| T::of(1.0 / n.max(1) as f64));
+    all.iter().map(move |j| {
+        let kind = usize::from(*j as usize >= graph.first_kind());
+        (kind, *j as usize, shares[kind])
+    })
+}
