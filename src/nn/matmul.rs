@@ -60,8 +60,6 @@ pub enum Start<'a, T> {
     Add,
 }
 
-/// Rows of a tile of C.
-const ROWS: usize = 6;
 /// Terms summed before a tile is put back: a panel of B of this height stays in the first-level cache.
 const DEPTH: usize = 144;
 
@@ -97,8 +95,6 @@ impl<T: Real> WithSimd for Product<'_, T> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
-        // 6 x 4 accumulators fit into 32 registers, 6 x 2 into 16.
-        let wide = S::REGISTER_COUNT >= 32;
         let lanes = T::lanes::<S>();
         let mut k0 = 0;
         loop {
@@ -106,17 +102,13 @@ impl<T: Real> WithSimd for Product<'_, T> {
             let mut j = 0;
             while j < self.n {
                 let left = self.n - j;
-                if wide && left >= 4 * lanes {
-                    self.columns::<S, 4>(simd, k0, depth, j, 4 * lanes);
-                    j += 4 * lanes;
-                } else if left >= 2 * lanes {
-                    self.columns::<S, 2>(simd, k0, depth, j, 2 * lanes);
-                    j += 2 * lanes;
+                let width = left.min(2 * lanes);
+                if left > lanes {
+                    self.columns::<S, 2>(simd, k0, depth, j, width);
                 } else {
-                    let width = left.min(lanes);
                     self.columns::<S, 1>(simd, k0, depth, j, width);
-                    j += width;
                 }
+                j += width;
             }
             k0 += depth;
             if k0 >= self.k {
@@ -132,15 +124,14 @@ impl<T: Real> Product<'_, T> {
     #[inline(always)]
     fn columns<S: Simd, const V: usize>(&mut self, simd: S, k0: usize, depth: usize, j: usize, width: usize) {
         let mut i = 0;
-        while i + ROWS <= self.m {
-            self.tile::<S, ROWS, V>(simd, (i, j, k0), depth, width);
-            i += ROWS;
+        // Twice 6 x 2 sums fit into 32 registers, twice 2 x 2 into 16.
+        if S::REGISTER_COUNT >= 32 {
+            while i + 6 <= self.m {
+                self.tile::<S, 6, V>(simd, (i, j, k0), depth, width);
+                i += 6;
+            }
         }
-        if i + 4 <= self.m {
-            self.tile::<S, 4, V>(simd, (i, j, k0), depth, width);
-            i += 4;
-        }
-        if i + 2 <= self.m {
+        while i + 2 <= self.m {
             self.tile::<S, 2, V>(simd, (i, j, k0), depth, width);
             i += 2;
         }
@@ -182,24 +173,40 @@ impl<T: Real> Product<'_, T> {
         }
         if depth > 0 {
             let b = &self.b.data[k0 * self.b.stride + j..];
-            let b_rows = b.chunks(self.b.stride).take(depth);
+            let b_row = |k: usize| &b[k * self.b.stride..][..width];
+            let mut odd = [[T::splat(simd, T::ZERO); V]; R];
             if self.a.col == 1 {
                 let mut rows: [&[T]; R] = [&[]; R];
                 for (r, row) in rows.iter_mut().enumerate() {
                     *row = &self.a.data[(i + r) * self.a.row + k0..][..depth];
                 }
-                for (k, b) in b_rows.enumerate() {
-                    let mut a = [T::ZERO; R];
-                    for r in 0..R {
-                        a[r] = rows[r][k];
-                    }
-                    accumulate::<T, S, R, V>(simd, &a, &b[..width], &mut sums);
+                let mut k = 0;
+                while k + 1 < depth {
+                    accumulate(simd, |r| rows[r][k], b_row(k), &mut sums);
+                    accumulate(simd, |r| rows[r][k + 1], b_row(k + 1), &mut odd);
+                    k += 2;
+                }
+                if k < depth {
+                    accumulate(simd, |r| rows[r][k], b_row(k), &mut sums);
                 }
             } else {
-                let a_rows = self.a.data[i + k0 * self.a.col..].chunks(self.a.col);
-                for (a, b) in a_rows.zip(b_rows) {
-                    let a: &[T; R] = a[..R].try_into().expect("R numbers");
-                    accumulate::<T, S, R, V>(simd, a, &b[..width], &mut sums);
+                let a = &self.a.data[i + k0 * self.a.col..];
+                let a_row = |k: usize| -> &[T; R] { a[k * self.a.col..][..R].try_into().expect("R numbers") };
+                let mut k = 0;
+                while k + 1 < depth {
+                    let (a, next) = (a_row(k), a_row(k + 1));
+                    accumulate(simd, |r| a[r], b_row(k), &mut sums);
+                    accumulate(simd, |r| next[r], b_row(k + 1), &mut odd);
+                    k += 2;
+                }
+                if k < depth {
+                    let a = a_row(k);
+                    accumulate(simd, |r| a[r], b_row(k), &mut sums);
+                }
+            }
+            for (row, odd) in sums.iter_mut().zip(&odd) {
+                for (x, &y) in row.iter_mut().zip(odd) {
+                    *x = T::plus(simd, *x, y);
                 }
             }
         }
@@ -212,16 +219,21 @@ impl<T: Real> Product<'_, T> {
     }
 }
 
-/// `sums[r]` += `a[r]` * b.
+/// `sums[r]` += a(r) * b.
 #[inline(always)]
-fn accumulate<T: Real, S: Simd, const R: usize, const V: usize>(simd: S, a: &[T; R], b: &[T], sums: &mut [[T::Vector<S>; V]; R]) {
+fn accumulate<T: Real, S: Simd, const R: usize, const V: usize>(
+    simd: S,
+    a: impl Fn(usize) -> T,
+    b: &[T],
+    sums: &mut [[T::Vector<S>; V]; R],
+) {
     let lanes = T::lanes::<S>();
     let mut row = [T::splat(simd, T::ZERO); V];
     for (v, x) in row.iter_mut().enumerate() {
         *x = T::load(simd, &b[v * lanes..if v + 1 < V { (v + 1) * lanes } else { b.len() }]);
     }
     for r in 0..R {
-        let x = T::splat(simd, a[r]);
+        let x = T::splat(simd, a(r));
         for v in 0..V {
             sums[r][v] = T::fma(simd, x, row[v], sums[r][v]);
         }

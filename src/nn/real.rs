@@ -73,6 +73,8 @@ pub trait Real:
     fn splat<S: Simd>(simd: S, x: Self) -> Self::Vector<S>;
     /// a * b + c in every lane, rounded once where the processor can.
     fn fma<S: Simd>(simd: S, a: Self::Vector<S>, b: Self::Vector<S>, c: Self::Vector<S>) -> Self::Vector<S>;
+    /// a + b in every lane.
+    fn plus<S: Simd>(simd: S, a: Self::Vector<S>, b: Self::Vector<S>) -> Self::Vector<S>;
     /// The first lanes from `from`, which may be shorter than a vector; the rest is 0.
     fn load<S: Simd>(simd: S, from: &[Self]) -> Self::Vector<S>;
     /// Writes as many lanes as `to` is long, at most a vector.
@@ -157,6 +159,11 @@ impl Real for f32 {
     }
 
     #[inline(always)]
+    fn plus<S: Simd>(simd: S, a: S::f32s, b: S::f32s) -> S::f32s {
+        simd.add_f32s(a, b)
+    }
+
+    #[inline(always)]
     fn load<S: Simd>(simd: S, from: &[Self]) -> S::f32s {
         match S::as_simd_f32s(from).0 {
             [x, ..] => *x,
@@ -221,6 +228,11 @@ impl Real for f64 {
     #[inline(always)]
     fn fma<S: Simd>(simd: S, a: S::f64s, b: S::f64s, c: S::f64s) -> S::f64s {
         simd.mul_add_e_f64s(a, b, c)
+    }
+
+    #[inline(always)]
+    fn plus<S: Simd>(simd: S, a: S::f64s, b: S::f64s) -> S::f64s {
+        simd.add_f64s(a, b)
     }
 
     #[inline(always)]
