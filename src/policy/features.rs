@@ -112,7 +112,7 @@ impl SetEncoder {
 
     /// Observations of rows `first` and on, into the first columns of rows of `stride` numbers.
     pub(super) fn forward<T: Real>(&self, w: Weights<'_, T>, geometry: &Geometry, first: usize, out: &mut [T], stride: usize) {
-        let (uav, user, scale) = (self.uav.load(w), self.user.load(w), T::of(self.scale));
+        let (uav, user, scale) = (self.uav.load(w), self.user.load(w), self.scale);
         simd(
             #[inline(always)]
             || {
@@ -132,7 +132,7 @@ impl SetEncoder {
         d: Rows<'_, T>,
         grads: &mut [T],
     ) {
-        let (uav, user, scale) = (self.uav.load(w), self.user.load(w), T::of(self.scale));
+        let (uav, user, scale) = (self.uav.load(w), self.user.load(w), self.scale);
         let (mut uav_sums, mut user_sums) = (EmbeddingGrad::zero(), EmbeddingGrad::zero());
         simd(
             #[inline(always)]
@@ -152,7 +152,7 @@ impl SetEncoder {
 #[inline(always)]
 fn encode<T: Real>(
     view: &View<'_>,
-    scale: T,
+    scale: f64,
     (uav, user): (&EmbeddingGrad<T, 2>, &EmbeddingGrad<T, 3>),
     (uav_sum, user_sum): (&mut [T; HIDDEN], &mut [T; HIDDEN]),
 ) {
@@ -165,7 +165,7 @@ fn encode<T: Real>(
 #[inline(always)]
 fn encode_back<T: Real>(
     view: &View<'_>,
-    scale: T,
+    scale: f64,
     (uav, user): (&EmbeddingGrad<T, 2>, &EmbeddingGrad<T, 3>),
     (d_uav, d_user): (&[T; HIDDEN], &[T; HIDDEN]),
     (uav_sums, user_sums): (&mut EmbeddingGrad<T, 2>, &mut EmbeddingGrad<T, 3>),
@@ -175,14 +175,14 @@ fn encode_back<T: Real>(
 
 /// Every entity a node sees; a user sees itself.
 #[inline(always)]
-fn each_seen<T: Real>(view: &View<'_>, scale: T, mut uav: impl FnMut([T; 2]), mut user: impl FnMut([T; 3])) {
+fn each_seen<T: Real>(view: &View<'_>, scale: f64, mut uav: impl FnMut([T; 2]), mut user: impl FnMut([T; 3])) {
     let m = view.fleet.uavs;
     let aoi = |node: usize| T::of(view.aoi[node - m].into());
     if view.node >= m {
         user([T::ZERO, T::ZERO, aoi(view.node)]);
     }
     for d in view.detections {
-        let [x, y] = d.rel.map(|x| T::of(x.into()) * scale);
+        let [x, y] = d.rel.map(|x| T::of(f64::from(x) * scale));
         let target = d.target as usize;
         if target < m {
             uav([x, y]);
