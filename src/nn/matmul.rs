@@ -2,7 +2,8 @@
 //!
 //! One kernel serves all three products of a layer, because each has a right-hand side whose rows are contiguous:
 //! Y = X Wt (weights transposed once per update), dX = dY W, dW += dYt X. A tile of C stays in vector registers while k
-//! runs. Every element of C is summed over k in ascending order by fused multiply-adds, whatever the size of the batch or
+//! runs. Every element of C is summed over k in one order by fused multiply-adds (even and odd terms apart, which halves
+//! the rounding error's growth and hides latency), whatever the size of the batch or
 //! the place of its row in it. So an answer does not depend on what it was batched with, which serving promises and
 //! general-purpose products (with their special cases for few rows) do not keep. No allocation, no packing, no threads:
 //! callers split the work.
@@ -236,6 +237,78 @@ fn accumulate<T: Real, S: Simd, const R: usize, const V: usize>(
         let x = T::splat(simd, a(r));
         for v in 0..V {
             sums[r][v] = T::fma(simd, x, row[v], sums[r][v]);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::RngExt;
+
+    use super::*;
+
+    /// Row i, column j of start + A B, as the formula reads, in f64.
+    fn naive<T: Real>(k: usize, a: impl Fn(usize) -> T, b: impl Fn(usize) -> T, start: T) -> f64 {
+        (0..k).map(|k| a(k).wide() * b(k).wide()).sum::<f64>() + start.wide()
+    }
+
+    fn check<T: Real>(tolerance: f64) {
+        let mut stream = crate::rng::stream(3, "matmul", 0);
+        let mut draw = |len: usize| -> Vec<T> { (0..len).map(|_| T::of(2.0 * stream.random::<f64>() - 1.0)).collect() };
+        for m in [1, 2, 3, 5, 6, 7, 13, 24] {
+            for k in [0, 1, 2, 21, 64, DEPTH - 1, DEPTH + 1, 2 * DEPTH] {
+                for n in [1, 2, 8, 9, 15, 16, 17, 31, 33, 96] {
+                    let (wide_a, wide_b, wide_c) = (k + 3, n + 2, n + 5);
+                    let (a, b) = (draw(m.max(k) * (wide_a + m)), draw(k.max(1) * wide_b));
+                    let (before, bias) = (draw(m * wide_c), draw(n));
+                    for (lhs, place) in [(Lhs::rows(&a, wide_a), (wide_a, 1)), (Lhs::transposed(&a, m + 1), (1, m + 1))] {
+                        for start in [Start::Zero, Start::Bias(&bias), Start::Add] {
+                            let mut c = before.clone();
+                            let (rhs, out) = (Rhs { data: &b, stride: wide_b }, Out { data: &mut c, stride: wide_c });
+                            matmul((m, k, n), lhs, rhs, out, start);
+                            for (at, (&c, &before)) in c.iter().zip(&before).enumerate() {
+                                let (i, j) = (at / wide_c, at % wide_c);
+                                if j >= n {
+                                    assert_eq!(c, before, "outside of C");
+                                    continue;
+                                }
+                                let start = match start {
+                                    Start::Zero => T::ZERO,
+                                    Start::Bias(bias) => bias[j],
+                                    Start::Add => before,
+                                };
+                                let exact = naive(k, |k| a[i * place.0 + k * place.1], |k| b[k * wide_b + j], start);
+                                assert!((c.wide() - exact).abs() <= tolerance * (1.0 + k as f64), "{m} {k} {n}: {c} {exact}");
+                            }
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn agrees_with_the_formula_in_f32() {
+        check::<f32>(1e-6);
+    }
+
+    #[test]
+    fn agrees_with_the_formula_in_f64() {
+        check::<f64>(1e-14);
+    }
+
+    #[test]
+    fn a_row_has_the_same_bits_in_any_batch() {
+        let data: Vec<f32> = (0..50 * 64).map(|i| ((i * 37 % 101) as f32 - 50.0) / 7.0).collect();
+        let product = |rows: std::ops::Range<usize>| {
+            let mut c = vec![0.0; rows.len() * 33];
+            let a = Lhs::rows(&data[rows.start * 64..], 64);
+            matmul((rows.len(), 64, 33), a, Rhs { data: &data, stride: 33 }, Out { data: &mut c, stride: 33 }, Start::Zero);
+            c
+        };
+        let whole = product(0..50);
+        for rows in [0..1, 3..5, 7..20, 49..50] {
+            assert_eq!(product(rows.clone()), whole[rows.start * 33..rows.end * 33]);
         }
     }
 }

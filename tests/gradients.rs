@@ -1,0 +1,258 @@
+//! Hand-derived gradients against central differences, in f64: of every layer, and of the whole loss.
+
+mod sample;
+
+use qedgix::learner::objective::{Objective, Returns};
+use qedgix::nn::{Batch, Graph, GraphLayer, Gru, HIDDEN, LayerCache, LayerScratch, Layout, Linear, Mlp, MlpCache, Weights};
+use qedgix::policy::mixer::Mixing;
+use qedgix::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, Observation};
+use qedgix::rng;
+use rand::RngExt;
+use sample::{AGENT, episodes};
+
+/// Allowed difference, relative to the largest gradient of the tensor.
+const TOLERANCE: f64 = 1e-6;
+const STEP: f64 = 1e-6;
+
+fn uniform(len: usize, name: &str) -> Vec<f64> {
+    let mut stream = rng::stream(5, name, 0);
+    (0..len).map(|_| 2.0 * stream.random::<f64>() - 1.0).collect()
+}
+
+/// Checks `gradient` of `f` at `at`, in the ranges named: a few entries of each, and one random direction through it.
+fn check(
+    what: &str,
+    ranges: &[(String, std::ops::Range<usize>)],
+    at: &[f64],
+    gradient: &[f64],
+    mut f: impl FnMut(&[f64]) -> f64,
+) {
+    let mut stream = rng::stream(9, what, 0);
+    for (name, range) in ranges.iter().filter(|(_, range)| !range.is_empty()) {
+        let largest = gradient[range.clone()].iter().fold(0.0, |m: f64, g| m.max(g.abs()));
+        let mut directions: Vec<Vec<(usize, f64)>> = (0..3).map(|_| vec![(stream.random_range(range.clone()), 1.0)]).collect();
+        let norm = (range.len() as f64).sqrt();
+        directions.push(range.clone().map(|i| (i, if stream.random() { 1.0 } else { -1.0 } / norm)).collect());
+        for direction in directions {
+            let mut moved = |sign: f64| {
+                let mut x = at.to_vec();
+                direction.iter().for_each(|&(i, d)| x[i] += sign * STEP * d);
+                f(&x)
+            };
+            let numeric = (moved(1.0) - moved(-1.0)) / (2.0 * STEP);
+            let exact: f64 = direction.iter().map(|&(i, d)| gradient[i] * d).sum();
+            let error = (numeric - exact).abs();
+            assert!(
+                error <= TOLERANCE * largest + 1e-9,
+                "{what}, {name}: {exact:e} by hand, {numeric:e} by differences, largest {largest:e}"
+            );
+        }
+    }
+}
+
+/// A layer as a function: parameters and inputs in, outputs; and backward: the gradients of both, given that of the outputs.
+trait Layer {
+    fn forward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>) -> Batch<f64>;
+    fn backward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>, dy: Batch<f64>, grads: &mut [f64]) -> Batch<f64>;
+    fn prepare(&self, flat: &[f64], turned: &mut [f64]);
+}
+
+fn check_layer(name: &str, layout: &Layout, layer: &mut impl Layer, width: usize, samples: usize) {
+    let params = layout.len();
+    let mut at = uniform(params, &format!("{name} parameters"));
+    at.iter_mut().for_each(|p| *p *= 0.2);
+    at.extend(uniform(width * samples, name));
+    let mut run = |at: &[f64], cotangent: Option<&[f64]>| -> (Vec<f64>, Vec<f64>) {
+        let (flat, x) = at.split_at(params);
+        let mut turned = vec![0.0; params];
+        layer.prepare(flat, &mut turned);
+        let w = Weights { flat, turned: &turned };
+        let mut input = Batch::default();
+        input.reset(width, samples);
+        input.as_mut_slice().copy_from_slice(x);
+        let y = layer.forward(w, &input);
+        let mut gradient = vec![0.0; params];
+        if let Some(cotangent) = cotangent {
+            let mut dy = y.clone();
+            dy.as_mut_slice().copy_from_slice(cotangent);
+            let dx = layer.backward(w, &input, dy, &mut gradient);
+            gradient.extend_from_slice(dx.as_slice());
+        }
+        (y.as_slice().to_vec(), gradient)
+    };
+    let outputs = run(&at, None).0.len();
+    let cotangent = uniform(outputs, "cotangent");
+    let (_, gradient) = run(&at, Some(&cotangent));
+    let mut ranges: Vec<_> = layout.parameters().iter().map(|p| (p.name.clone(), p.range.clone())).collect();
+    ranges.push(("input".into(), params..at.len()));
+    check(name, &ranges, &at, &gradient, |at| run(at, None).0.iter().zip(&cotangent).map(|(y, c)| y * c).sum());
+}
+
+struct Plain(Linear);
+
+impl Layer for Plain {
+    fn prepare(&self, flat: &[f64], turned: &mut [f64]) {
+        self.0.prepare(flat, turned);
+    }
+
+    fn forward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>) -> Batch<f64> {
+        let mut y = Batch::default();
+        y.reset(self.0.outputs, x.len());
+        self.0.forward(w, x.rows(), y.rows_mut());
+        y
+    }
+
+    fn backward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>, dy: Batch<f64>, grads: &mut [f64]) -> Batch<f64> {
+        let mut dx = Batch::default();
+        dx.reset(x.width(), x.len());
+        self.0.backward(w.flat, x.rows(), dy.rows(), grads, Some(dx.rows_mut()));
+        dx
+    }
+}
+
+#[test]
+fn linear() {
+    let mut layout = Layout::default();
+    let mut layer = Plain(Linear::new(&mut layout, "linear", 21, 9));
+    check_layer("linear", &layout, &mut layer, 21, 7);
+}
+
+struct Split(Mlp<96>, MlpCache<f64>);
+
+impl Layer for Split {
+    fn prepare(&self, flat: &[f64], turned: &mut [f64]) {
+        self.0.prepare(flat, turned);
+    }
+
+    fn forward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>) -> Batch<f64> {
+        let mut y = Batch::default();
+        y.reset(8, x.len());
+        self.0.forward(w, (x.rows(), x.rows().from_column(5), 5), &mut self.1, y.rows_mut());
+        y
+    }
+
+    fn backward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>, dy: Batch<f64>, grads: &mut [f64]) -> Batch<f64> {
+        self.0.backward(w.flat, (x.rows(), x.rows().from_column(5), 5), dy.rows(), &mut self.1, grads);
+        let mut dx = Batch::default();
+        dx.reset(x.width(), x.len());
+        let start = qedgix::nn::matmul::Start::Zero;
+        self.0.first.backward_input(w.flat, (0, x.width()), self.0.d_first(&self.1), dx.rows_mut(), start);
+        dx
+    }
+}
+
+#[test]
+fn mlp_of_two_parts() {
+    let mut layout = Layout::default();
+    let mut layer = Split(Mlp::new(&mut layout, "mlp", 13, 8), MlpCache::default());
+    check_layer("mlp", &layout, &mut layer, 13, 6);
+}
+
+struct Cell(Gru, Batch<f64>, Batch<f64>);
+
+/// Slots of the GRU test.
+const SLOTS: usize = 5;
+
+impl Layer for Cell {
+    fn prepare(&self, flat: &[f64], turned: &mut [f64]) {
+        self.0.prepare(flat, turned);
+    }
+
+    fn forward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>) -> Batch<f64> {
+        let n = x.len() / SLOTS;
+        self.2.reset_zero(HIDDEN, x.len() + n);
+        self.0.forward(w, x.rows(), SLOTS, &mut self.1, &mut self.2);
+        let mut y = Batch::default();
+        y.reset(HIDDEN, x.len());
+        y.as_mut_slice().copy_from_slice(&self.2.as_slice()[n * HIDDEN..]);
+        y
+    }
+
+    fn backward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>, mut dy: Batch<f64>, grads: &mut [f64]) -> Batch<f64> {
+        self.0.backward(w.flat, (x.rows(), SLOTS), &self.2, (&mut self.1, &mut dy), grads);
+        let mut dx = Batch::default();
+        self.0.backward_input(w.flat, &self.1, &mut dx);
+        dx
+    }
+}
+
+#[test]
+fn gru_over_time() {
+    let mut layout = Layout::default();
+    let mut layer = Cell(Gru::new(&mut layout, "gru"), Batch::default(), Batch::default());
+    check_layer("gru", &layout, &mut layer, HIDDEN, 3 * SLOTS);
+}
+
+struct Convolution(GraphLayer, Graph, LayerCache<f64>);
+
+impl Layer for Convolution {
+    fn prepare(&self, flat: &[f64], turned: &mut [f64]) {
+        self.0.prepare(flat, turned);
+    }
+
+    fn forward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>) -> Batch<f64> {
+        let mut y = Batch::default();
+        y.reset(HIDDEN, self.1.offsets.len() - 1);
+        self.0.forward(w, &self.1, x.rows(), &mut self.2, y.rows_mut());
+        y
+    }
+
+    fn backward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>, mut dy: Batch<f64>, grads: &mut [f64]) -> Batch<f64> {
+        let mut dx = Batch::default();
+        let (mut scratch, forward) = (LayerScratch::default(), (&self.1, x.rows(), &mut self.2));
+        self.0.backward(w, forward, &mut dy, &mut scratch, (grads, &mut dx));
+        dx
+    }
+}
+
+/// Two of the first kind, four of the second; node 1 sees itself, node 3 nobody, node 5 is only seen.
+fn graph() -> Graph {
+    let lists: [&[u32]; 5] = [&[1, 2, 4], &[1, 0, 3], &[0, 5], &[], &[2, 0]];
+    let offsets = std::iter::once(0).chain(lists.iter().scan(0, |end, l| {
+        *end += l.len() as u32;
+        Some(*end)
+    }));
+    Graph { offsets: offsets.collect(), targets: lists.concat(), reach: vec![2, 5, 6] }
+}
+
+#[test]
+fn graph_layers() {
+    let layers: [(&str, fn(&mut Layout) -> GraphLayer); 4] = [
+        ("edgeconv, mean", |layout| GraphLayer::edge_conv(layout, "layer", true)),
+        ("edgeconv, sum", |layout| GraphLayer::edge_conv(layout, "layer", false)),
+        ("agggnn", |layout| GraphLayer::agg_gnn(layout, "layer")),
+        ("rgcn", |layout| GraphLayer::rgcn(layout, "layer")),
+    ];
+    for (name, make) in layers {
+        let mut layout = Layout::default();
+        let mut layer = Convolution(make(&mut layout), graph(), LayerCache::default());
+        check_layer(name, &layout, &mut layer, HIDDEN, 6);
+    }
+}
+
+#[test]
+fn whole_loss() {
+    let set = AgentConfig { observation: Observation::Set, identity: Identity::Phase, self_position: true, ..AGENT };
+    let cases = [
+        ("qedgix", AGENT, Mixing::Qmix),
+        ("qedgix on sets", AgentConfig { self_loops: true, aggregation: Aggregation::Sum, ..set }, Mixing::Invariant),
+        ("three layers", AgentConfig { layers: 3, identity: Identity::Token, ..AGENT }, Mixing::Vdn),
+        ("agggnn", AgentConfig { gnn: Gnn::AggGnn, layers: 1, ..set }, Mixing::Invariant),
+        ("rgcn", AgentConfig { gnn: Gnn::Rgcn, identity: Identity::None, ..AGENT }, Mixing::Qmix),
+        ("qmix", AgentConfig { gnn: Gnn::None, ..AGENT }, Mixing::Qmix),
+        ("iql", AgentConfig { gnn: Gnn::None, identity: Identity::Token, ..set }, Mixing::None),
+    ];
+    for (name, agent, mixing) in cases {
+        let dims = Dims { uavs: 3, users: 4, actions: 9, detection_range: 0.28, slots: 3 };
+        let returns = Returns { gamma: 0.95, lambda: 0.6 };
+        let mut objective = Objective::<f64>::new(agent, dims, mixing, returns, 1);
+        let layout = objective.layout().clone();
+        let online: Vec<f64> = layout.initialise(&mut rng::stream(1, "online", 0));
+        let target: Vec<f64> = layout.initialise(&mut rng::stream(1, "target", 0));
+        let episodes = episodes(&dims, 2, 3);
+        objective.evaluate(&online, &target, &episodes, None);
+        let gradient = objective.gradient().to_vec();
+        let ranges: Vec<_> = layout.parameters().iter().map(|p| (p.name.clone(), p.range.clone())).collect();
+        check(name, &ranges, &online, &gradient, |online| objective.evaluate(online, &target, &episodes, None).loss);
+    }
+}

@@ -1,0 +1,409 @@
+//! Properties of agents, mixers and updates that hold for all parameters (spec 2.4, 3, 4, 5).
+
+mod sample;
+
+use qedgix::env::Point;
+use qedgix::learner::objective::{Objective, Returns, Trace};
+use qedgix::learner::{Algorithm, Learner, Preset, TrainConfig};
+use qedgix::nn::{Batch, Graph, GraphLayer, HIDDEN, LayerCache, Layout, Rows, Weights};
+use qedgix::policy::mixer::{Mixer, MixerCache, Mixing};
+use qedgix::policy::{
+    Actor, Agent, AgentConfig, Dims, Gnn, Identity, Learned, Needs, Observation, Policy, Slot, StepInput, TOKEN, Turn,
+};
+use qedgix::rng;
+use rand::RngExt;
+use sample::{AGENT, episodes};
+
+const DIMS: Dims = Dims { uavs: 3, users: 5, actions: 8, detection_range: 0.28, slots: 80 };
+const SET: AgentConfig = AgentConfig { observation: Observation::Set, identity: Identity::Phase, self_position: true, ..AGENT };
+
+fn parameters(layout: &Layout, seed: u64) -> Vec<f32> {
+    layout.initialise(&mut rng::stream(seed, "init", 0))
+}
+
+fn learned(config: AgentConfig) -> Learned {
+    Learned::new(config, DIMS, parameters(Agent::new(config, DIMS).layout(), 1)).expect("as many as the layout says")
+}
+
+/// A slot with everybody near the middle, so that most see each other.
+fn slot(uavs: usize, users: usize, seed: u64) -> Slot {
+    let mut stream = rng::stream(seed, "slot", 0);
+    let mut points = |n: usize| -> Vec<Point> { (0..n).map(|_| [0, 1].map(|_| 0.3 + 0.4 * stream.random::<f64>())).collect() };
+    let (uavs, users) = (points(uavs), points(users));
+    let aoi: Vec<f32> = (0..users.len()).map(|i| (i * 7 % 40) as f32).collect();
+    Slot::from_scene(&uavs, &users, &aoi, DIMS.detection_range)
+}
+
+/// A fleet between slots: slot, memory, and what it answered.
+struct Fleet {
+    slot: Slot,
+    memory: Vec<f32>,
+    headings: Vec<u8>,
+    q: Vec<f32>,
+}
+
+impl Fleet {
+    fn new(policy: &Learned, uavs: usize, users: usize, seed: u64) -> Self {
+        let mut memory = vec![0.0; policy.memory_len(uavs, users)];
+        policy.start(uavs, users, seed, &mut memory);
+        let (headings, q) = (vec![0; uavs], vec![0.0; uavs * policy.actions()]);
+        Self { slot: slot(uavs, users, seed), memory, headings, q }
+    }
+
+    fn turn(&mut self) -> Turn<'_> {
+        let Self { slot, memory, headings, q } = self;
+        Turn { slot, step: 0, memory, headings, q_values: Some(q) }
+    }
+
+    fn bits(&self) -> (Vec<u32>, Vec<u8>, Vec<u32>) {
+        let bits = |x: &[f32]| x.iter().map(|x| x.to_bits()).collect();
+        (bits(&self.memory), self.headings.clone(), bits(&self.q))
+    }
+}
+
+#[test]
+fn a_batched_answer_is_the_single_answer_bit_for_bit() {
+    let variants = [
+        SET,
+        AgentConfig { identity: Identity::Token, self_loops: true, layers: 3, ..SET },
+        AgentConfig { gnn: Gnn::AggGnn, ..SET },
+        AgentConfig { gnn: Gnn::Rgcn, identity: Identity::None, ..SET },
+        AgentConfig { gnn: Gnn::None, ..SET },
+    ];
+    for config in variants {
+        let policy = learned(config);
+        let sizes = [(1, 1), (3, 5), (2, 0), (9, 4), (1, 12), (4, 40), (20, 3)];
+        let fleets =
+            || -> Vec<Fleet> { (0..).zip(sizes).map(|(seed, (uavs, users))| Fleet::new(&policy, uavs, users, seed)).collect() };
+        let (mut single, mut batch, mut reversed) = (fleets(), fleets(), fleets());
+        for _ in 0..3 {
+            single.iter_mut().for_each(|fleet| policy.act(&mut [fleet.turn()]));
+            policy.act(&mut batch.iter_mut().map(Fleet::turn).collect::<Vec<_>>());
+            policy.act(&mut reversed.iter_mut().rev().map(Fleet::turn).collect::<Vec<_>>());
+        }
+        for ((a, b), c) in single.iter().zip(&batch).zip(&reversed) {
+            assert_eq!(a.bits(), b.bits(), "{config:?}");
+            assert_eq!(a.bits(), c.bits(), "{config:?}");
+        }
+    }
+}
+
+#[test]
+fn actor_policy_and_update_see_the_same_values() {
+    for config in [AGENT, SET, AgentConfig { gnn: Gnn::None, identity: Identity::Token, ..AGENT }] {
+        let dims = Dims { slots: 6, ..DIMS };
+        let (m, n, slots) = (dims.uavs, dims.users, dims.slots);
+        let ep = episodes(&dims, 2, 8);
+        let returns = Returns { gamma: 0.99, lambda: 0.6 };
+        let mut objective = Objective::<f32>::new(config, dims, Mixing::Vdn, returns, 1);
+        let params = parameters(objective.layout(), 3);
+        let mut trace = Trace::default();
+        objective.evaluate(&params, &params, &ep, Some(&mut trace));
+
+        let agent = Agent::new(config, dims);
+        let policy = Learned::new(config, dims, params.clone()).expect("as many as the layout says");
+        let mut actor = Actor::new(&agent, 1);
+        for e in 0..2 {
+            actor.begin(&agent, &params, &ep.token[e * m * TOKEN..][..m * TOKEN]);
+            let mut memory = vec![0.0; policy.memory_len(m, n)];
+            policy.start(m, n, 0, &mut memory);
+            if config.identity == Identity::Token {
+                for (uav, token) in memory.chunks_exact_mut(HIDDEN + 1 + TOKEN).zip(ep.token[e * m * TOKEN..].chunks_exact(TOKEN))
+                {
+                    uav[HIDDEN + 1..].copy_from_slice(token);
+                }
+            }
+            for t in 0..slots {
+                let at = e * (slots + 1) + t;
+                let (uav_xy, user_xy) = (&ep.uav_xy[at * 2 * m..][..2 * m], &ep.user_xy[e * 2 * n..][..2 * n]);
+                let aoi = &ep.aoi[at * n..][..n];
+                let q = actor.step(&agent, StepInput { uav_xy, user_xy, aoi }).to_vec();
+                assert_eq!(q, trace.q[at * m * dims.actions..][..m * dims.actions], "slot {t}, {config:?}");
+
+                let points = |xy: &[f32]| -> Vec<Point> { xy.chunks_exact(2).map(|p| [p[0].into(), p[1].into()]).collect() };
+                let slot = Slot::from_scene(&points(uav_xy), &points(user_xy), aoi, dims.detection_range);
+                let (mut headings, mut served) = (vec![0; m], vec![0.0; q.len()]);
+                let turn =
+                    Turn { slot: &slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: Some(&mut served) };
+                policy.act(&mut [turn]);
+                assert_eq!(q, served, "slot {t}, {config:?}");
+
+                let actions = &ep.actions[(e * slots + t) * m..][..m];
+                actor.acted(actions);
+                // Replay what the episode did instead of the greedy heading.
+                let stride = memory.len() / m;
+                memory.chunks_exact_mut(stride).zip(actions).for_each(|(uav, &a)| uav[HIDDEN] = f32::from(a));
+            }
+        }
+    }
+}
+
+#[test]
+fn without_an_identity_uavs_move_as_one_for_ever_and_with_one_they_part() {
+    let fly = |config: AgentConfig, seed: u64| {
+        let policy = Learned::new(config, DIMS, parameters(Agent::new(config, DIMS).layout(), seed)).expect("the layout's");
+        assert_eq!(policy.needs(), if config.self_position { Needs::OwnPositions } else { Needs::Detections });
+        let mut stream = rng::stream(seed, "users", 0);
+        let users: Vec<Point> = (0..5).map(|_| [stream.random(), stream.random()]).collect();
+        let mut uavs: Vec<Point> = vec![[0.5, 0.5]; 3];
+        let mut memory = vec![0.0; policy.memory_len(3, 5)];
+        policy.start(3, 5, seed, &mut memory);
+        let mut parted = false;
+        for step in 0..80 {
+            let slot = Slot::from_scene(&uavs, &users, &[step as f32; 5], DIMS.detection_range);
+            let mut headings = [0; 3];
+            policy.act(&mut [Turn { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
+            for (p, h) in uavs.iter_mut().zip(headings) {
+                let (sin, cos) = (f64::from(h) * std::f64::consts::FRAC_PI_4).sin_cos();
+                *p = [(p[0] + 0.04 * cos).clamp(0.0, 1.0), (p[1] + 0.04 * sin).clamp(0.0, 1.0)];
+            }
+            parted |= uavs.iter().any(|p| *p != uavs[0]);
+        }
+        parted
+    };
+    for gnn in [Gnn::None, Gnn::EdgeConv] {
+        let parts = |identity| (0..6).filter(|&seed| fly(AgentConfig { gnn, identity, ..SET }, seed)).count();
+        assert_eq!(parts(Identity::None), 0, "{gnn:?}");
+        for identity in [Identity::Onehot, Identity::Phase, Identity::Token] {
+            // A drawn network may prefer one heading whatever it is told; some of six do not.
+            assert!(parts(identity) > 0, "{gnn:?}, {identity:?}");
+        }
+    }
+}
+
+/// q of one slot of a set agent without identity, its UAVs and users in the order given.
+fn values(policy: &Learned, uavs: &[Point], users: &[(Point, f32)]) -> Vec<f32> {
+    let (points, aoi): (Vec<Point>, Vec<f32>) = users.iter().copied().unzip();
+    let slot = Slot::from_scene(uavs, &points, &aoi, DIMS.detection_range);
+    let mut memory = vec![0.0; policy.memory_len(uavs.len(), users.len())];
+    policy.start(uavs.len(), users.len(), 0, &mut memory);
+    let (mut headings, mut q) = (vec![0; uavs.len()], vec![0.0; uavs.len() * 8]);
+    policy.act(&mut [Turn { slot: &slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: Some(&mut q) }]);
+    q
+}
+
+fn close(a: f32, b: f32) -> bool {
+    (a - b).abs() <= 2e-6 * (1.0 + a.abs())
+}
+
+#[test]
+fn set_agents_are_equivariant_under_permutations_of_uavs_and_invariant_under_those_of_users() {
+    for gnn in [Gnn::None, Gnn::EdgeConv, Gnn::AggGnn, Gnn::Rgcn] {
+        let policy = learned(AgentConfig { gnn, identity: Identity::None, ..SET });
+        let mut stream = rng::stream(2, "permutation", 0);
+        let mut point = || -> Point { [0, 1].map(|_| 0.3 + 0.4 * stream.random::<f64>()) };
+        let uavs: Vec<Point> = (0..5).map(|_| point()).collect();
+        let users: Vec<(Point, f32)> = (0..7).map(|i| (point(), 3.0 * i as f32)).collect();
+        let order = [3, 0, 4, 1, 2];
+        let shuffled: Vec<Point> = order.map(|i| uavs[i]).to_vec();
+        let reversed: Vec<_> = users.iter().rev().copied().collect();
+        let (q, permuted) = (values(&policy, &uavs, &users), values(&policy, &shuffled, &reversed));
+        for (to, from) in order.into_iter().enumerate() {
+            for a in 0..8 {
+                assert!(close(q[from * 8 + a], permuted[to * 8 + a]), "{gnn:?}");
+            }
+        }
+        assert!(q[..8].iter().zip(&q[8..16]).any(|(a, b)| !close(*a, *b)), "different UAVs value differently");
+    }
+}
+
+/// A mixer with drawn parameters, and Q_tot as a function of state and values.
+struct Mixed {
+    mixer: Mixer,
+    flat: Vec<f32>,
+    turned: Vec<f32>,
+}
+
+impl Mixed {
+    fn new(mixing: Mixing, dims: &Dims, seed: u64) -> Self {
+        let mut layout = Layout::default();
+        let mixer = Mixer::new(mixing, dims, &mut layout);
+        let flat = parameters(&layout, seed);
+        let mut turned = vec![0.0; flat.len()];
+        mixer.prepare(&flat, &mut turned);
+        Self { mixer, flat, turned }
+    }
+
+    fn rows(x: &[f32]) -> Rows<'_, f32> {
+        Rows { data: x, stride: x.len(), len: 1 }
+    }
+
+    fn total(&self, state: &[f32], q: &[f32]) -> f32 {
+        let w = Weights { flat: &self.flat, turned: &self.turned };
+        let mut total = Batch::default();
+        total.reset(1, 1);
+        self.mixer.forward(w, (Self::rows(state), Self::rows(q)), &mut MixerCache::default(), total.rows_mut());
+        total.as_slice()[0]
+    }
+
+    fn slope(&self, state: &[f32], q: &[f32]) -> Vec<f32> {
+        let w = Weights { flat: &self.flat, turned: &self.turned };
+        let (mut cache, mut total, mut dq) = (MixerCache::default(), Batch::default(), Batch::default());
+        total.reset(1, 1);
+        let inputs = (Self::rows(state), Self::rows(q));
+        self.mixer.forward(w, inputs, &mut cache, total.rows_mut());
+        self.mixer.backward(w, inputs, &mut cache, &[1.0], (&mut vec![0.0; self.flat.len()], &mut dq));
+        dq.as_slice().to_vec()
+    }
+}
+
+fn drawn(len: usize, seed: u64) -> Vec<f32> {
+    let mut stream = rng::stream(seed, "drawn", 0);
+    (0..len).map(|_| 2.0 * stream.random::<f32>() - 1.0).collect()
+}
+
+#[test]
+fn q_tot_does_not_fall_when_a_value_rises() {
+    for mixing in [Mixing::Qmix, Mixing::Invariant, Mixing::Vdn] {
+        for seed in 0..50 {
+            let mixed = Mixed::new(mixing, &DIMS, seed);
+            let (state, q) = (drawn(2 * 3 + 3 * 5, seed), drawn(3, seed + 1000));
+            let slope = mixed.slope(&state, &q);
+            assert!(slope.iter().all(|&d| d >= 0.0) && slope.iter().any(|&d| d > 0.0), "{mixing:?}: {slope:?}");
+            for i in 0..3 {
+                let mut more = q.clone();
+                more[i] += 0.5;
+                assert!(mixed.total(&state, &more) >= mixed.total(&state, &q), "{mixing:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn the_invariant_mixer_ignores_the_order_of_uavs_and_of_users() {
+    let mixed = Mixed::new(Mixing::Invariant, &DIMS, 4);
+    let (state, q) = (drawn(21, 4), drawn(3, 5));
+    let order = [2, 0, 1];
+    let uavs = order.iter().flat_map(|&i| &state[2 * i..2 * i + 2]);
+    let users = [4, 2, 0, 1, 3].into_iter().flat_map(|j| &state[6 + 3 * j..9 + 3 * j]);
+    let shuffled: Vec<f32> = uavs.chain(users).copied().collect();
+    let total = mixed.total(&state, &q);
+    assert!(close(total, mixed.total(&shuffled, &order.map(|i| q[i]))));
+    assert!(!close(total, mixed.total(&shuffled, &q)), "but not of one without the other");
+}
+
+#[test]
+fn an_invariant_mixer_fits_any_fleet() {
+    let layout = |uavs, users| {
+        let mut layout = Layout::default();
+        Mixer::new(Mixing::Invariant, &Dims { uavs, users, ..DIMS }, &mut layout);
+        layout
+    };
+    assert_eq!(layout(3, 5), layout(12, 40));
+}
+
+/// x'_i = agg_j f(x_i || x_j - x_i), edge by edge, as the formula reads, in f64.
+fn naive_edge_conv(layout: &Layout, flat: &[f64], graph: &Graph, x: &Batch<f64>, mean: bool, nodes: usize) -> Vec<f64> {
+    let get = |name: &str| {
+        let p = layout.parameters().iter().find(|p| p.name == format!("layer.f.{name}")).expect(name);
+        &flat[p.range.clone()]
+    };
+    let linear = |name: &str, x: &[f64]| -> Vec<f64> {
+        let (weight, bias) = (get(&format!("{name}.weight")), get(&format!("{name}.bias")));
+        weight.chunks(x.len()).zip(bias).map(|(w, b)| b + w.iter().zip(x).map(|(w, x)| w * x).sum::<f64>()).collect()
+    };
+    let f = |pair: &[f64]| {
+        let h = linear("0", pair);
+        let mean = h.iter().sum::<f64>() / h.len() as f64;
+        let variance = h.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / h.len() as f64;
+        let affine = get("1.weight").iter().zip(get("1.bias"));
+        let normal = h.iter().zip(affine).map(|(x, (g, b))| ((x - mean) / (variance + 1e-5).sqrt() * g + b).max(0.0));
+        linear("3", &normal.collect::<Vec<_>>())
+    };
+    let mut out = Vec::new();
+    for i in 0..nodes {
+        let neighbours = graph.neighbours(i);
+        let mut sum = vec![0.0; HIDDEN];
+        for &j in neighbours {
+            let (a, b) = (x.row(i), x.row(j as usize));
+            let pair: Vec<f64> = a.iter().copied().chain(b.iter().zip(a).map(|(b, a)| b - a)).collect();
+            sum.iter_mut().zip(f(&pair)).for_each(|(s, y)| *s += y);
+        }
+        let share = if mean { 1.0 / neighbours.len().max(1) as f64 } else { 1.0 };
+        out.extend(sum.iter().map(|s| s * share));
+    }
+    out
+}
+
+#[test]
+fn the_factored_edge_conv_is_the_naive_one() {
+    let mut stream = rng::stream(6, "graph", 0);
+    let lists: Vec<Vec<u32>> =
+        (0..9).map(|i| if i == 4 { vec![] } else { (0..12).filter(|_| stream.random_bool(0.4)).collect() }).collect();
+    let offsets = (0..=9).map(|i| lists[..i].iter().map(|l| l.len() as u32).sum()).collect();
+    let graph = Graph { offsets, targets: lists.concat(), reach: vec![5, 9, 12] };
+    for mean in [true, false] {
+        let mut layout = Layout::default();
+        let layer = GraphLayer::edge_conv(&mut layout, "layer", mean);
+        // Scales and shifts that differ, so that the order of operations matters.
+        let mut flat: Vec<f64> = layout.initialise(&mut rng::stream(7, "init", 0));
+        flat.iter_mut().zip(drawn(layout.len(), 8)).for_each(|(p, d)| *p += 0.1 * f64::from(d));
+        let mut turned = vec![0.0; flat.len()];
+        layer.prepare(&flat, &mut turned);
+        let (mut x, mut y) = (Batch::default(), Batch::default());
+        x.reset(HIDDEN, 12);
+        x.as_mut_slice().iter_mut().zip(drawn(12 * HIDDEN, 9)).for_each(|(x, d)| *x = d.into());
+        y.reset(HIDDEN, 9);
+        layer.forward(Weights { flat: &flat, turned: &turned }, &graph, x.rows(), &mut LayerCache::default(), y.rows_mut());
+        let naive = naive_edge_conv(&layout, &flat, &graph, &x, mean, 9);
+        for (a, b) in y.as_slice().iter().zip(&naive) {
+            assert!((a - b).abs() < 1e-12, "{a} instead of {b}");
+        }
+        assert!(y.row(4).iter().all(|&x| x == 0.0), "an isolated node gets 0");
+    }
+}
+
+#[test]
+fn one_thread_and_two_make_the_same_bits() {
+    for (algorithm, preset) in
+        [(Algorithm::Qedgix, Preset::Practical), (Algorithm::Qmix, Preset::Paper), (Algorithm::Iql, Preset::Paper)]
+    {
+        let mut config = TrainConfig::preset(algorithm, preset);
+        config.environment.slots = 10;
+        let run = |threads| {
+            let mut learner = Learner::new(&config, threads).expect("threads");
+            let mut updates = Vec::new();
+            for seed in 0..3 {
+                updates.push(learner.update(&episodes(&config.dims(), 37, seed)));
+                learner.sync_targets();
+            }
+            assert!(updates.iter().all(|u| u.loss.is_finite() && u.grad_norm > 0.0));
+            (updates, learner.state())
+        };
+        let one = run(1);
+        assert_eq!(one, run(2), "{algorithm:?}");
+        assert_eq!(one, run(3), "{algorithm:?}");
+    }
+}
+
+#[test]
+fn a_restored_learner_goes_on_as_if_never_stopped() {
+    let mut config = TrainConfig::preset(Algorithm::Qmix, Preset::Practical);
+    config.environment.slots = 8;
+    let batch = |seed| episodes(&config.dims(), 6, seed);
+    let mut whole = Learner::new(&config, 1).expect("a thread");
+    whole.update(&batch(0));
+    let state = whole.state();
+    whole.sync_targets();
+    whole.update(&batch(1));
+    let mut resumed = Learner::new(&TrainConfig { seed: 99, ..config.clone() }, 1).expect("a thread");
+    resumed.restore(state.clone()).expect("the same architecture");
+    assert_eq!(resumed.state(), state);
+    resumed.sync_targets();
+    resumed.update(&batch(1));
+    assert_eq!(whole.state(), resumed.state());
+    let short = qedgix::learner::LearnerState { adam_v: vec![0.0; 3], ..state };
+    assert_eq!(resumed.restore(short).expect_err("too short").field, "adam_v");
+}
+
+#[test]
+fn agents_say_which_fleets_fit() {
+    let fits = |config, uavs, users| learned(config).check_fleet(uavs, users).map_err(|e| e.field);
+    assert_eq!(fits(AGENT, 3, 5), Ok(()));
+    assert_eq!(fits(AGENT, 4, 5), Err("uavs".into()));
+    assert_eq!(fits(AGENT, 3, 6), Err("users".into()));
+    assert_eq!(fits(AgentConfig { identity: Identity::Onehot, ..SET }, 3, 50), Ok(()));
+    assert_eq!(fits(AgentConfig { identity: Identity::Onehot, ..SET }, 4, 5), Err("uavs".into()));
+    assert_eq!(fits(SET, 40, 200), Ok(()));
+    assert_eq!(fits(SET, 0, 5), Err("uavs".into()));
+}
