@@ -177,4 +177,15 @@ mod tests {
         assert_eq!(digest(r#"{"seed": 2, "threads": 1}"#), digest(r#"{"threads":1.0,"seed":2.0}"#));
         assert_ne!(digest(r#"{"seed": 2}"#), digest(r#"{"seed": 3}"#));
     }
+
+    #[test]
+    fn a_configuration_survives_json_to_the_bit() {
+        // Numbers whose shortest decimal form has more than 2^53 units: the ones that hasty parsers round twice.
+        let text = r#"{"environment": {"slots": 11, "speed": 0.09232400000000001}, "training": {"gamma": 0.9232400000000001}}"#;
+        let config = parse(serde_json::from_str(text).unwrap(), 2).unwrap().spec.config;
+        assert_eq!(config.training.gamma, 0.923_240_000_000_000_1);
+        assert_eq!(config.environment.reward_scale, Some(1.0 / 11.0));
+        let again: TrainConfig = serde_json::from_str(&serde_json::to_string(&config).unwrap()).unwrap();
+        assert_eq!(again, config);
+    }
 }

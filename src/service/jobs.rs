@@ -3,7 +3,7 @@
 use serde_json::Value;
 use uuid::Uuid;
 
-use super::{App, Error};
+use super::{App, Error, policies};
 use crate::invalid::{Invalid, in_range};
 use crate::jobs::spec;
 use crate::store::{
@@ -32,6 +32,10 @@ pub async fn submit(app: &App, document: Value, key: Option<String>) -> Result<(
         }
     }
     let request = spec::parse(document, app.jobs.settings().cpu_budget)?;
+    if let Some(name) = &request.spec.name {
+        // Found out now rather than when the policy is trained.
+        policies::check_publishable(name)?;
+    }
     app.admit()?;
     let id = JobId(Uuid::now_v7());
     let idempotency = key.map(|key| (key, request.digest));

@@ -50,16 +50,25 @@ fn describe(app: &App, policy: Arc<LoadedPolicy>) -> Described {
     Described { policy, aliases, versions }
 }
 
+/// Checks that policies may be published as `name`.
+///
+/// # Errors
+/// A name that no policy can have, or a baseline's.
+pub fn check_publishable(name: &str) -> Result<(), Invalid> {
+    check_name("name", name)?;
+    if baselines::LIST.iter().any(|baseline| baseline.name == name) {
+        return Err(Invalid::new("name", format!("{name:?}"), "a name that is not a baseline's"));
+    }
+    Ok(())
+}
+
 /// Stores a checkpoint (safetensors) as the next version of policy `name` and serves it. Equal bytes under the same name are
 /// the version that they already are.
 ///
 /// # Errors
 /// A name that cannot be used, bytes that are no checkpoint, a database that fails.
 pub async fn publish(app: &App, name: &str, bytes: Vec<u8>) -> Result<PolicyRef, Error> {
-    check_name("name", name)?;
-    if baselines::LIST.iter().any(|baseline| baseline.name == name) {
-        return Err(Invalid::new("name", format!("{name:?}"), "a name that is not a baseline's").into());
-    }
+    check_publishable(name)?;
     let (checkpoint, bytes) = read(bytes).await?;
     let digest: [u8; 32] = Sha256::digest(&bytes).into();
     let mut reference = PolicyRef { name: name.to_owned(), version: 0, digest };

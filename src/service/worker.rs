@@ -3,11 +3,11 @@
 use sha2::{Digest, Sha256};
 use uuid::Uuid;
 
-use super::{App, Error};
+use super::{App, Error, policies};
 use crate::invalid::{Invalid, in_range};
 use crate::jobs::{Directive, equal_secrets, hex, token_digest};
 use crate::recipe::TrainConfig;
-use crate::store::{Ending, JobId, Lease, Metric, NewCheckpoint, OpenSnapshot, Snapshot};
+use crate::store::{Ending, JobId, Lease, Metric, NewCheckpoint, OpenSnapshot, Snapshot, Wanted};
 
 /// Largest piece of an upload, in bytes.
 pub const CHUNK: usize = 1 << 20;
@@ -145,13 +145,13 @@ pub async fn heartbeat(app: &App, lease: Lease) -> Result<Directive, Error> {
     Ok(app.jobs.directive(job.wanted))
 }
 
-/// Ends the attempt. A job that is done is published: its best policy, or its last where none was evaluated.
+/// Ends the attempt. A job that is done is published: its best policy.
 ///
 /// # Errors
 /// The attempt is over, or the checkpoint cannot be published.
 pub async fn finish(app: &App, lease: Lease, finish: Finish) -> Result<(), Error> {
     let ending = match finish {
-        Finish::Succeeded => Ending::Succeeded(None),
+        Finish::Succeeded => succeed(app, lease).await?,
         Finish::Stopped => Ending::Stopped,
         Finish::Failed { reason, permanent } => {
             let reason = reason.chars().take(2000).collect();
@@ -162,6 +162,25 @@ pub async fn finish(app: &App, lease: Lease, finish: Finish) -> Result<(), Error
     tracing::info!(job = %job.id, attempt = lease.attempt, state = %job.state, reason = job.reason, "attempt over");
     app.jobs.changed(lease.job);
     Ok(())
+}
+
+/// Publishes what a job has made, unless it was cancelled meanwhile. Publishing the same again changes nothing, so a
+/// server that dies in between loses nothing.
+async fn succeed(app: &App, lease: Lease) -> Result<Ending, Error> {
+    let job = app.store.job(lease.id).await?.ok_or_else(|| fenced(lease))?;
+    if job.wanted == Some(Wanted::Cancel) {
+        return Ok(Ending::Stopped);
+    }
+    let Some(checkpoint) = app.store.best_checkpoint(lease.id).await? else { return Ok(Ending::Succeeded(None)) };
+    // The tail of an id is random; its head is the time, which jobs sent together share.
+    let id = lease.id.to_string();
+    let name = job.spec.name.unwrap_or_else(|| format!("job-{}", &id[id.len() - 8..]));
+    match policies::publish(app, &name, checkpoint).await {
+        Ok(policy) => Ok(Ending::Succeeded(Some(policy.to_string()))),
+        // The same checkpoint would be refused again.
+        Err(Error::Invalid(e)) => Ok(Ending::Failed { reason: format!("its policy cannot be published: {e}"), max_attempts: 1 }),
+        Err(e) => Err(e),
+    }
 }
 
 /// What an upload announces.

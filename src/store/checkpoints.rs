@@ -151,6 +151,16 @@ impl Store {
         rows.into_iter().map(Checkpoint::try_from).collect()
     }
 
+    /// Bytes of a job's best checkpoint, or of its last where there is no best.
+    ///
+    /// # Errors
+    /// The database.
+    pub async fn best_checkpoint(&self, job: JobId) -> Result<Option<Vec<u8>>> {
+        let sql = "SELECT c.bytes FROM checkpoints c JOIN jobs j ON j.number = c.job
+                   WHERE j.id = ? ORDER BY c.kind = 'best' DESC LIMIT 1";
+        Ok(sqlx::query_scalar(sql).bind(job.to_string()).fetch_optional(&self.read).await?)
+    }
+
     /// One checkpoint and its bytes.
     ///
     /// # Errors

@@ -211,6 +211,10 @@ async fn a_job_runs_to_its_end_in_a_worker() {
     assert_eq!(Checkpoint::from_bytes(&bytes).unwrap(), best);
     assert_eq!(found["metrics"]["eval/mean_aoi"], json!(best.metrics().unwrap().mean_aoi));
     assert!(list.iter().any(|c| c["kind"] == "last" && c["step"] == 24_000));
+    let policy = format!("job-{}:1", &id[id.len() - 8..]);
+    assert_eq!(done["policy"], policy);
+    let policy = rest.get(&format!("/v1/policies/{policy}")).await;
+    assert_eq!(policy["ref"]["digest"], found["sha256"], "{policy}");
     no_worker(&id).await;
 }
 

@@ -50,6 +50,7 @@ async fn malformed_requests_get_the_error_of_the_table() {
         ("{\"threads\": \"two\"}", 422, "invalid_schema"),
         ("{\"threads\": 3}", 400, "invalid_argument"),
         ("{\"kind\": \"sweep\"}", 400, "invalid_argument"),
+        ("{\"name\": \"random\"}", 400, "invalid_argument"),
         ("{\"environment\": {\"uavs\": 0}}", 400, "invalid_argument"),
     ];
     for (body, status, code) in cases {
