@@ -88,7 +88,7 @@ fn kind_of(value: &Value) -> &'static str {
 fn integers(value: &mut Value) {
     match value {
         Value::Number(number) => {
-            let float = number.as_f64().filter(|x| number.is_f64() && x.trunc() == *x && x.abs() <= EXACT as f64);
+            let float = number.as_f64().filter(|x| number.is_f64() && x.fract() == 0.0 && x.abs() <= EXACT as f64);
             if let Some(float) = float {
                 *value = Value::from(float as i64);
             }

@@ -66,7 +66,7 @@ pub struct Server {
     pub rest: Rest,
     pub grpc: String,
     pub workers: mpsc::UnboundedReceiver<Worker>,
-    server: JoinHandle<()>,
+    running: JoinHandle<()>,
 }
 
 impl Deref for Server {
@@ -162,7 +162,7 @@ impl Server {
             draining: Draining::default(),
         });
         let serving = Arc::clone(&app);
-        let server = tokio::spawn(async move {
+        let running = tokio::spawn(async move {
             server::run(&config, &data, serving, listeners, std::future::pending()).await.unwrap();
         });
         Self {
@@ -170,15 +170,15 @@ impl Server {
             rest: Rest::new(format!("http://{}", endpoints.http)),
             grpc: format!("http://{}", endpoints.grpc),
             workers,
-            server,
+            running,
         }
     }
 
     /// The end of the server, without any chance to clean up.
     pub async fn crash(&mut self) {
-        self.server.abort();
+        self.running.abort();
         // Aborted: that is its result.
-        let _ = (&mut self.server).await;
+        let _ = (&mut self.running).await;
     }
 
     /// The next worker that is started.

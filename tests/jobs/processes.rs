@@ -9,7 +9,7 @@ use std::time::Duration;
 use qedgix::checkpoint::Checkpoint;
 use qedgix::env::EpisodeMetrics;
 use qedgix::jobs::{LocalProcess, hex};
-use qedgix::learner::{Event, TrainConfig, Trainer, evaluate, layouts};
+use qedgix::learner::{Event, Preset, TrainConfig, Trainer, evaluate, layouts};
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
@@ -136,7 +136,7 @@ fn undisturbed(spec: &Value) -> (Rows, Checkpoint) {
     let algorithm = serde_json::from_value(spec["algorithm"].clone()).unwrap();
     let (environment, training) = (object("environment"), object("training"));
     let seed = spec["seed"].as_u64().unwrap();
-    let config = TrainConfig::resolve(algorithm, Default::default(), &environment, &training, seed).unwrap();
+    let config = TrainConfig::resolve(algorithm, Preset::default(), &environment, &training, seed).unwrap();
     let reference = |checkpoint: &Checkpoint| {
         let seeds = layouts("eval-v1").unwrap().seeds(256);
         EpisodeMetrics::mean(&evaluate(&checkpoint.policy(), &config.environment, &seeds, 1).unwrap()).mean_aoi

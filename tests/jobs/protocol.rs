@@ -112,7 +112,7 @@ async fn a_snapshot_comes_back_as_it_went_and_a_broken_one_changes_nothing() {
     let absent = client.download_snapshot(sign(&worker, v1::DownloadSnapshotRequest {})).await.unwrap_err();
     assert_eq!(absent.code(), Code::NotFound);
 
-    let bytes: Vec<u8> = (0..3_500_000_u32).map(|i| (i * i >> 7) as u8).collect();
+    let bytes: Vec<u8> = (0..3_500_000_u32).map(|i| (i.wrapping_mul(i) >> 7) as u8).collect();
     let sha256 = hex(&Sha256::digest(&bytes));
     client.upload_snapshot(sign(&worker, snapshot(100, &bytes, sha256.clone()))).await.unwrap();
     client.upload_snapshot(sign(&worker, snapshot(200, &bytes, sha256))).await.unwrap();
