@@ -50,7 +50,7 @@ pub enum Error {
 pub struct Store {
     /// Readers; WAL lets them go on while somebody writes.
     read: SqlitePool,
-    /// A single connection: writers queue here instead of meeting SQLITE_BUSY.
+    /// A single connection: writers queue here instead of meeting `SQLITE_BUSY`.
     write: SqlitePool,
 }
 
