@@ -29,7 +29,7 @@ pub struct DemoArgs {
     #[arg(long)]
     keep: bool,
     /// Environment steps of the training job
-    #[arg(long, env = "QEDGIX_STEPS", default_value_t = 60_000)]
+    #[arg(long, env = "QEDGIX_STEPS", default_value_t = 100_000)]
     steps: u64,
     /// Layouts of eval-v1 that every policy flies
     #[arg(long, env = "QEDGIX_EPISODES", default_value_t = 32)]
@@ -88,7 +88,7 @@ async fn story(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
     let client = Client::new(&server.http.to_string())?;
     let job = json!({
         "name": JOB,
-        "algorithm": Algorithm::Qmix,
+        "algorithm": Algorithm::Qedgix,
         "preset": "practical",
         "environment": {},
         "training": {"steps": args.steps, "eval_every": (args.steps / 12).max(1)},
@@ -148,7 +148,7 @@ impl Flight {
 async fn tell_curve(client: &Client, id: &str) -> anyhow::Result<()> {
     let answer = client.get(&format!("/v1/jobs/{id}/metrics?name=eval/mean_aoi")).await?;
     let values: Vec<f64> =
-        answer["rows"].as_array().into_iter().flatten().filter_map(|row: &Value| row["value"].as_f64()).collect();
+        answer["metrics"].as_array().into_iter().flatten().filter_map(|row: &Value| row["value"].as_f64()).collect();
     let (first, last) = values.first().zip(values.last()).context("the job reported no evaluation")?;
     println!("   job {id} succeeded; validation mean AoI {first:.1} {} {last:.1}", table::sparkline(&values));
     Ok(())

@@ -29,8 +29,15 @@ pub fn of_policies(rows: &[(String, Summary)]) -> Table {
     table
 }
 
-/// A learning curve in one line, lowest value lowest.
+/// A learning curve in one line of at most 40 characters, lowest value lowest.
 pub fn sparkline(values: &[f64]) -> String {
+    const WIDTH: usize = 40;
+    let values: Vec<f64> = if values.len() > WIDTH {
+        let shares = (0..WIDTH).map(|i| &values[i * values.len() / WIDTH..(i + 1) * values.len() / WIDTH]);
+        shares.map(|share| share.iter().sum::<f64>() / share.len() as f64).collect()
+    } else {
+        values.to_vec()
+    };
     const LEVELS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
     let low = values.iter().copied().fold(f64::INFINITY, f64::min);
     let high = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
@@ -47,5 +54,8 @@ mod tests {
         assert_eq!(sparkline(&[3.0, 1.0, 2.0]), "█▁▅");
         assert_eq!(sparkline(&[5.0, 5.0]), "▁▁");
         assert_eq!(sparkline(&[]), "");
+        let long: Vec<f64> = (0..1000).map(f64::from).collect();
+        assert_eq!(sparkline(&long).chars().count(), 40);
+        assert!(sparkline(&long).starts_with('▁') && sparkline(&long).ends_with('█'));
     }
 }

@@ -78,10 +78,10 @@ pub async fn run(args: TrainArgs) -> anyhow::Result<()> {
 pub async fn submit(client: &Client, job: &Value) -> anyhow::Result<Value> {
     let accepted = client.post("/v1/jobs", job).await?;
     let id = accepted["id"].as_str().context("the server's answer has no job id")?;
-    let bar = progress::bar(accepted["steps"].as_u64().unwrap_or(0), "steps");
+    let bar = progress::bar(accepted["progress"]["steps"].as_u64().unwrap_or(0), "steps");
     let ended = client
         .wait_for_job(id, |job| {
-            bar.set_position(job["step"].as_u64().unwrap_or(0));
+            bar.set_position(job["progress"]["step"].as_u64().unwrap_or(0));
             bar.set_message(job["state"].as_str().unwrap_or("?").to_owned());
         })
         .await;
