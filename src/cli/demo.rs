@@ -88,7 +88,7 @@ async fn story(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
     let client = Client::new(&server.http.to_string())?;
     let job = json!({
         "name": JOB,
-        "algorithm": Algorithm::Qedgix,
+        "algorithm": Algorithm::Qmix,
         "preset": "practical",
         "environment": {},
         "training": {"steps": args.steps, "eval_every": (args.steps / 12).max(1)},
