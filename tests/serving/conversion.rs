@@ -171,6 +171,21 @@ proptest! {
         }
     }
 
+    /// Callers may forge the memory that they keep.
+    #[test]
+    fn arbitrary_memory_is_flown(values in prop::collection::vec(number(), 400), step in any::<u64>(), seed in 0..50_u64) {
+        let sent: Observation = scene(3, 5, seed).try_into().unwrap();
+        for baseline in &LIST {
+            let policy = by_name(baseline.name, World::default()).unwrap();
+            let slot = slot_of(sent.clone(), &*policy);
+            let len = policy.memory_len(3, 5);
+            let mut memory: Vec<f32> = values.iter().cycle().take(len).map(|&x| x as f32).collect();
+            let mut headings = vec![0; 3];
+            policy.act(&mut [Turn { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
+            prop_assert!(headings.iter().all(|&h| usize::from(h) < policy.actions()));
+        }
+    }
+
     #[test]
     fn arbitrary_documents_never_panic(body in "\\PC{0,60}") {
         let _ = qedgix::api::rest::extract::parse::<serde_json::Value>(body.as_bytes());

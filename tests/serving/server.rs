@@ -111,3 +111,59 @@ fn settings_are_checked() {
     (open.insecure, open.http_addr) = (true, "0.0.0.0:80".parse().unwrap());
     assert!(open.validate().is_ok());
 }
+
+/// Starts the binary; it is killed when dropped.
+struct Process(std::process::Child);
+
+impl Process {
+    fn start(dir: &std::path::Path, flags: &[&str]) -> Self {
+        let child = std::process::Command::new(env!("CARGO_BIN_EXE_qedgix"))
+            .args(["serve", "--grpc-addr", "127.0.0.1:0"])
+            .args(flags)
+            .env("QEDGIX_HTTP_ADDR", "127.0.0.1:0")
+            .env("QEDGIX_DATA_DIR", dir)
+            .stdout(std::process::Stdio::piped())
+            .stderr(std::process::Stdio::piped())
+            .spawn();
+        Self(child.unwrap())
+    }
+
+    /// Waits for its end: exit code and standard error.
+    fn ended(mut self) -> (Option<i32>, String) {
+        let mut text = String::new();
+        std::io::Read::read_to_string(self.0.stderr.as_mut().unwrap(), &mut text).unwrap();
+        (self.0.wait().unwrap().code(), text)
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+#[test]
+fn the_binary_says_where_it_listens_and_ends_well_on_sigterm() {
+    use std::io::BufRead;
+    let dir = tempfile::tempdir().unwrap();
+    let mut first = Process::start(dir.path(), &[]);
+    let mut told = std::io::BufReader::new(first.0.stdout.take().unwrap()).lines().map(Result::unwrap);
+    assert!(told.next().unwrap().starts_with("qedgix "));
+    let grpc = told.next().unwrap();
+    assert!(grpc.starts_with("gRPC  127.0.0.1:") && !grpc.ends_with(":0"), "{grpc}");
+    assert!(told.next().unwrap().starts_with("REST  http://127.0.0.1:"));
+
+    let (code, text) = Process::start(dir.path(), &[]).ended();
+    assert_eq!(code, Some(1));
+    assert!(text.contains("in use by another qedgix server"), "{text}");
+    let (code, text) = Process::start(dir.path(), &["--http-addr=0.0.0.0:0"]).ended();
+    assert_eq!(code, Some(1));
+    assert!(text.contains("--http-addr") && text.contains("--insecure"), "{text}");
+
+    let signalled = std::process::Command::new("kill").args(["-TERM", &first.0.id().to_string()]).status().unwrap();
+    assert!(signalled.success());
+    let (code, text) = first.ended();
+    assert_eq!(code, Some(0), "{text}");
+    assert!(text.contains("draining") && text.contains("stopped"), "{text}");
+}
