@@ -22,7 +22,7 @@ use crate::api::{grpc, rest};
 use crate::config::Config;
 use crate::invalid::Invalid;
 use crate::jobs::{Jobs, LocalProcess, Settings};
-use crate::service::{App, policies};
+use crate::service::{App, Draining, policies};
 use crate::serving::{Clock, Engine, Registry, Sessions, SessionsConfig};
 use crate::store::{self, Store};
 use crate::telemetry;
@@ -179,7 +179,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         sessions: Sessions::new(sessions, clock.clone()),
         engine: Engine::start(config.engine_threads, config.engine_queue).map_err(Error::Engine)?,
         clock,
-        draining: Default::default(),
+        draining: Draining::default(),
     };
     policies::load(&app).await.map_err(Error::Policies)?;
     Ok(Arc::new(app))

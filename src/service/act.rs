@@ -129,13 +129,12 @@ async fn with_held_state(app: &App, state: &[u8], request: Request, deadline: Op
         let message = format!("step {sent} does not go with this recurrent_state, which is of step {step}");
         return Err(Error::Precondition { code: "wrong_step", message });
     }
-    let memory = match held {
-        Some(held) => memory_of(held, &fleet, &policy)?,
-        None => {
-            let mut memory = vec![0.0; policy.policy.memory_len(slot.uavs(), slot.users())];
-            policy.policy.start(slot.uavs(), slot.users(), request.seed.unwrap_or(0), &mut memory);
-            memory
-        }
+    let memory = if let Some(held) = held {
+        memory_of(held, &fleet, &policy)?
+    } else {
+        let mut memory = vec![0.0; policy.policy.memory_len(slot.uavs(), slot.users())];
+        policy.policy.start(slot.uavs(), slot.users(), request.seed.unwrap_or(0), &mut memory);
+        memory
     };
     let outcome = compute(app, Task { policy: policy.clone(), slot, step, memory }, deadline).await?;
     let next = HeldState::new(policy.reference.digest, step.saturating_add(1), &fleet, outcome.memory);

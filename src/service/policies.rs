@@ -76,7 +76,7 @@ pub async fn publish(app: &App, name: &str, bytes: Vec<u8>) -> Result<PolicyRef,
         NewPolicyVersion { name, digest: &reference.digest_hex(), checkpoint: &bytes, now: app.clock.now().as_millisecond() };
     let (version, created_at) = app.store.publish_policy(new).await?;
     reference.version = version;
-    app.registry.insert(learned(reference.clone(), checkpoint, created_at));
+    app.registry.insert(learned(reference.clone(), &checkpoint, created_at));
     tracing::info!(policy = %reference, digest = reference.digest_hex(), "published");
     Ok(reference)
 }
@@ -113,7 +113,7 @@ pub async fn load(app: &App) -> Result<(), Error> {
             continue;
         }
         match Checkpoint::from_bytes(&stored.checkpoint) {
-            Ok(checkpoint) => drop(app.registry.insert(learned(reference, checkpoint, stored.created_at))),
+            Ok(checkpoint) => drop(app.registry.insert(learned(reference, &checkpoint, stored.created_at))),
             Err(error) => tracing::error!(policy = %reference, %error, "its checkpoint cannot be read"),
         }
     }
@@ -135,7 +135,7 @@ async fn read(bytes: Vec<u8>) -> Result<(Checkpoint, Vec<u8>), Error> {
     Ok((checkpoint.map_err(refused)?, bytes))
 }
 
-fn learned(reference: PolicyRef, checkpoint: Checkpoint, created_at: i64) -> LoadedPolicy {
+fn learned(reference: PolicyRef, checkpoint: &Checkpoint, created_at: i64) -> LoadedPolicy {
     let config = checkpoint.config();
     let (environment, training) = (&config.environment, &config.training);
     let flat = training.observation == Observation::Flat;

@@ -4,7 +4,7 @@
 //! the ids (16), memory (4 each), first 8 bytes of the SHA-256 of all that. A checksum, not a signature: it finds
 //! accidents; whoever forges a state harms only the fleet that flies with it.
 
-use bytes::{BufMut, Bytes, BytesMut};
+use bytes::{Buf, BufMut, Bytes, BytesMut};
 use sha2::{Digest, Sha256};
 
 use super::Fleet;
@@ -77,16 +77,14 @@ impl HeldState {
         if body[4] != FORMAT {
             return Err(wrong(format!("format {}", body[4])));
         }
-        let array = |at: usize| -> [u8; 4] { body[at..at + 4].try_into().expect("four bytes") };
-        let (header, memory) = body.split_at(HEADER);
-        Ok(Self {
-            digest: header[5..37].try_into().expect("32 bytes"),
-            step: u64::from_le_bytes(header[37..45].try_into().expect("8 bytes")),
-            uavs: u32::from_le_bytes(array(45)),
-            users: u32::from_le_bytes(array(49)),
-            fleet: header[53..69].try_into().expect("16 bytes"),
-            memory: memory.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().expect("4 bytes"))).collect(),
-        })
+        let (mut digest, mut fleet) = ([0; 32], [0; 16]);
+        let mut rest = &body[MAGIC.len() + 1..];
+        rest.copy_to_slice(&mut digest);
+        let step = rest.get_u64_le();
+        let (uavs, users) = (rest.get_u32_le(), rest.get_u32_le());
+        rest.copy_to_slice(&mut fleet);
+        let memory = rest.chunks_exact(4).map(|mut value| value.get_f32_le()).collect();
+        Ok(Self { digest, step, uavs, users, fleet, memory })
     }
 }
 

@@ -253,16 +253,13 @@ async fn a_full_queue_is_said_and_empties() {
     };
     let first = attempt();
     gate.reached(1).await;
-    let (answered, waiting) = match soon(futures::future::select(attempt(), attempt())).await {
-        futures::future::Either::Left(pair) => pair,
-        futures::future::Either::Right(pair) => pair,
-    };
+    let (answered, _, mut waiting) = soon(futures::future::select_all([attempt(), attempt()])).await;
     let status = answered.unwrap().unwrap_err();
     assert_eq!(status.code(), Code::ResourceExhausted);
     assert_eq!(status.metadata().get("retry-after").unwrap(), "1");
     gate.open();
     assert!(soon(first).await.unwrap().is_ok());
-    assert!(soon(waiting).await.unwrap().is_ok());
+    assert!(soon(waiting.remove(0)).await.unwrap().is_ok());
 }
 
 #[tokio::test]

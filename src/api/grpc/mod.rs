@@ -19,6 +19,8 @@ use crate::wire::{DESCRIPTORS, v1};
 pub const SERVICES: &[&str] =
     &[v1::policy_service_server::SERVICE_NAME, v1::job_service_server::SERVICE_NAME, v1::worker_service_server::SERVICE_NAME];
 
+const BUILT_IN: &str = "the descriptors are built into the program";
+
 /// All services. A message larger than `max_message` bytes is refused.
 ///
 /// # Panics
@@ -28,7 +30,6 @@ pub fn routes<H: Health>(app: &Arc<App>, health: HealthServer<H>, max_message: u
         let builder = tonic_reflection::server::Builder::configure().register_encoded_file_descriptor_set(DESCRIPTORS);
         builder.register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
-    const BUILT_IN: &str = "the descriptors are built into the program";
     let mut routes = Routes::builder();
     routes
         .add_service(policy::service(app.clone()).max_decoding_message_size(max_message))

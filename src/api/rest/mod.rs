@@ -12,7 +12,7 @@ use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
 
 use axum::Router;
-use axum::extract::{MatchedPath, Request};
+use axum::extract::{MatchedPath, Request, State};
 use axum::http::StatusCode;
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
@@ -31,7 +31,7 @@ pub fn router(app: Arc<App>, metrics: PrometheusHandle, max_body: usize) -> Rout
         .route("/", get(ops::index))
         .route("/livez", get(ops::live))
         .route("/readyz", get(ops::ready))
-        .route("/metrics", get(move |app| ops::metrics(metrics.clone(), app)))
+        .route("/metrics", get(async move |State(app): State<Arc<App>>| ops::metrics(&metrics, &app)))
         .route("/v1/act", post(act::act))
         .route("/v1/sessions", post(sessions::open).get(sessions::list))
         .route("/v1/sessions/{id}", get(sessions::get).delete(sessions::close))

@@ -43,7 +43,7 @@ pub(super) async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, E
 }
 
 /// Prometheus text.
-pub(super) async fn metrics(handle: PrometheusHandle, State(app): State<Arc<App>>) -> impl IntoResponse {
+pub(super) fn metrics(handle: &PrometheusHandle, app: &App) -> impl IntoResponse + use<> {
     metrics::gauge!("qedgix_sessions").set(app.sessions.len() as f64);
     metrics::gauge!("qedgix_policy_versions").set(app.registry.len() as f64);
     ([(header::CONTENT_TYPE, "text/plain; version=0.0.4")], handle.render())

@@ -64,7 +64,8 @@ struct Timings {
 
 #[derive(Debug, Serialize)]
 pub(super) struct Session {
-    session_id: String,
+    #[serde(rename = "session_id")]
+    id: String,
     policy: Option<PolicyRef>,
     steps: u64,
     opened_at: Option<String>,
@@ -123,7 +124,7 @@ impl From<v1::PolicyRef> for PolicyRef {
 impl From<v1::Session> for Session {
     fn from(session: v1::Session) -> Self {
         Self {
-            session_id: session.session_id,
+            id: session.session_id,
             policy: session.policy.map(Into::into),
             steps: session.steps,
             opened_at: session.opened_at.and_then(|t| time(&t)),

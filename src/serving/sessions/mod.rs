@@ -112,23 +112,25 @@ impl Sessions {
         let id = how.id.clone().unwrap_or_else(|| Uuid::now_v7().to_string());
         let existing = {
             let mut table = self.write();
-            let existing = table.open.get(&id).cloned().filter(|session| !session.idle_longer_than(self.config.ttl, now));
-            if existing.is_none() {
-                if table.open.len() >= self.config.max {
-                    self.sweep_table(&mut table, now);
-                }
-                if table.open.len() >= self.config.max {
-                    return Err(Error::Busy(format!("{} sessions are open, the most this server holds", self.config.max)));
-                }
-                table.expired.remove(&id);
-                let session = Arc::new(Session::new(id.clone(), policy.clone(), &how, self.clock.clone()));
-                table.open.insert(id, session.clone());
-                return Ok(self.info(&session));
+            match table.open.get(&id).cloned().filter(|session| !session.idle_longer_than(self.config.ttl, now)) {
+                Some(existing) => existing,
+                None => return self.add(&mut table, policy, id, &how),
             }
-            existing
         };
-        let session = existing.expect("otherwise returned above");
-        session.reopen(&policy, &how).await?;
+        existing.reopen(&policy, &how).await?;
+        Ok(self.info(&existing))
+    }
+
+    fn add(&self, table: &mut Table, policy: Arc<LoadedPolicy>, id: String, how: &Opened) -> Result<SessionInfo, Error> {
+        if table.open.len() >= self.config.max {
+            self.sweep_table(table, self.clock.now());
+        }
+        if table.open.len() >= self.config.max {
+            return Err(Error::Busy(format!("{} sessions are open, the most this server holds", self.config.max)));
+        }
+        table.expired.remove(&id);
+        let session = Arc::new(Session::new(id.clone(), policy, how, self.clock.clone()));
+        table.open.insert(id, session.clone());
         Ok(self.info(&session))
     }
 

@@ -3,7 +3,7 @@ use std::sync::Mutex;
 use super::*;
 use crate::invalid::Invalid;
 use crate::policy::{Needs, Policy};
-use crate::serving::{Fleet, Kind, Outcome};
+use crate::serving::{Fleet, Kind, Outcome, Timings};
 
 struct Nothing;
 
@@ -86,8 +86,6 @@ async fn fly(session: &Session, step: Option<u64>, run: Option<&str>) -> Result<
     }
 }
 
-use crate::serving::Timings;
-
 #[tokio::test]
 async fn steps_follow_each_other_and_the_last_may_be_repeated() {
     let (sessions, _) = sessions(10);
@@ -156,7 +154,7 @@ async fn opening_twice_is_a_retry_only_if_nothing_differs() {
     assert_eq!(code(&sessions.open(policy("q"), named("s")).await.unwrap_err()), "exists");
     let seeded = Opened { seed: Some(1), ..named("s") };
     assert_eq!(code(&sessions.open(policy("p"), seeded).await.unwrap_err()), "exists");
-    fly(&*sessions.get("s").unwrap(), None, None).await.unwrap();
+    fly(&sessions.get("s").unwrap(), None, None).await.unwrap();
     assert_eq!(code(&sessions.open(policy("p"), named("s")).await.unwrap_err()), "exists");
     assert_ne!(sessions.open(policy("p"), Opened::default()).await.unwrap().id, "s");
 }
