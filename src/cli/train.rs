@@ -117,9 +117,9 @@ fn train(args: &TrainArgs, mut trainer: Trainer, threads: usize) -> anyhow::Resu
                 let line = format!("step {step:>8}  mean AoI {:6.2}  {}", metrics.mean_aoi, table::sparkline(&evaluations));
                 // Where nobody sees the bar, the line is the progress.
                 if bar.is_hidden() {
-                    eprintln!("{line}")
+                    eprintln!("{line}");
                 } else {
-                    bar.println(line)
+                    bar.println(line);
                 }
                 if let Some(path) = &args.snapshot {
                     write_whole(path, &trainer.snapshot())?;
