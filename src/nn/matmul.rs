@@ -104,10 +104,15 @@ impl<T: Real> WithSimd for Product<'_, T> {
             while j < self.n {
                 let left = self.n - j;
                 let width = left.min(2 * lanes);
-                if left > lanes {
-                    self.columns::<S, 2>(simd, k0, depth, j, width);
+                // Whole vectors have widths known to the compiler, so that only the last columns pay for masks.
+                if left >= 2 * lanes {
+                    self.columns::<S, 2>(simd, k0, depth, j, 2 * lanes);
+                } else if left == lanes {
+                    self.columns::<S, 1>(simd, k0, depth, j, lanes);
+                } else if left > lanes {
+                    self.columns::<S, 2>(simd, k0, depth, j, left);
                 } else {
-                    self.columns::<S, 1>(simd, k0, depth, j, width);
+                    self.columns::<S, 1>(simd, k0, depth, j, left);
                 }
                 j += width;
             }
