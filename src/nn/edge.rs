@@ -138,16 +138,11 @@ impl EdgeNet {
         da.reset(W, nodes);
         du.reset(W, nodes);
         dv.reset_zero(W, x.len);
-        let bias = self.last.bias_grad(grads);
-        for (i, dy) in dy.as_mut_slice().chunks_exact_mut(H).enumerate() {
-            match graph.degree(i) {
-                0 => dy.fill(T::ZERO),
-                degree => {
-                    let times = if self.mean { T::ONE } else { T::of(degree as f64) };
-                    bias.iter_mut().zip(dy).for_each(|(g, &mut d)| *g += times * d);
-                }
-            }
-        }
+        let bias: &mut [T; H] = self.last.bias_grad(grads).try_into().expect("H numbers");
+        simd(
+            #[inline(always)]
+            || last_bias_back(graph, self.mean, dy.as_mut_slice().as_chunks_mut().0, bias),
+        );
         self.last.backward_part((0, W), cache.a.rows(), dy.rows(), grads);
         self.last.backward_input(flat, (0, W), dy.rows(), da.rows_mut(), Start::Zero);
 
@@ -166,13 +161,32 @@ impl EdgeNet {
         self.first.backward_part((0, H), x, du.rows(), grads);
         if self.pairing == Pairing::Difference {
             // u takes Wa - Wb and v takes Wb, so Wb sees dv - du.
-            let (dv, du) = (dv.as_mut_slice().iter_mut(), du.as_slice());
-            dv.zip(du).for_each(|(v, &u)| *v -= u);
+            let (dv, du) = (dv.as_mut_slice(), du.as_slice());
+            simd(
+                #[inline(always)]
+                || dv.iter_mut().zip(du).for_each(|(v, &u)| *v -= u),
+            );
         }
         self.first.backward_part((H, H), x, dv.rows(), grads);
         dx.reset(H, x.len);
         self.first.backward_input(flat, (H, H), dv.rows(), dx.rows_mut(), Start::Zero);
         self.first.backward_input(flat, (0, H), du.rows(), dx.range_mut(0..nodes), Start::Add);
+    }
+}
+
+/// Adds the gradient of the last layer's bias; nodes without neighbours, whose output is 0, lose theirs.
+#[inline(always)]
+fn last_bias_back<T: Real>(graph: &Graph, mean: bool, dy: &mut [[T; H]], bias: &mut [T; H]) {
+    for (i, dy) in dy.iter_mut().enumerate() {
+        let degree = graph.degree(i);
+        if degree == 0 {
+            *dy = [T::ZERO; H];
+            continue;
+        }
+        let times = if mean { T::ONE } else { T::of(degree as f64) };
+        for c in 0..H {
+            bias[c] = times.mul_add(dy[c], bias[c]);
+        }
     }
 }
 
