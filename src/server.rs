@@ -211,6 +211,7 @@ pub async fn run(
     let serve_grpc = tonic::transport::Server::builder()
         .http2_keepalive_interval(Some(Duration::from_secs(30)))
         .max_concurrent_streams(1024)
+        .layer(tower::util::MapRequestLayer::new(grpc::stamp))
         .add_routes(grpc::routes(&app, health_server, config.max_message_size))
         .serve_with_incoming_shutdown(TcpIncoming::from(listeners.grpc).with_nodelay(Some(true)), stop.clone().cancelled_owned());
     let http = listeners.http.tap_io(|stream| {

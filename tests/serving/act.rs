@@ -233,7 +233,10 @@ async fn policies_are_listed_in_pages() {
             break;
         }
     }
-    assert_eq!(names, ["greedy-global", "nearest", "persistent", "random", "sweep"]);
+    let bundled = qedgix::serving::bundled::BUNDLED.iter().map(|(name, _)| *name);
+    let mut expected: Vec<&str> = LIST.iter().map(|baseline| baseline.name).chain(bundled).collect();
+    expected.sort_unstable();
+    assert_eq!(names, expected);
     let mut get = async |policy: &str| client.get_policy(v1::GetPolicyRequest { policy: policy.into() }).await;
     let newest = get("sweep").await.unwrap().into_inner();
     assert_eq!((newest.r#ref.unwrap().version, newest.versions, newest.aliases.len()), (2, vec![1, 2], 0));

@@ -1,16 +1,18 @@
 //! gRPC: all services on one router, health and reflection included.
 
+mod deadline;
 mod envelope;
 mod job;
 mod policy;
 mod worker;
 
 use std::sync::Arc;
-use std::time::Instant;
 
-use tonic::Extensions;
 use tonic::service::Routes;
 use tonic_health::pb::health_server::{Health, HealthServer};
+
+pub use deadline::stamp;
+use deadline::{Deadline, deadline};
 
 use crate::service::App;
 use crate::wire::{DESCRIPTORS, v1};
@@ -40,13 +42,4 @@ pub fn routes<H: Health>(app: &Arc<App>, health: HealthServer<H>, max_message: u
         .add_service(reflection().build_v1alpha().expect(BUILT_IN));
     let router = routes.routes().into_axum_router().layer(axum::middleware::from_fn(envelope::around));
     Routes::from(router)
-}
-
-/// The moment after which the caller no longer waits.
-#[derive(Clone, Copy, Debug)]
-pub struct Deadline(pub Instant);
-
-/// The deadline of a request, from its `grpc-timeout`.
-pub fn deadline(extensions: &Extensions) -> Option<Instant> {
-    extensions.get::<Deadline>().map(|deadline| deadline.0)
 }
