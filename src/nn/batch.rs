@@ -38,7 +38,7 @@ pub struct RowsMut<'a, T> {
     pub len: usize,
 }
 
-impl<'a, T> Rows<'a, T> {
+impl<T> Rows<'_, T> {
     /// The same samples from column `from` on.
     #[must_use]
     pub fn from_column(self, from: usize) -> Self {

@@ -4,6 +4,12 @@
 //! vector described by a [`Layout`]; a layer holds offsets into it, so one network serves many threads and any scalar type.
 //! `forward` writes what `backward` needs into buffers of the caller, which are sized once and reused.
 
+// Kernels run inside a function compiled for the processor's vector units; what is not inlined into it loses them. Loops
+// over several fixed-width arrays at once read best with an index. Views are passed by value, as slices are.
+#![allow(clippy::inline_always, clippy::needless_range_loop, clippy::needless_pass_by_value)]
+// Sizes that do not fit together are the caller's bugs; every layer asserts them.
+#![allow(clippy::missing_panics_doc)]
+
 mod adam;
 mod batch;
 mod edge;

@@ -41,27 +41,34 @@ pub trait Real:
     /// Widens to f64.
     fn wide(self) -> f64;
     /// self * a + b, rounded once.
+    #[must_use]
     fn mul_add(self, a: Self, b: Self) -> Self;
     /// Square root.
+    #[must_use]
     fn sqrt(self) -> Self;
     /// e^self.
+    #[must_use]
     fn exp(self) -> Self;
     /// Hyperbolic tangent.
+    #[must_use]
     fn tanh(self) -> Self;
 
     /// Absolute value.
+    #[must_use]
     #[inline(always)]
     fn abs(self) -> Self {
         if self < Self::ZERO { -self } else { self }
     }
 
     /// 1 / (1 + e^-self).
+    #[must_use]
     #[inline(always)]
     fn sigmoid(self) -> Self {
         Self::ONE / (Self::ONE + (-self).exp())
     }
 
     /// max(self, 0).
+    #[must_use]
     #[inline(always)]
     fn relu(self) -> Self {
         if self > Self::ZERO { self } else { Self::ZERO }
@@ -137,7 +144,7 @@ impl Real for f32 {
         let p = z.mul_add(p, 2.063_908_8e-2);
         let p = z.mul_add(p, -5.373_971_6e-2);
         let p = z.mul_add(p, 1.333_144_2e-1);
-        let p = z.mul_add(p, -3.333_328_2e-1);
+        let p = z.mul_add(p, -3.333_328e-1);
         let near = (p * z).mul_add(self, self);
         let far = 1.0 - 2.0 / (Real::exp(a + a) + 1.0);
         if a < 0.625 { near } else { far.copysign(self) }

@@ -22,7 +22,7 @@ pub struct Learned {
     flat: Vec<f32>,
     turned: Vec<f32>,
     /// Buffers of calls that are over; a call takes one or makes one.
-    buffers: Mutex<Vec<Box<Buffers>>>,
+    buffers: Mutex<Vec<Buffers>>,
 }
 
 #[derive(Debug, Default)]

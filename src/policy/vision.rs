@@ -131,7 +131,7 @@ mod tests {
             // A lattice of quarters of the range puts many pairs exactly at the range.
             let mut coordinate = |i: u64| {
                 let x = spread * (rng.random::<f64>() - 0.3);
-                if i % 2 == 0 { x } else { (x / range * 4.0).round() * range / 4.0 }
+                if i.is_multiple_of(2) { x } else { (x / range * 4.0).round() * range / 4.0 }
             };
             let points: Vec<Point> = (0..n).map(|i| [coordinate(i), coordinate(i)]).collect();
             let (mut offsets, mut detections) = (vec![0], Vec::new());
