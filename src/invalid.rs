@@ -44,6 +44,19 @@ impl Invalid {
     }
 }
 
+/// What would have been accepted, from the message of a parser that says `..., expected WHAT`.
+pub fn expectation(error: &impl Display) -> String {
+    let message = error.to_string();
+    let expected = message.split_once("expected ").map_or(message.as_str(), |(_, expected)| expected);
+    match expected {
+        "usize" | "u64" | "u32" => "a whole number, 0 or more".to_owned(),
+        "i64" | "i32" => "a whole number".to_owned(),
+        "f64" => "a number".to_owned(),
+        "a boolean" => "true or false".to_owned(),
+        other => other.to_owned(),
+    }
+}
+
 /// Checks that `value` lies in `range` (NaN never does).
 ///
 /// # Errors
@@ -56,4 +69,24 @@ where
         return Ok(());
     }
     Err(Invalid::new(field, &value, format!("a number from {} to {}", range.start(), range.end())))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn expectations_read_as_sentences() {
+        let of = |message: &str| expectation(&message);
+        assert_eq!(of("invalid type: string \"3\", expected usize"), "a whole number, 0 or more");
+        assert_eq!(of("unknown variant `ppo`, expected one of `qmix`, `vdn`"), "one of `qmix`, `vdn`");
+        assert_eq!(of("something else"), "something else");
+    }
+
+    #[test]
+    fn long_values_are_cut_and_nan_is_in_no_range() {
+        assert!(Invalid::new("f", "x".repeat(1000), "less").value.len() < 130);
+        assert!(in_range("f", f64::NAN, 0.0..=1.0).is_err());
+        assert!(in_range("f", 1.0, 0.0..=1.0).is_ok());
+    }
 }

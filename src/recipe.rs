@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use serde_json::{Map, Value};
 
 use crate::env::EnvConfig;
-use crate::invalid::{Invalid, in_range};
+use crate::invalid::{Invalid, expectation, in_range};
 use crate::policy::mixer::Mixing;
 use crate::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, Observation};
 
@@ -317,7 +317,7 @@ fn overridden<T: Serialize + DeserializeOwned>(section: &str, base: &T, patch: &
         }
         fields[name] = value.clone();
         if let Err(e) = T::deserialize(&fields) {
-            return Err(Invalid::schema(format!("{section}.{key}"), value, e.to_string()));
+            return Err(Invalid::schema(format!("{section}.{key}"), value, expectation(&e)));
         }
     }
     Ok(serde_json::from_value(fields).expect("checked field by field"))

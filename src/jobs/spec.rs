@@ -6,7 +6,7 @@ use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 
-use crate::invalid::{Invalid, in_range};
+use crate::invalid::{Invalid, expectation, in_range};
 use crate::recipe::{Algorithm, Preset, TrainConfig};
 use crate::store::{JobKind, JobSpec};
 
@@ -70,7 +70,7 @@ pub fn parse(mut document: Value, cpu_budget: usize) -> Result<Request, Invalid>
 fn take<T: DeserializeOwned>(fields: &mut Map<String, Value>, name: &str, default: T) -> Result<T, Invalid> {
     match fields.remove(name) {
         None | Some(Value::Null) => Ok(default),
-        Some(value) => T::deserialize(&value).map_err(|e| Invalid::schema(name, &value, e.to_string())),
+        Some(value) => T::deserialize(&value).map_err(|e| Invalid::schema(name, &value, expectation(&e))),
     }
 }
 
