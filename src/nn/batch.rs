@@ -59,7 +59,7 @@ impl<T: Real> Batch<T> {
     /// Takes a new shape, all zeros.
     pub fn reset_zero(&mut self, width: usize, len: usize) {
         self.reset(width, len);
-        self.0.fill(T::ZERO);
+        self.as_mut_slice().fill(T::ZERO);
     }
 
     /// Numbers per sample.
