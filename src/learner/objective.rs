@@ -1,8 +1,10 @@
 //! The loss of an update and its gradient (spec 5): double Q-learning with a target network and TD(lambda).
 //!
-//!     m_k = target_mixer(Q_target(argmax_a Q(o_k, a)), s_k)
-//!     G_K = m_K,  G_k = r_k + gamma (lambda G_{k+1} + (1 - lambda) m_{k+1})
-//!     loss = mean over episodes, slots and joint values of (Q_tot - G)^2 / 2
+//! ```text
+//! m_k = target_mixer(Q_target(argmax_a Q(o_k, a)), s_k)
+//! G_K = m_K,  G_k = r_k + gamma (lambda G_{k+1} + (1 - lambda) m_{k+1})
+//! loss = mean over episodes, slots and joint values of (Q_tot - G)^2 / 2
+//! ```
 //!
 //! A batch is split into chunks of episodes whose number depends on sizes only. Each chunk's gradient is its own and they
 //! are summed in order, so the result has the same bits whatever the number of threads.

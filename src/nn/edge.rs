@@ -1,11 +1,13 @@
 //! A network on pairs of neighbours, f = Linear(2H, 96), LayerNorm, ReLU, Linear(96, H), aggregated over neighbours, in
 //! its factored form (spec 3), exact up to rounding:
 //!
-//!     EdgeConv    x'_i = agg_j f(x_i || x_j - x_i)      u_i = (Wa - Wb) x_i + b
-//!     messages    m_i  = agg_j f(x_i || x_j)            u_i = Wa x_i + b
-//!     v_j = Wb x_j                                per node: f's first Linear is linear in x_i and x_j
-//!     a_i = agg_j relu(LayerNorm(u_i + v_j))      per edge, never stored; backward recomputes it
-//!     x'_i = W' a_i + b'                          per node: f's last Linear commutes with the sum
+//! ```text
+//! EdgeConv    x'_i = agg_j f(x_i || x_j - x_i)      u_i = (Wa - Wb) x_i + b
+//! messages    m_i  = agg_j f(x_i || x_j)            u_i = Wa x_i + b
+//! v_j = Wb x_j                                per node: f's first Linear is linear in x_i and x_j
+//! a_i = agg_j relu(LayerNorm(u_i + v_j))      per edge, never stored; backward recomputes it
+//! x'_i = W' a_i + b'                          per node: f's last Linear commutes with the sum
+//! ```
 //!
 //! A node without neighbours gets 0. Nodes computed are a prefix of the nodes read (see [`Graph`]).
 

@@ -1,7 +1,9 @@
 //! `PyTorch`'s `GRUCell` over time, gates in the order reset, update, new:
 //!
-//!     r = sigmoid(Wi_r x + bi_r + Wh_r h + bh_r)      z likewise
-//!     q = Wh_n h + bh_n        n = tanh(Wi_n x + bi_n + r q)        h' = (1 - z) n + z h
+//! ```text
+//! r = sigmoid(Wi_r x + bi_r + Wh_r h + bh_r)      z likewise
+//! q = Wh_n h + bh_n        n = tanh(Wi_n x + bi_n + r q)        h' = (1 - z) n + z h
+//! ```
 //!
 //! Only Wh h walks over time; Wi x is one product over all slots, and so are all gradients of weights, from the gate
 //! gradients of all slots. Samples are time-major: slot t is samples t n .. (t + 1) n.

@@ -1,8 +1,10 @@
 //! The agent (spec 3): parameters shared by all UAVs; only the GRU walks over time.
 //!
-//!     x = relu(fc(input))        h_k = GRU(x, h_{k-1})
-//!     no graph:    Q = head(h)
-//!     with one:    y = leaky(w1 h) for UAVs, leaky(w2 obs) for users; graph layers with ReLU between; Q = head(h || y)
+//! ```text
+//! x = relu(fc(input))        h_k = GRU(x, h_{k-1})
+//! no graph:    Q = head(h)
+//! with one:    y = leaky(w1 h) for UAVs, leaky(w2 obs) for users; graph layers with ReLU between; Q = head(h || y)
+//! ```
 //!
 //! All slots of all fleets go through each layer at once. UAV rows are time-major: slot, fleet, UAV.
 

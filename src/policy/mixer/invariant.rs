@@ -1,8 +1,10 @@
 //! The permutation-invariant mixer (spec 4.2), E = 32:
 //!
-//!     g    = mean_i relu(Linear(2, 64)(P_i)) + mean_j relu(Linear(3, 64)(P_j, AoI_j / K))
-//!     w1_i = |Linear(64, E)(relu(Linear(66, 64)(P_i || g)))|      hid = ELU(sum_i q_i w1_i + Linear(64, E)(g))
-//!     Q_tot = |Linear(64, E)(relu(Linear(64, 64)(g)))| . hid + Linear(E, 1)(relu(Linear(64, E)(g)))
+//! ```text
+//! g    = mean_i relu(Linear(2, 64)(P_i)) + mean_j relu(Linear(3, 64)(P_j, AoI_j / K))
+//! w1_i = |Linear(64, E)(relu(Linear(66, 64)(P_i || g)))|      hid = ELU(sum_i q_i w1_i + Linear(64, E)(g))
+//! Q_tot = |Linear(64, E)(relu(Linear(64, 64)(g)))| . hid + Linear(E, 1)(relu(Linear(64, E)(g)))
+//! ```
 //!
 //! The share of g in w1's first layer is the same for all UAVs of a slot and computed once.
 

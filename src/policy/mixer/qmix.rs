@@ -1,8 +1,10 @@
 //! QMIX (spec 4.1), E = 32, s the flat state:
 //!
-//!     W1 = |Linear(64, M E)(relu(Linear(S, 64)(s)))|   b1 = Linear(S, E)(s)
-//!     w2 = |Linear(64, E)(relu(Linear(S, 64)(s)))|     b2 = Linear(E, 1)(relu(Linear(S, E)(s)))
-//!     Q_tot = w2 . ELU(q W1 + b1) + b2
+//! ```text
+//! W1 = |Linear(64, M E)(relu(Linear(S, 64)(s)))|   b1 = Linear(S, E)(s)
+//! w2 = |Linear(64, E)(relu(Linear(S, 64)(s)))|     b2 = Linear(E, 1)(relu(Linear(S, E)(s)))
+//! Q_tot = w2 . ELU(q W1 + b1) + b2
+//! ```
 
 use super::hyper::{Hyper, HyperCache};
 use super::{E, elu_slope, sign};
