@@ -28,7 +28,7 @@ fn update(c: &mut Criterion) {
         let batch = episodes(&config.dims(), 128, 1);
         for threads in [1, 2] {
             let mut learner = Learner::new(&config, threads).expect("threads");
-            group.bench_with_input(BenchmarkId::new(name, threads), &batch, |b, batch| b.iter(|| learner.update(batch)));
+            group.bench_with_input(BenchmarkId::new(name, threads), &batch, |b, batch| b.iter(|| learner.update(batch, 1e-3)));
         }
     }
     group.finish();

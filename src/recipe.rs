@@ -83,12 +83,24 @@ pub struct Training {
     pub self_position: bool,
     /// Whether a node is its own neighbour.
     pub self_loops: bool,
+    /// Links over which a UAV without a graph network observes: 1 is its own range, L + 1 all that L graph layers reach.
+    #[serde(default = "one")]
+    pub hops: usize,
+    /// Whether relative positions are divided by d in flat observations too, and own positions scaled to [-1, 1].
+    #[serde(default)]
+    pub normalise: bool,
     /// Mixer.
     pub mixer: MixerKind,
+    /// Factor of the initial weights of the hypernetworks' last layers.
+    #[serde(default = "unit")]
+    pub hyper_init: f64,
     /// Environment steps (slots) to train for.
     pub steps: u64,
-    /// Adam's learning rate.
+    /// Adam's learning rate at the beginning.
     pub learning_rate: f64,
+    /// Share of the learning rate that is left at the end; it falls linearly over `steps`. 1: constant.
+    #[serde(default = "unit")]
+    pub learning_rate_decay: f64,
     /// Discount.
     pub gamma: f64,
     /// lambda of TD(lambda).
@@ -109,6 +121,16 @@ pub struct Training {
     pub buffer: usize,
     /// Episodes between copies of the online networks to the targets.
     pub target_every: u64,
+    /// Share of the online networks that every update mixes into the targets, instead of copies; 0: copies.
+    #[serde(default)]
+    pub target_tau: f64,
+    /// Weights that are evaluated and published: the mean of the online weights over about this many updates, fading; 0 or
+    /// 1: the online weights themselves.
+    #[serde(default)]
+    pub average: u64,
+    /// Whether replayed episodes are turned and mirrored at random, by the eight symmetries of the square.
+    #[serde(default)]
+    pub augment: bool,
     /// Environment steps between evaluations.
     pub eval_every: u64,
     /// Episodes of an evaluation.
@@ -154,9 +176,13 @@ impl TrainConfig {
             layers: 2,
             self_position: false,
             self_loops: false,
+            hops: 1,
+            normalise: false,
             mixer: MixerKind::Invariant,
+            hyper_init: 1.0,
             steps: 2_050_000,
             learning_rate: 5e-3,
+            learning_rate_decay: 1.0,
             gamma: 0.99,
             lambda: 0.6,
             clip: 10.0,
@@ -167,6 +193,9 @@ impl TrainConfig {
             envs: 8,
             buffer: 5000,
             target_every: 200,
+            target_tau: 0.0,
+            average: 0,
+            augment: false,
             eval_every: 10_000,
             eval_episodes: 64,
         };
@@ -232,6 +261,8 @@ impl TrainConfig {
             identity: t.identity,
             self_position: t.self_position,
             self_loops: t.self_loops,
+            hops: t.hops,
+            normalise: t.normalise,
         }
     }
 
@@ -256,6 +287,13 @@ impl TrainConfig {
             return Err(Invalid::new("training.mixer", if mixes { "a mixer" } else { "none" }, expected));
         }
         let (env, t) = (&self.environment, &self.training);
+        if t.hops > 1 && self.algorithm.gnn() != Gnn::None {
+            return Err(Invalid::new(
+                "training.hops",
+                t.hops,
+                "1 for an algorithm with a graph network, whose layers are its hops",
+            ));
+        }
         let episode = (env.slots + 1) * (env.uavs * 8 + env.users * 10) + env.slots * (env.uavs + 4);
         let replay = episode.saturating_mul(t.buffer);
         if replay > LIMIT {
@@ -269,8 +307,11 @@ impl TrainConfig {
 impl Training {
     fn validate(&self) -> Result<(), Invalid> {
         in_range("layers", self.layers, 1..=8)?;
+        in_range("hops", self.hops, 1..=9)?;
+        in_range("hyper_init", self.hyper_init, 0.0..=10.0)?;
         in_range("steps", self.steps, 1..=1_000_000_000_000)?;
         in_range("learning_rate", self.learning_rate, 1e-12..=1.0)?;
+        in_range("learning_rate_decay", self.learning_rate_decay, 0.0..=1.0)?;
         in_range("gamma", self.gamma, 0.0..=1.0)?;
         in_range("lambda", self.lambda, 0.0..=1.0)?;
         in_range("clip", self.clip, 1e-9..=1e9)?;
@@ -281,6 +322,8 @@ impl Training {
         in_range("envs", self.envs, 1..=4096)?;
         in_range("buffer", self.buffer, 1..=1_000_000)?;
         in_range("target_every", self.target_every, 1..=1_000_000_000)?;
+        in_range("target_tau", self.target_tau, 0.0..=1.0)?;
+        in_range("average", self.average, 0..=1_000_000_000)?;
         in_range("eval_every", self.eval_every, 1..=1_000_000_000_000)?;
         in_range("eval_episodes", self.eval_episodes, 1..=4096)?;
         if self.buffer < self.batch {
@@ -288,6 +331,14 @@ impl Training {
         }
         Ok(())
     }
+}
+
+fn one() -> usize {
+    1
+}
+
+fn unit() -> f64 {
+    1.0
 }
 
 /// The letters of the paper, accepted for the fields they stand for.

@@ -112,6 +112,8 @@ impl Config {
             },
             self_position: flag("self_position")?,
             self_loops: flag("self_loops")?,
+            hops: 1,
+            normalise: false,
         };
         if count("token")? != TOKEN {
             return Err(format!("metadata token = {}; the specification has {TOKEN}", text("token")?));
@@ -269,7 +271,7 @@ fn check_features(config: &Config, episodes: &Episodes, tensors: &mut Tensors<'_
     let Dims { uavs: m, users: n, slots: k, detection_range: range, .. } = config.dims;
     let (b, nodes, width) = (episodes.len, m + n, 2 * m + 3 * n);
     // One layer, so that the geometry has the users' view too.
-    let wanted = GeometryConfig { range, slots: k, layers: 1, self_loops: config.agent.self_loops };
+    let wanted = GeometryConfig { range, slots: k, layers: 1, self_loops: config.agent.self_loops, hops: 1 };
     let mut geometry = Geometry::default();
     geometry.clear();
     let mut state = vec![0.0; b * (k + 1) * width];
@@ -288,7 +290,7 @@ fn check_features(config: &Config, episodes: &Episodes, tensors: &mut Tensors<'_
         let view = geometry.node(at / nodes, at % nodes);
         visible[view.node] = 1.0;
         view.detections.iter().for_each(|d| visible[d.target as usize] = 1.0);
-        flat_observation(&view, observation);
+        flat_observation(&view, 1.0, observation);
     }
     let golden = tensors.f32("out.visible", &[b, k + 1, nodes, nodes])?;
     if golden != visible {

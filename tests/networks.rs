@@ -8,7 +8,8 @@ use qedgix::learner::{Algorithm, Learner, Preset, TrainConfig};
 use qedgix::nn::{Batch, Graph, GraphLayer, HIDDEN, LayerCache, Layout, Rows, Weights};
 use qedgix::policy::mixer::{Mixer, MixerCache, Mixing};
 use qedgix::policy::{
-    Actor, Agent, AgentConfig, Dims, Gnn, Identity, Learned, Needs, Observation, Policy, Slot, StepInput, TOKEN, Turn,
+    Actor, Agent, AgentConfig, Dims, Geometry, GeometryConfig, Gnn, Identity, Learned, Needs, Observation, Policy, Slot,
+    StepInput, TOKEN, Turn,
 };
 use qedgix::rng;
 use rand::RngExt;
@@ -69,6 +70,7 @@ fn a_batched_answer_is_the_single_answer_bit_for_bit() {
         AgentConfig { gnn: Gnn::AggGnn, ..SET },
         AgentConfig { gnn: Gnn::Rgcn, identity: Identity::None, ..SET },
         AgentConfig { gnn: Gnn::None, ..SET },
+        AgentConfig { gnn: Gnn::None, hops: 3, ..SET },
     ];
     for config in variants {
         let policy = learned(config);
@@ -89,8 +91,36 @@ fn a_batched_answer_is_the_single_answer_bit_for_bit() {
 }
 
 #[test]
+fn more_hops_see_exactly_what_links_lead_to() {
+    // A chain of users from one UAV, each only seen by the one before, and a second UAV at its end.
+    let users: Vec<Point> = (1..=4).map(|i| [0.2 * f64::from(i), 0.0]).collect();
+    let slot = Slot::from_scene(&[[0.0, 0.0], [1.0, 0.0]], &users, &[8.0, 16.0, 24.0, 32.0], 0.25);
+    for (hops, reach) in [(1, [2].as_slice()), (2, &[2, 3]), (3, &[2, 3, 4]), (4, &[2, 3, 4, 5]), (5, &[1, 2, 3, 4, 5])] {
+        let config = GeometryConfig { range: 0.25, slots: 80, layers: 0, self_loops: false, hops };
+        let mut geometry = Geometry::default();
+        geometry.clear();
+        // Fleets before and after change nothing.
+        (0..3).for_each(|_| geometry.push_slot(&config, &slot));
+        geometry.finish(&config);
+        for fleet in 0..3 {
+            let view = geometry.node(fleet, 0);
+            let seen: Vec<u32> = view.detections.iter().map(|d| d.target).collect();
+            assert_eq!(seen, reach, "{hops} hops");
+            for d in view.detections {
+                let x = if d.target == 1 { 1.0 } else { 0.2 * (d.target - 1) as f32 };
+                assert!((d.rel[0] - x).abs() < 1e-6 && d.rel[1] == 0.0, "{d:?}");
+            }
+            assert_eq!(geometry.node(fleet, 1).detections.len(), reach.len(), "the chain from its other end");
+        }
+    }
+}
+
+#[test]
 fn actor_policy_and_update_see_the_same_values() {
-    for config in [AGENT, SET, AgentConfig { gnn: Gnn::None, identity: Identity::Token, ..AGENT }] {
+    let plain = AgentConfig { gnn: Gnn::None, ..AGENT };
+    let configs =
+        [AGENT, SET, AgentConfig { identity: Identity::Token, ..plain }, AgentConfig { hops: 3, normalise: true, ..plain }];
+    for config in configs {
         let dims = Dims { slots: 6, ..DIMS };
         let (m, n, slots) = (dims.uavs, dims.users, dims.slots);
         let ep = episodes(&dims, 2, 8);
@@ -364,7 +394,7 @@ fn one_thread_and_two_make_the_same_bits() {
             let mut learner = Learner::new(&config, threads).expect("threads");
             let mut updates = Vec::new();
             for seed in 0..3 {
-                updates.push(learner.update(&episodes(&config.dims(), 37, seed)));
+                updates.push(learner.update(&episodes(&config.dims(), 37, seed), 1e-3));
                 learner.sync_targets();
             }
             assert!(updates.iter().all(|u| u.loss.is_finite() && u.grad_norm > 0.0));
@@ -382,15 +412,15 @@ fn a_restored_learner_goes_on_as_if_never_stopped() {
     config.environment.slots = 8;
     let batch = |seed| episodes(&config.dims(), 6, seed);
     let mut whole = Learner::new(&config, 1).expect("a thread");
-    whole.update(&batch(0));
+    whole.update(&batch(0), 1e-3);
     let state = whole.state();
     whole.sync_targets();
-    whole.update(&batch(1));
+    whole.update(&batch(1), 1e-3);
     let mut resumed = Learner::new(&TrainConfig { seed: 99, ..config.clone() }, 1).expect("a thread");
     resumed.restore(state.clone()).expect("the same architecture");
     assert_eq!(resumed.state(), state);
     resumed.sync_targets();
-    resumed.update(&batch(1));
+    resumed.update(&batch(1), 1e-3);
     assert_eq!(whole.state(), resumed.state());
     let short = qedgix::learner::LearnerState { adam_v: vec![0.0; 3], ..state };
     assert_eq!(resumed.restore(short).expect_err("too short").field, "adam_v");

@@ -2,10 +2,14 @@
 
 #![allow(clippy::float_cmp, reason = "runs repeat themselves bit for bit")]
 
+mod sample;
+
 use std::sync::atomic::Ordering;
 
-use qedgix::env::EpisodeMetrics;
-use qedgix::learner::{Algorithm, Event, Preset, SnapshotError, TrainConfig, Trainer, evaluate, layouts};
+use qedgix::env::{BatchEnv, EnvConfig, EpisodeMetrics, Layout};
+use qedgix::learner::{
+    Algorithm, Event, Learner, Preset, Rollout, SnapshotError, Symmetry, TrainConfig, Trainer, evaluate, layouts,
+};
 
 /// A run of a few iterations that meets everything: updates, target copies, a full ring, evaluations.
 fn small(algorithm: Algorithm) -> TrainConfig {
@@ -23,6 +27,24 @@ fn small(algorithm: Algorithm) -> TrainConfig {
     t.target_every = 12;
     t.eval_every = 250;
     t.eval_episodes = 6;
+    config
+}
+
+const ALGORITHMS: [Algorithm; 6] =
+    [Algorithm::Qmix, Algorithm::Vdn, Algorithm::Iql, Algorithm::Qedgix, Algorithm::Agggnn, Algorithm::Rgcn];
+
+/// The same with everything that the presets of the paper leave out turned on, or off where `small` has it.
+fn other(algorithm: Algorithm) -> TrainConfig {
+    let mut config = small(algorithm);
+    let t = &mut config.training;
+    t.augment = !t.augment;
+    t.target_tau = if t.target_tau > 0.0 { 0.0 } else { 0.02 };
+    t.average = if t.average > 0 { 0 } else { 20 };
+    t.learning_rate_decay = if t.learning_rate_decay < 1.0 { 1.0 } else { 0.1 };
+    t.normalise = !t.normalise;
+    t.hyper_init = 0.5;
+    t.observation = qedgix::policy::Observation::Flat;
+    config.environment.user_speed = 0.02;
     config
 }
 
@@ -77,9 +99,9 @@ fn the_best_weights_are_kept_and_fly_as_they_were_evaluated() {
 
 #[test]
 fn threads_change_no_bit() {
-    for algorithm in [Algorithm::Qmix, Algorithm::Qedgix, Algorithm::Iql] {
-        let mut one = Trainer::new(small(algorithm), 1).unwrap();
-        let mut two = Trainer::new(small(algorithm), 2).unwrap();
+    for config in ALGORITHMS.iter().flat_map(|&a| [small(a), other(a)]) {
+        let mut one = Trainer::new(config.clone(), 1).unwrap();
+        let mut two = Trainer::new(config, 2).unwrap();
         assert_eq!(run(&mut one), run(&mut two));
         assert_eq!(one.checkpoint().unwrap().to_bytes(), two.checkpoint().unwrap().to_bytes());
         assert!(one.snapshot() == two.snapshot());
@@ -100,27 +122,74 @@ fn seeds_change_everything() {
 
 #[test]
 fn resuming_is_never_having_stopped() {
-    for algorithm in [Algorithm::Qmix, Algorithm::Qedgix] {
-        for moving in [false, true] {
-            let mut config = small(algorithm);
-            config.environment.user_speed = if moving { 0.02 } else { 0.0 };
-            let mut whole = Trainer::new(config.clone(), 2).unwrap();
-            let expected = run(&mut whole);
-            // Interrupted again and again, after every kind of event, on changing numbers of threads.
-            let mut told = Vec::new();
-            let mut trainer = Trainer::new(config, 1).unwrap();
-            for (n, events) in [1, 1, 3, 2, 1, 6, 8, 1, 12].into_iter().enumerate() {
-                told.extend(trainer.by_ref().take(events));
-                let saved = trainer.snapshot();
-                trainer = Trainer::restore(&saved, 1 + n % 2).unwrap();
-                assert!(trainer.snapshot() == saved);
+    for config in ALGORITHMS.iter().flat_map(|&a| [small(a), other(a)]) {
+        let mut whole = Trainer::new(config.clone(), 2).unwrap();
+        let expected = run(&mut whole);
+        // Interrupted again and again, after every kind of event, on changing numbers of threads.
+        let mut told = Vec::new();
+        let mut trainer = Trainer::new(config, 1).unwrap();
+        for (n, events) in [1, 1, 3, 2, 1, 6, 8, 1, 12].into_iter().enumerate() {
+            told.extend(trainer.by_ref().take(events));
+            let saved = trainer.snapshot();
+            trainer = Trainer::restore(&saved, 1 + n % 2).unwrap();
+            assert!(trainer.snapshot() == saved);
+        }
+        told.extend(trainer.by_ref());
+        assert_eq!(told, expected);
+        assert!(trainer.snapshot() == whole.snapshot(), "weights, optimiser, replay and counters");
+        assert_eq!(trainer.best().unwrap(), whole.best().unwrap());
+    }
+}
+
+#[test]
+fn turned_and_mirrored_episodes_are_what_turned_and_mirrored_fleets_fly() {
+    let config = EnvConfig { hover: true, ..EnvConfig::default() };
+    let mut train = small(Algorithm::Vdn);
+    train.environment = config.clone();
+    train.training.envs = Symmetry::COUNT.into();
+    let learner = Learner::new(&train, 1).unwrap();
+    let mut rollout = Rollout::new(&train, learner.agent()).unwrap();
+    let flown = rollout.collect(learner.agent(), learner.agent_parameters(), 1.0, 0).clone();
+    let mut turned = flown.clone();
+    let symmetries: Vec<_> = (0..Symmetry::COUNT).map(Symmetry::number).collect();
+    turned.transform(&symmetries);
+    let (m, n, k) = (flown.uavs, flown.users, flown.slots);
+    for e in 0..flown.len {
+        let users = turned.user_xy[e * n * 2..][..n * 2].as_chunks().0;
+        let given = users.iter().map(|p: &[f32; 2]| p.map(f64::from)).collect();
+        let mut env = BatchEnv::new(&EnvConfig { layout: Layout::Given(given), ..config.clone() }, 1).unwrap();
+        for slot in 0..=k {
+            let at = e * (k + 1) + slot;
+            let expected = &turned.uav_xy[at * m * 2..][..m * 2];
+            assert!(env.uav_xy().iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-5), "symmetry {e}, slot {slot}");
+            assert_eq!(env.aoi(), &turned.aoi[at * n..][..n], "symmetry {e}, slot {slot}");
+            if slot < k {
+                env.step(&turned.actions[(e * k + slot) * m..][..m]);
             }
-            told.extend(trainer.by_ref());
-            assert_eq!(told, expected);
-            assert!(trainer.snapshot() == whole.snapshot(), "weights, optimiser, replay and counters");
-            assert_eq!(trainer.best().unwrap(), whole.best().unwrap());
         }
     }
+    assert_eq!(turned.uav_xy[..81 * 6], flown.uav_xy[..81 * 6], "the first symmetry changes nothing");
+    assert_ne!(turned.actions, flown.actions);
+}
+
+#[test]
+fn averaged_weights_follow_the_online_ones_from_the_first_update() {
+    let mut config = small(Algorithm::Vdn);
+    config.training.average = 4;
+    let mut learner = Learner::new(&config, 1).unwrap();
+    let batch = sample::episodes(&config.dims(), 4, 1);
+    let mut online: Vec<Vec<f32>> = Vec::new();
+    for update in 1..=6_usize {
+        learner.update(&batch, 1e-3);
+        online.push(learner.parameters().to_vec());
+        // Until it looks back on four updates it is their plain mean; then the older ones fade.
+        if update <= 4 {
+            let mean = |i: usize| online.iter().map(|w| w[i]).sum::<f32>() / update as f32;
+            let close = learner.published().iter().enumerate().all(|(i, a)| (a - mean(i)).abs() < 1e-6);
+            assert!(close, "after {update} updates");
+        }
+    }
+    assert_ne!(learner.published(), learner.parameters());
 }
 
 #[test]

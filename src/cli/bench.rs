@@ -78,7 +78,7 @@ fn learner(mut args: LearnerArgs) -> anyhow::Result<()> {
     let mut learner = Learner::new(&config, threads)?;
     let batch = random_episodes(&config, &learner)?;
     let update_s = median_seconds(repeat, || {
-        learner.update(&batch);
+        learner.update(&batch, config.training.learning_rate);
     });
     let mut rollout = Rollout::new(&config, learner.agent())?;
     let rollout_s = median_seconds(repeat, || {

@@ -10,7 +10,7 @@ mod snapshot;
 mod trainer;
 mod update;
 
-pub use episodes::Episodes;
+pub use episodes::{Episodes, Symmetry};
 pub use evaluation::{Difference, Interval, LAYOUTS, Summary, difference, evaluate, layouts, summarize};
 pub use event::{Event, Iteration};
 pub use rollout::Rollout;

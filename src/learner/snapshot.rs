@@ -1,11 +1,10 @@
 //! Snapshots: everything that a training run's future depends on, exact to the bit, versioned and checksummed.
 //!
 //! Layout: magic, version, then sections, each a length (u64) and its bytes, then SHA-256 of all before. The first section is
-//! JSON, in which every floating-point number is written as its bits, because decimal text need not come back exactly; the
-//! others are little-endian arrays. Reading trusts nothing.
+//! JSON, whose numbers come back to the bit (`serde_json` with `float_roundtrip`); the others are little-endian arrays.
+//! Reading trusts nothing.
 
-use serde::{Deserialize, Serialize, de::DeserializeOwned};
-use serde_json::Value;
+use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use super::replay::{Data, Replay, Shape};
@@ -15,7 +14,7 @@ use crate::checkpoint;
 use crate::invalid::Invalid;
 
 const MAGIC: &[u8; 8] = b"qedgixss";
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 /// Magic and version.
 const PREFIX: usize = 12;
 const CHECKSUM: usize = 32;
@@ -78,9 +77,9 @@ pub(super) fn encode(parts: &Parts<'_>) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(parts.replay.bytes() + 32 * learner.online.len());
     bytes.extend(MAGIC);
     bytes.extend(VERSION.to_le_bytes());
-    section(&mut bytes, exact_json(&head).as_bytes());
+    section(&mut bytes, &serde_json::to_vec(&head).expect("plain data with string keys"));
     let best = parts.best.map_or(&[][..], |(_, weights)| weights);
-    for array in [&learner.online, &learner.target, &learner.adam_m, &learner.adam_v, best] {
+    for array in [&learner.online, &learner.target, &learner.adam_m, &learner.adam_v, &learner.average, best] {
         floats(&mut bytes, array);
     }
     for array in [&replay.uav_xy, &replay.user_xy, &replay.reward, &replay.token] {
@@ -107,13 +106,14 @@ pub(super) fn decode(bytes: &[u8]) -> Result<State, SnapshotError> {
         return Err(SnapshotError::Version { found });
     }
     let mut rest = Sections(&content[PREFIX..]);
-    let head: Head = from_exact_json(rest.take()?)?;
+    let head: Head = serde_json::from_slice(rest.take()?).map_err(|e| inconsistent(e.to_string()))?;
     head.config.validate()?;
     let learner = LearnerState {
         online: rest.floats()?,
         target: rest.floats()?,
         adam_m: rest.floats()?,
         adam_v: rest.floats()?,
+        average: rest.floats()?,
         adam_steps: head.adam_steps,
     };
     let weights = rest.floats()?;
@@ -179,38 +179,6 @@ impl<'a> Sections<'a> {
     }
 }
 
-/// Key of an object that stands for a floating-point number.
-const BITS: &str = "f64";
-
-/// JSON with every floating-point number as `{"f64": bits}`.
-fn exact_json(value: &impl Serialize) -> String {
-    let mut value = serde_json::to_value(value).expect("plain data with string keys");
-    rewrite(&mut value, &|v| {
-        let x = v.as_f64().filter(|_| v.is_f64())?;
-        Some(serde_json::json!({ BITS: x.to_bits() }))
-    });
-    value.to_string()
-}
-
-fn from_exact_json<T: DeserializeOwned>(json: &[u8]) -> Result<T, SnapshotError> {
-    let mut value: Value = serde_json::from_slice(json).map_err(|e| inconsistent(e.to_string()))?;
-    rewrite(&mut value, &|v| Some(f64::from_bits(v.as_object()?.get(BITS)?.as_u64()?).into()));
-    serde_json::from_value(value).map_err(|e| inconsistent(e.to_string()))
-}
-
-/// Replaces, from the root, whatever `by` has a replacement for.
-fn rewrite(value: &mut Value, by: &impl Fn(&Value) -> Option<Value>) {
-    if let Some(new) = by(value) {
-        *value = new;
-        return;
-    }
-    match value {
-        Value::Array(items) => items.iter_mut().for_each(|v| rewrite(v, by)),
-        Value::Object(fields) => fields.values_mut().for_each(|v| rewrite(v, by)),
-        _ => {}
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -223,7 +191,7 @@ mod tests {
         for bits in 0..2000 {
             config.training.gamma = f64::from_bits((1.0_f64 / 3.0).to_bits() + bits);
             config.environment.reward_scale = Some(f64::from_bits((1e-5_f64 / 7.0).to_bits() + bits));
-            let back: TrainConfig = from_exact_json(exact_json(&config).as_bytes()).unwrap();
+            let back: TrainConfig = serde_json::from_slice(&serde_json::to_vec(&config).unwrap()).unwrap();
             assert_eq!(back, config);
         }
     }

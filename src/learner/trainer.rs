@@ -8,8 +8,10 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use rand::RngExt;
 use serde::{Deserialize, Serialize};
 
+use super::episodes::Symmetry;
 use super::replay::{Replay, Shape};
 use super::rollout::Rollout;
 use super::snapshot::{self, SnapshotError};
@@ -171,7 +173,7 @@ impl Trainer {
     /// Training has diverged: a weight is no sensible number.
     pub fn checkpoint(&self) -> Result<Checkpoint, checkpoint::Error> {
         let latest = self.latest.filter(|e| e.step == self.progress.step);
-        let weights = self.learner.parameters().to_vec();
+        let weights = self.learner.published().to_vec();
         Checkpoint::new(self.config.clone(), self.progress.step, latest.map(|e| e.metrics), weights)
     }
 
@@ -191,14 +193,14 @@ impl Trainer {
 
     fn evaluate(&mut self) -> Event {
         let t = &self.config.training;
-        let weights = self.learner.agent_parameters().to_vec();
+        let weights = self.learner.published()[..self.learner.agent().layout().len()].to_vec();
         let policy = Learned::new(self.config.agent(), self.config.dims(), weights).expect("as many as the agent has");
         let seeds = layouts("valid-v1").expect("a list of this program").seeds(t.eval_episodes);
         let flown = evaluate(&policy, &self.config.environment, &seeds, self.threads).expect("an agent fits its environment");
         let now = Evaluated { step: self.progress.step, metrics: EpisodeMetrics::mean(&flown) };
         self.latest = Some(now);
         if self.best.as_ref().is_none_or(|(best, _)| now.metrics.mean_aoi < best.metrics.mean_aoi) {
-            self.best = Some((now, self.learner.parameters().to_vec()));
+            self.best = Some((now, self.learner.published().to_vec()));
         }
         let p = &mut self.progress;
         p.next_evaluation = (p.step / t.eval_every + 1) * t.eval_every;
@@ -210,6 +212,7 @@ impl Trainer {
         let t = &self.config.training;
         let p = &mut self.progress;
         let epsilon = epsilon(t, p.step);
+        let learning_rate = learning_rate(t, p.step);
         let flown = self.rollout.collect(self.learner.agent(), self.learner.agent_parameters(), epsilon, p.episodes);
         p.step += (flown.len * flown.slots) as u64;
         p.episodes += flown.len as u64;
@@ -220,13 +223,18 @@ impl Trainer {
             for _ in 0..t.updates_per_iteration {
                 let mut draw = rng::stream(self.config.seed, "replay", p.updates);
                 self.replay.sample(t.batch, &mut draw, &mut self.batch);
-                let update = self.learner.update(&self.batch);
+                if t.augment {
+                    let symmetries: Vec<_> =
+                        (0..t.batch).map(|_| Symmetry::number(draw.random_range(0..Symmetry::COUNT))).collect();
+                    self.batch.transform(&symmetries);
+                }
+                let update = self.learner.update(&self.batch, learning_rate);
                 loss += update.loss;
                 grad_norm += update.grad_norm;
                 q_tot += update.q_tot;
                 p.updates += 1;
             }
-            if p.episodes - p.copied >= t.target_every {
+            if t.target_tau == 0.0 && p.episodes - p.copied >= t.target_every {
                 self.learner.sync_targets();
                 p.copied = p.episodes;
             }
@@ -267,6 +275,12 @@ impl Iterator for Trainer {
             Phase::Finished => return None,
         })
     }
+}
+
+/// Learning rate at an environment step: linear from its beginning to its end.
+fn learning_rate(t: &Training, step: u64) -> f64 {
+    let done = (step as f64 / t.steps as f64).min(1.0);
+    t.learning_rate * (1.0 - (1.0 - t.learning_rate_decay) * done)
 }
 
 /// Exploration at an environment step: linear from 1 to its end, then constant.

@@ -26,6 +26,8 @@ pub struct LearnerState {
     pub adam_v: Vec<f32>,
     /// Adam's steps.
     pub adam_steps: u64,
+    /// Averaged parameters, empty where none are kept.
+    pub average: Vec<f32>,
 }
 
 /// Online and target networks with their optimiser. Same configuration, same episodes: same bits, on any number of threads.
@@ -35,8 +37,10 @@ pub struct Learner {
     online: Vec<f32>,
     target: Vec<f32>,
     adam: Adam<f32>,
-    learning_rate: f64,
+    /// Averaged parameters and the number of updates they look back on; empty where none are kept.
+    average: (Vec<f32>, u64),
     clip: f64,
+    tau: f32,
     pool: ThreadPool,
 }
 
@@ -50,7 +54,11 @@ impl Learner {
         let training = &config.training;
         let returns = Returns { gamma: training.gamma, lambda: training.lambda };
         let objective = Objective::new(config.agent(), config.dims(), training.mixer.into(), returns, threads);
-        let online = objective.layout().initialise(&mut rng::stream(config.seed, "init", 0));
+        let mut online: Vec<f32> = objective.layout().initialise(&mut rng::stream(config.seed, "init", 0));
+        // The last layers of the hypernetworks, by their names in the checkpoint.
+        for p in objective.layout().parameters().iter().filter(|p| p.name.starts_with("mixer.") && p.name.contains(".2.")) {
+            online[p.range.clone()].iter_mut().for_each(|x| *x *= training.hyper_init as f32);
+        }
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(threads)
             .thread_name(|i| format!("learner-{i}"))
@@ -60,21 +68,30 @@ impl Learner {
             target: online.clone(),
             adam: Adam::new(online.len()),
             objective,
+            average: if training.average > 1 { (online.clone(), training.average) } else { (Vec::new(), 0) },
             online,
-            learning_rate: training.learning_rate,
+            tau: training.target_tau as f32,
             clip: training.clip,
             pool,
         })
     }
 
-    /// One step of Adam against the loss of `episodes`.
+    /// One step of Adam at this learning rate against the loss of `episodes`; then targets and averages follow.
     ///
     /// # Panics
     /// When the episodes' sizes are not those of the configuration, or there are none.
-    pub fn update(&mut self, episodes: &Episodes) -> Update {
+    pub fn update(&mut self, episodes: &Episodes, learning_rate: f64) -> Update {
         let Self { objective, online, target, adam, pool, .. } = self;
         let figures = pool.install(|| objective.evaluate(online, target, episodes, None));
-        adam.step(online, objective.gradient(), self.learning_rate, (figures.grad_norm, self.clip));
+        adam.step(online, objective.gradient(), learning_rate, (figures.grad_norm, self.clip));
+        if self.tau > 0.0 {
+            blend(&mut self.target, &self.online, self.tau);
+        }
+        if self.average.1 > 0 {
+            // In the beginning the mean is over what there is, not over what the parameters were drawn as.
+            let seen = self.adam.steps.min(self.average.1);
+            blend(&mut self.average.0, &self.online, 1.0 / seen as f32);
+        }
         figures
     }
 
@@ -98,6 +115,11 @@ impl Learner {
         &self.online
     }
 
+    /// What is evaluated and published: the averaged parameters where there are, else the online networks'.
+    pub fn published(&self) -> &[f32] {
+        if self.average.1 > 0 { &self.average.0 } else { &self.online }
+    }
+
     /// The agents' parameters: the first part of [`Learner::parameters`].
     pub fn agent_parameters(&self) -> &[f32] {
         &self.online[..self.agent().layout().len()]
@@ -111,6 +133,7 @@ impl Learner {
             adam_m: self.adam.m.clone(),
             adam_v: self.adam.v.clone(),
             adam_steps: self.adam.steps,
+            average: self.average.0.clone(),
         }
     }
 
@@ -126,9 +149,22 @@ impl Learner {
                 return Err(Invalid::new(name, format!("{} numbers", part.len()), format!("{len} numbers")));
             }
         }
+        if state.average.len() != self.average.0.len() {
+            return Err(Invalid::new(
+                "average",
+                format!("{} numbers", state.average.len()),
+                format!("{} numbers", self.average.0.len()),
+            ));
+        }
+        self.average.0 = state.average;
         self.online = state.online;
         self.target = state.target;
         self.adam = Adam { m: state.adam_m, v: state.adam_v, steps: state.adam_steps };
         Ok(())
     }
+}
+
+/// Moves every number of `to` by `share` of the way to `from`.
+fn blend(to: &mut [f32], from: &[f32], share: f32) {
+    to.iter_mut().zip(from).for_each(|(t, f)| *t += share * (f - *t));
 }

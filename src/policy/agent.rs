@@ -142,7 +142,7 @@ impl Agent {
     pub fn geometry(&self) -> GeometryConfig {
         let layers = if self.config.gnn == Gnn::None { 0 } else { self.config.layers };
         let Dims { detection_range, slots, .. } = self.dims;
-        GeometryConfig { range: detection_range, slots, layers, self_loops: self.config.self_loops }
+        GeometryConfig { range: detection_range, slots, layers, self_loops: self.config.self_loops, hops: self.config.hops }
     }
 
     /// Whether it fits a fleet: with flat observations only the one it was made for, with one-hot identities only its number
@@ -189,13 +189,18 @@ impl Agent {
         }
     }
 
+    /// What relative positions of flat observations are multiplied with.
+    fn flat_scale(&self) -> f64 {
+        if self.config.normalise { 1.0 / self.dims.detection_range } else { 1.0 }
+    }
+
     /// Writes the observations of rows `first` and on, `stride` apart.
     fn observe<T: Real>(&self, w: Weights<'_, T>, inputs: &Inputs<'_>, first: usize, out: &mut [T], stride: usize) {
         match &self.sets {
             Some(sets) => sets.forward(w, inputs.geometry, first, out, stride),
             None => {
                 for (r, out) in out.chunks_exact_mut(stride).enumerate() {
-                    flat_observation(&inputs.geometry.view(first + r), &mut out[..self.observation]);
+                    flat_observation(&inputs.geometry.view(first + r), self.flat_scale(), &mut out[..self.observation]);
                 }
             }
         }

@@ -73,4 +73,8 @@ pub struct AgentConfig {
     pub self_position: bool,
     /// Whether a node is its own neighbour.
     pub self_loops: bool,
+    /// Links over which a UAV observes; more than 1 only without a graph layer.
+    pub hops: usize,
+    /// Whether relative positions are in units of d in flat observations too, and own positions in [-1, 1].
+    pub normalise: bool,
 }

@@ -20,13 +20,14 @@ pub struct Inputs<'a> {
     pub position: &'a [f32],
 }
 
-/// Writes the flat observation (spec 2.1) of one node, 2M + 3N wide.
-pub fn flat_observation<T: Real>(view: &View<'_>, out: &mut [T]) {
+/// Writes the flat observation (spec 2.1) of one node, 2M + 3N wide; relative positions times `scale`.
+pub fn flat_observation<T: Real>(view: &View<'_>, scale: f64, out: &mut [T]) {
     out.fill(T::ZERO);
     let uavs = view.fleet.uavs;
+    let scaled = |x: f32| T::of(f64::from(x) * scale);
     let (seen_uavs, seen_users) = out.split_at_mut(2 * uavs);
     let mut user = |j: usize, rel: [f32; 2]| {
-        seen_users[3 * j..3 * j + 3].copy_from_slice(&[T::of(rel[0].into()), T::of(rel[1].into()), T::of(view.aoi[j].into())]);
+        seen_users[3 * j..3 * j + 3].copy_from_slice(&[scaled(rel[0]), scaled(rel[1]), T::of(view.aoi[j].into())]);
     };
     if view.node >= uavs {
         user(view.node - uavs, [0.0; 2]);
@@ -35,7 +36,7 @@ pub fn flat_observation<T: Real>(view: &View<'_>, out: &mut [T]) {
         let target = d.target as usize;
         match target.checked_sub(uavs) {
             Some(j) => user(j, d.rel),
-            None => seen_uavs[2 * target..2 * target + 2].copy_from_slice(&d.rel.map(|x| T::of(x.into()))),
+            None => seen_uavs[2 * target..2 * target + 2].copy_from_slice(&d.rel.map(scaled)),
         }
     }
 }
@@ -73,7 +74,8 @@ pub(super) fn write_rest<T: Real>(config: &AgentConfig, actions: usize, inputs: 
     }
     if config.self_position {
         let own = &inputs.position[2 * row..][..2];
-        position.iter_mut().zip(own).for_each(|(o, &p)| *o = T::of(p.into()) - T::of(0.5));
+        let scale = T::of(if config.normalise { 2.0 } else { 1.0 });
+        position.iter_mut().zip(own).for_each(|(o, &p)| *o = (T::of(p.into()) - T::of(0.5)) * scale);
     }
 }
 

@@ -61,6 +61,15 @@ pub struct Geometry {
     graph: Graph,
     vision: Vision,
     points: Vec<Point>,
+    further: Further,
+}
+
+/// Scratch of [`Geometry::look_further`].
+#[derive(Debug, Default)]
+struct Further {
+    offsets: Vec<u32>,
+    detections: Vec<Detection>,
+    reached: Vec<bool>,
 }
 
 /// How a geometry is built.
@@ -74,6 +83,15 @@ pub struct GeometryConfig {
     pub layers: usize,
     /// Whether a node is its own neighbour.
     pub self_loops: bool,
+    /// Links over which UAVs observe. More than 1 without a graph only: a UAV then sees what it could hear of.
+    pub hops: usize,
+}
+
+impl GeometryConfig {
+    /// How many of a fleet's nodes must look around: all where anybody asks what users see.
+    fn observers(&self, uavs: usize, users: usize) -> usize {
+        if self.layers == 0 && self.hops <= 1 { uavs } else { uavs + users }
+    }
 }
 
 impl Geometry {
@@ -100,8 +118,7 @@ impl Geometry {
         self.points.clear();
         let all = uav_xy.chunks_exact(2).chain(user_xy.chunks_exact(2));
         self.points.extend(all.map(|p| [f64::from(p[0]), f64::from(p[1])]));
-        // Without a graph nobody asks what users see.
-        let observers = if config.layers == 0 { uavs } else { uavs + users };
+        let observers = config.observers(uavs, users);
         self.vision.look(&self.points, observers, config.range, &mut self.offsets, &mut self.detections);
         self.offsets.resize(self.row_of.len() + 1, self.detections.len() as u32);
         self.aoi.extend(aoi.iter().map(|a| a / config.slots as f32));
@@ -110,7 +127,7 @@ impl Geometry {
     /// Adds a fleet from what its nodes detect.
     pub fn push_slot(&mut self, config: &GeometryConfig, slot: &Slot) {
         self.open(slot.uavs(), slot.users());
-        let observers = if config.layers == 0 { slot.uavs() } else { slot.uavs() + slot.users() };
+        let observers = config.observers(slot.uavs(), slot.users());
         for i in 0..observers {
             self.detections.extend_from_slice(slot.detections(i));
             self.offsets.push(self.detections.len() as u32);
@@ -121,6 +138,9 @@ impl Geometry {
 
     /// Orders the rows and builds the graph; call it after the last fleet.
     pub fn finish(&mut self, config: &GeometryConfig) {
+        if config.hops > 1 {
+            self.look_further(config.hops);
+        }
         let Self { fleets, offsets, detections, rows, row_of, graph, .. } = self;
         rows.clear();
         for (f, fleet) in fleets.iter().enumerate() {
@@ -158,6 +178,45 @@ impl Geometry {
             next = end;
             graph.reach.push(rows.len());
         }
+    }
+
+    /// Replaces what UAVs detect by what they could hear of over `hops` links, each seen along the shortest way, and what
+    /// users detect by nothing.
+    fn look_further(&mut self, hops: usize) {
+        let Self { fleets, offsets, detections, further, .. } = self;
+        further.offsets.clear();
+        further.offsets.push(0);
+        further.detections.clear();
+        for fleet in fleets.iter() {
+            let nodes = fleet.uavs + fleet.users;
+            for node in 0..fleet.uavs {
+                let from = further.detections.len();
+                further.reached.clear();
+                further.reached.resize(nodes, false);
+                further.reached[node] = true;
+                // A breadth-first walk; what is found is its own queue.
+                let mut hop = vec![Detection { target: node as u32, rel: [0.0; 2] }];
+                for _ in 0..hops {
+                    let mut next = Vec::new();
+                    for via in hop {
+                        let at = fleet.first_node + via.target as usize;
+                        for d in &detections[offsets[at] as usize..offsets[at + 1] as usize] {
+                            if !std::mem::replace(&mut further.reached[d.target as usize], true) {
+                                let rel = [via.rel[0] + d.rel[0], via.rel[1] + d.rel[1]];
+                                next.push(Detection { target: d.target, rel });
+                            }
+                        }
+                    }
+                    further.detections.extend_from_slice(&next);
+                    hop = next;
+                }
+                further.detections[from..].sort_unstable_by_key(|d| d.target);
+                further.offsets.push(further.detections.len() as u32);
+            }
+            further.offsets.resize(fleet.first_node + nodes + 1, further.detections.len() as u32);
+        }
+        std::mem::swap(offsets, &mut further.offsets);
+        std::mem::swap(detections, &mut further.detections);
     }
 
     /// The fleets, in the order given.

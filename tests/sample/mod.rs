@@ -15,6 +15,8 @@ pub const AGENT: AgentConfig = AgentConfig {
     identity: Identity::Onehot,
     self_position: false,
     self_loops: false,
+    hops: 1,
+    normalise: false,
 };
 
 /// Episodes of UAVs that fly at random from the centre, each among users of its own.
