@@ -128,6 +128,10 @@ pub struct Training {
     /// 1: the online weights themselves.
     #[serde(default)]
     pub average: u64,
+    /// Whether the learner is rewarded for the age it collects instead of punished for the age there is: the same optimal
+    /// policies (potential-based shaping), but the reward tells at once what an action was good for.
+    #[serde(default)]
+    pub shaping: bool,
     /// Whether replayed episodes are turned and mirrored at random, by the eight symmetries of the square.
     #[serde(default)]
     pub augment: bool,
@@ -195,6 +199,7 @@ impl TrainConfig {
             target_every: 200,
             target_tau: 0.0,
             average: 0,
+            shaping: false,
             augment: false,
             eval_every: 10_000,
             eval_episodes: 64,

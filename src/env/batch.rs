@@ -54,18 +54,11 @@ impl BatchEnv {
             return Err(Invalid::new("copies", copies, "at least 1"));
         }
         let (m, n) = (config.uavs, config.users);
-        let weights = config.weights.as_ref().map_or_else(
-            || vec![1.0; n],
-            |w| {
-                let mean = w.iter().sum::<f64>() / n as f64;
-                w.iter().map(|w| w / mean).collect()
-            },
-        );
         let mut env = Self {
             copies,
             slot: 0,
             moves: DIRECTIONS[..config.headings()].iter().map(|d| [d[0] * config.speed, d[1] * config.speed]).collect(),
-            weights,
+            weights: config.user_weights(),
             uav_xy: vec![0.0; copies * m * 2],
             user_xy: vec![0.0; copies * n * 2],
             aoi: vec![0.0; copies * n],

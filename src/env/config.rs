@@ -113,6 +113,13 @@ impl EnvConfig {
         self.reward_scale.unwrap_or(1.0 / self.slots as f64)
     }
 
+    /// The weight of each user, scaled to mean 1.
+    pub fn user_weights(&self) -> Vec<f64> {
+        let Some(weights) = &self.weights else { return vec![1.0; self.users] };
+        let mean = weights.iter().sum::<f64>() / self.users as f64;
+        weights.iter().map(|w| w / mean).collect()
+    }
+
     /// Checks every field.
     ///
     /// # Errors

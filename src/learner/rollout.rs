@@ -1,5 +1,15 @@
 //! Collecting episodes (spec 5): several fleets at once, epsilon-greedy, each UAV drawing on its own.
 //!
+//! With `training.shaping` the reward recorded is that of the age collected (a_i before the slot, a'_i after it):
+//!
+//! ```text
+//! r' = reward_scale * mean_i w_i (a_i + 1) [a'_i = 0]
+//!    = (1 - gamma) (r + gamma Phi(a') - Phi(a)),   Phi(a) = -reward_scale * mean_i w_i (a_i / (1 - gamma) + 1 / (1 - gamma)^2)
+//! ```
+//!
+//! Phi is what the future is worth to a fleet that never collects again, so by Ng, Harada and Russell (1999) the optimal
+//! policies stay what they are.
+//!
 //! Randomness is per episode: layout, tokens and exploration of episode number e are streams of e, whichever fleets fly
 //! beside it. Nothing is allocated per slot.
 
@@ -23,6 +33,8 @@ pub struct Rollout {
     seeds: Vec<u64>,
     explorers: Vec<ChaCha8Rng>,
     actions: Vec<u8>,
+    /// Per user reward_scale * w_i / N where age collected is what counts.
+    collected: Option<Vec<f64>>,
 }
 
 impl Rollout {
@@ -54,6 +66,10 @@ impl Rollout {
             seeds: Vec::with_capacity(fleets),
             explorers: Vec::with_capacity(fleets),
             actions: vec![0; fleets * m],
+            collected: config.training.shaping.then(|| {
+                let factor = environment.reward_factor() / n as f64;
+                environment.user_weights().iter().map(|w| w * factor).collect()
+            }),
         })
     }
 
@@ -109,7 +125,16 @@ impl Rollout {
     fn record_step(&mut self) {
         let (e, slot) = (&mut self.episodes, self.env.slot() - 1);
         place(&mut e.actions, &self.actions, e.len, slot);
-        place(&mut e.reward, self.env.reward(), e.len, slot);
+        let Some(factors) = &self.collected else {
+            place(&mut e.reward, self.env.reward(), e.len, slot);
+            return;
+        };
+        let (n, slots) = (factors.len(), e.slots);
+        for (b, now) in self.env.aoi().chunks_exact(n).enumerate() {
+            let before = &e.aoi[(b * (slots + 1) + slot) * n..][..n];
+            let gains = factors.iter().zip(before).zip(now).filter(|(_, now)| **now == 0.0);
+            e.reward[b * slots + slot] = gains.map(|((f, before), _)| f * (f64::from(*before) + 1.0)).sum::<f64>() as f32;
+        }
     }
 }
 
@@ -176,6 +201,35 @@ mod tests {
             }
             assert!(e.token.iter().all(|t| (-1.0..=1.0).contains(t)));
         }
+    }
+
+    #[test]
+    fn shaped_rewards_differ_by_a_potential() {
+        let mut config = config(4, 0.0);
+        config.environment.weights = Some(vec![1.0, 2.0, 3.0, 0.0, 4.0]);
+        config.environment.slots = 60;
+        let plain = flown(&config, 1.0, 0);
+        config.training.shaping = true;
+        let shaped = flown(&config, 1.0, 0);
+        assert_eq!(shaped.actions, plain.actions);
+        let (gamma, scale) = (0.9, 1.0 / 60.0);
+        let weights = [0.5, 1.0, 1.5, 0.0, 2.0];
+        let potential = |aoi: &[f32]| {
+            let worth = |a: f64| a / (1.0 - gamma) + 1.0 / (1.0 - gamma) / (1.0 - gamma);
+            -scale * aoi.iter().zip(weights).map(|(&a, w)| w * worth(a.into())).sum::<f64>() / 5.0
+        };
+        let mut collected = 0;
+        for e in 0..plain.len {
+            for k in 0..60 {
+                let at = |slot: usize| &plain.aoi[(e * 61 + slot) * 5..][..5];
+                let r = f64::from(plain.reward[e * 60 + k]);
+                let expected = (1.0 - gamma) * (r + gamma * potential(at(k + 1)) - potential(at(k)));
+                let got = f64::from(shaped.reward[e * 60 + k]);
+                assert!((got - expected).abs() < 1e-6, "episode {e}, slot {k}: {got}, expected {expected}");
+                collected += usize::from(got > 0.0);
+            }
+        }
+        assert!(collected > 5);
     }
 
     #[test]

@@ -84,6 +84,11 @@ impl EdgeNet {
         }
     }
 
+    /// The products of a forward pass that reads `read` nodes and computes `made`, each as (rows, k, columns).
+    pub fn products(&self, (read, made): (usize, usize)) -> [[usize; 3]; 3] {
+        [[made, H, W], [read, H, W], self.last.product(made)]
+    }
+
     /// x' of the first `y.len` nodes from x of all of them.
     pub fn forward<T: Real>(
         &self,

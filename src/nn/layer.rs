@@ -74,6 +74,16 @@ impl GraphLayer {
         }
     }
 
+    /// The products of a forward pass that reads `read` nodes and computes `made`, each as (rows, k, columns).
+    pub fn products(&self, (read, made): (usize, usize)) -> Vec<[usize; 3]> {
+        match self {
+            Self::EdgeConv(net) => net.products((read, made)).to_vec(),
+            Self::AggGnn { com, update } => [&com.products((read, made))[..], &update.products(made)].concat(),
+            // Itself, and its neighbours of either kind.
+            Self::Rgcn(_) => vec![[made, H, H]; 3],
+        }
+    }
+
     /// x' of the first `y.len` nodes from x of all of them.
     pub fn forward<T: Real>(&self, w: Weights<'_, T>, graph: &Graph, x: Rows<'_, T>, c: &mut LayerCache<T>, y: RowsMut<'_, T>) {
         match self {

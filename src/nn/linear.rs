@@ -32,6 +32,11 @@ impl Linear {
         transpose(&flat[self.weight..][..n], self.inputs, &mut turned[self.weight..][..n]);
     }
 
+    /// The product of a forward pass over `rows` samples, as (rows, k, columns).
+    pub fn product(&self, rows: usize) -> [usize; 3] {
+        [rows, self.inputs, self.outputs]
+    }
+
     /// W, (outputs, inputs).
     pub fn weight<'a, T>(&self, flat: &'a [T]) -> &'a [T] {
         &flat[self.weight..][..self.inputs * self.outputs]

@@ -43,6 +43,11 @@ impl<const W: usize> Mlp<W> {
         self.last.prepare(flat, turned);
     }
 
+    /// The products of a forward pass over `rows` samples, each as (rows, k, columns).
+    pub fn products(&self, rows: usize) -> [[usize; 3]; 2] {
+        [self.first.product(rows), self.last.product(rows)]
+    }
+
     /// y = f(a || b) for `a` of width `split`.
     pub fn forward<T: Real>(
         &self,

@@ -10,7 +10,7 @@
 
 use super::config::{AgentConfig, Aggregation, Gnn, Identity, Observation};
 use super::features::{Inputs, SetEncoder, flat_observation, identity_width, write_rest};
-use super::geometry::GeometryConfig;
+use super::geometry::{Geometry, GeometryConfig};
 use crate::invalid::Invalid;
 use crate::nn::matmul::Start;
 use crate::nn::{
@@ -204,6 +204,22 @@ impl Agent {
                 }
             }
         }
+    }
+
+    /// The matrix products of a forward pass over `slots` slots, each as (rows, k, columns): what an update cannot do without.
+    pub fn products(&self, geometry: &Geometry, slots: usize) -> Vec<[usize; 3]> {
+        let (uavs, graph) = (geometry.uav_rows(), geometry.graph());
+        let mut products = vec![self.fc.product(uavs), [uavs, HIDDEN, 3 * HIDDEN]];
+        products.resize(products.len() + slots, [uavs / slots, HIDDEN, 3 * HIDDEN]);
+        match &self.body {
+            Body::Plain { head } => products.push(head.product(uavs)),
+            Body::Graph { w1, w2, layers, head } => {
+                products.extend([w1.product(uavs), w2.product(geometry.rows() - uavs)]);
+                products.extend(layers.iter().enumerate().flat_map(|(l, layer)| layer.products(graph.span(l, layers.len()))));
+                products.extend(head.products(uavs));
+            }
+        }
+        products
     }
 
     /// Q-values and hidden states of `slots` slots; [`AgentCache::begin`] has been called.

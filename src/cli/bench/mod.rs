@@ -1,5 +1,7 @@
 //! `qedgix bench`: how fast the parts are on this machine.
 
+mod floor;
+
 use std::time::Instant;
 
 use clap::{Args, Subcommand};
@@ -18,7 +20,8 @@ pub struct BenchArgs {
 
 #[derive(Subcommand, Debug)]
 enum What {
-    /// Seconds per learner update and per rollout, environment steps per second
+    /// Seconds per learner update and per rollout, environment steps per second, and the floor of an update: its matrix
+    /// products alone, at the same shapes on the same threads
     ///
     /// What --set leaves open is as in the specification's figures: flat observation without own position, one-hot identity,
     /// mean aggregation, qmix mixer, a batch of 128 episodes, one update per rollout of 8.
@@ -84,6 +87,7 @@ fn learner(mut args: LearnerArgs) -> anyhow::Result<()> {
     let rollout_s = median_seconds(repeat, || {
         rollout.collect(learner.agent(), learner.agent_parameters(), 0.1, 0);
     });
+    let floor = floor::of(learner.agent(), &batch, threads, repeat);
     let steps = (t.envs * config.environment.slots) as f64;
     let env_steps_per_s = steps / (rollout_s + update_s * t.updates_per_iteration as f64);
     if args.json {
@@ -93,11 +97,21 @@ fn learner(mut args: LearnerArgs) -> anyhow::Result<()> {
             "update_s": update_s,
             "rollout_s": rollout_s,
             "env_steps_per_s": env_steps_per_s,
+            "update_gflop": floor.gflop,
+            "matmul_gflop_per_s": floor.gflop / floor.seconds,
+            "floor_s": floor.seconds,
             "config": config,
         });
         println!("{figures}");
     } else {
         println!("update of {} episodes   {:.2} ms", t.batch, update_s * 1e3);
+        println!(
+            "  its products alone     {:.2} ms   ({:.1} GFLOP at {:.0} GFLOP/s; the update takes {:.2} times as long)",
+            floor.seconds * 1e3,
+            floor.gflop,
+            floor.gflop / floor.seconds,
+            update_s / floor.seconds
+        );
         println!("rollout of {} episodes    {:.2} ms", t.envs, rollout_s * 1e3);
         println!(
             "environment steps per s  {env_steps_per_s:.0}   ({} updates per rollout, {threads} threads)",

@@ -1,0 +1,81 @@
+//! The floating-point floor of an update: how long its matrix products alone take, at their shapes, on as many threads.
+//!
+//! An update multiplies every weight four times: forward online, forward target, and back to the weights and to the inputs
+//! online. The mixers, about three hundredths of the arithmetic, are left out.
+
+use std::hint::black_box;
+use std::time::Instant;
+
+use crate::learner::Episodes;
+use crate::nn::matmul::{Lhs, Out, Rhs, Start, matmul};
+use crate::policy::{Agent, Geometry};
+
+/// Episodes whose products are made together, as the learner does.
+const EPISODES: usize = 8;
+
+/// What an update cannot do without.
+pub(super) struct Floor {
+    /// 10^9 floating-point operations of all its products.
+    pub gflop: f64,
+    /// Median seconds that they take.
+    pub seconds: f64,
+}
+
+/// The floor of an update with `batch`.
+pub(super) fn of(agent: &Agent, batch: &Episodes, threads: usize, repeat: usize) -> Floor {
+    let chunks = batch.len.div_ceil(EPISODES);
+    let slots = batch.slots + 1;
+    let products: Vec<[usize; 3]> = agent
+        .products(&geometry(agent, batch), slots)
+        .into_iter()
+        .map(|[rows, k, columns]| [rows.div_ceil(chunks), k, columns])
+        .collect();
+    let operations: usize = products.iter().map(|[m, k, n]| 2 * m * k * n).sum();
+    let mut seconds: Vec<f64> = (0..repeat).map(|_| multiply(&products, chunks, threads)).collect();
+    seconds.sort_by(f64::total_cmp);
+    Floor { gflop: (4 * chunks * operations) as f64 * 1e-9, seconds: seconds[repeat / 2] }
+}
+
+/// Who sees whom in all slots of all episodes.
+fn geometry(agent: &Agent, ep: &Episodes) -> Geometry {
+    let config = agent.geometry();
+    let mut geometry = Geometry::default();
+    geometry.clear();
+    for at in 0..ep.len * (ep.slots + 1) {
+        let users = if ep.users_move { at } else { at / (ep.slots + 1) };
+        let uav_xy = &ep.uav_xy[at * 2 * ep.uavs..][..2 * ep.uavs];
+        let user_xy = &ep.user_xy[users * 2 * ep.users..][..2 * ep.users];
+        geometry.push_scene(&config, uav_xy, user_xy, &ep.aoi[at * ep.users..][..ep.users]);
+    }
+    geometry.finish(&config);
+    geometry
+}
+
+/// Seconds that the products of `chunks` chunks take.
+fn multiply(products: &[[usize; 3]], chunks: usize, threads: usize) -> f64 {
+    let widest = products.iter().map(|[m, k, n]| m * k.max(n)).max().unwrap_or(0);
+    let weights = products.iter().map(|[_, k, n]| k * n).max().unwrap_or(0);
+    let begin = Instant::now();
+    std::thread::scope(|scope| {
+        for thread in 0..threads {
+            scope.spawn(move || {
+                let (x, w) = (vec![0.5_f32; widest], vec![0.25_f32; weights]);
+                let (mut y, mut dw) = (vec![0.0; widest], vec![0.0; weights]);
+                for _ in (thread..chunks).step_by(threads) {
+                    for &[m, k, n] in products {
+                        for _ in 0..2 {
+                            let out = Out { data: &mut y, stride: n };
+                            matmul((m, k, n), Lhs::rows(&x, k), Rhs { data: &w, stride: n }, out, Start::Zero);
+                        }
+                        let out = Out { data: &mut dw, stride: k };
+                        matmul((n, m, k), Lhs::transposed(&x, n), Rhs { data: &x, stride: k }, out, Start::Add);
+                        let out = Out { data: &mut y, stride: k };
+                        matmul((m, n, k), Lhs::rows(&x, n), Rhs { data: &w, stride: k }, out, Start::Zero);
+                    }
+                }
+                black_box((y, dw));
+            });
+        }
+    });
+    begin.elapsed().as_secs_f64()
+}
