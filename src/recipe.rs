@@ -216,8 +216,15 @@ impl TrainConfig {
                 training.identity = Identity::Phase;
                 training.self_position = true;
                 training.learning_rate = 1e-3;
+                training.learning_rate_decay = 0.1;
+                training.gamma = 0.95;
+                training.lambda = 0.8;
                 training.batch = 32;
                 training.updates_per_iteration = 4;
+                training.target_tau = 0.01;
+                training.average = 500;
+                training.shaping = true;
+                training.eval_episodes = 128;
             }
         }
         match algorithm {
@@ -331,6 +338,9 @@ impl Training {
         in_range("average", self.average, 0..=1_000_000_000)?;
         in_range("eval_every", self.eval_every, 1..=1_000_000_000_000)?;
         in_range("eval_episodes", self.eval_episodes, 1..=4096)?;
+        if self.shaping && self.gamma > 0.9999 {
+            return Err(Invalid::new("gamma", self.gamma, "at most 0.9999 with shaping, which sums ages to come"));
+        }
         if self.buffer < self.batch {
             return Err(Invalid::new("buffer", self.buffer, format!("at least batch ({})", self.batch)));
         }

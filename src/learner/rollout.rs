@@ -3,8 +3,8 @@
 //! With `training.shaping` the reward recorded is that of the age collected (a_i before the slot, a'_i after it):
 //!
 //! ```text
-//! r' = reward_scale * mean_i w_i (a_i + 1) [a'_i = 0]
-//!    = (1 - gamma) (r + gamma Phi(a') - Phi(a)),   Phi(a) = -reward_scale * mean_i w_i (a_i / (1 - gamma) + 1 / (1 - gamma)^2)
+//! r' = r + gamma Phi(a') - Phi(a) = reward_scale / (1 - gamma) * mean_i w_i (a_i + 1) [a'_i = 0]
+//! Phi(a) = -reward_scale * mean_i w_i (a_i / (1 - gamma) + 1 / (1 - gamma)^2)
 //! ```
 //!
 //! Phi is what the future is worth to a fleet that never collects again, so by Ng, Harada and Russell (1999) the optimal
@@ -33,7 +33,7 @@ pub struct Rollout {
     seeds: Vec<u64>,
     explorers: Vec<ChaCha8Rng>,
     actions: Vec<u8>,
-    /// Per user reward_scale * w_i / N where age collected is what counts.
+    /// Per user reward_scale / (1 - gamma) * w_i / N where age collected is what counts.
     collected: Option<Vec<f64>>,
 }
 
@@ -67,7 +67,7 @@ impl Rollout {
             explorers: Vec::with_capacity(fleets),
             actions: vec![0; fleets * m],
             collected: config.training.shaping.then(|| {
-                let factor = environment.reward_factor() / n as f64;
+                let factor = environment.reward_factor() / (1.0 - config.training.gamma) / n as f64;
                 environment.user_weights().iter().map(|w| w * factor).collect()
             }),
         })
@@ -210,6 +210,7 @@ mod tests {
         config.environment.slots = 60;
         let plain = flown(&config, 1.0, 0);
         config.training.shaping = true;
+        config.training.gamma = 0.9;
         let shaped = flown(&config, 1.0, 0);
         assert_eq!(shaped.actions, plain.actions);
         let (gamma, scale) = (0.9, 1.0 / 60.0);
@@ -223,9 +224,9 @@ mod tests {
             for k in 0..60 {
                 let at = |slot: usize| &plain.aoi[(e * 61 + slot) * 5..][..5];
                 let r = f64::from(plain.reward[e * 60 + k]);
-                let expected = (1.0 - gamma) * (r + gamma * potential(at(k + 1)) - potential(at(k)));
+                let expected = r + gamma * potential(at(k + 1)) - potential(at(k));
                 let got = f64::from(shaped.reward[e * 60 + k]);
-                assert!((got - expected).abs() < 1e-6, "episode {e}, slot {k}: {got}, expected {expected}");
+                assert!((got - expected).abs() < 1e-5, "episode {e}, slot {k}: {got}, expected {expected}");
                 collected += usize::from(got > 0.0);
             }
         }
