@@ -14,6 +14,7 @@
 //! | [`checkpoint`] | parameters to and from safetensors |
 //! | [`recipe`] | what a training run is made of: algorithm, preset, resolved configuration |
 //! | [`policy`] | observations, agents, mixers, baselines |
+//! | [`figure`] | data to SVG |
 //! | [`nn`], [`env`] | mathematics; physics |
 //! | [`invalid`], [`rng`] | errors of input; random streams |
 //!
@@ -24,6 +25,7 @@ pub mod checkpoint;
 pub mod cli;
 pub mod config;
 pub mod env;
+pub mod figure;
 pub mod invalid;
 pub mod jobs;
 pub mod learner;

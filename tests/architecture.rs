@@ -10,6 +10,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("wire", &[]),
     ("nn", &["invalid", "rng"]),
     ("env", &["invalid", "rng"]),
+    ("figure", &["env", "invalid"]),
     ("policy", &["env", "nn", "invalid", "rng"]),
     ("recipe", &["policy", "env", "invalid"]),
     ("checkpoint", &["recipe", "policy", "env", "nn", "invalid"]),
@@ -33,6 +34,7 @@ const LAYERS: &[(&str, &[&str])] = &[
             "checkpoint",
             "recipe",
             "learner",
+            "figure",
             "policy",
             "env",
             "nn",
@@ -46,7 +48,7 @@ const LAYERS: &[(&str, &[&str])] = &[
 /// What the pure layers never touch.
 const IMPURE: &[&str] =
     &["tokio", "tonic", "axum", "sqlx", "std::fs", "std::net", "std::process", "std::time", "SystemTime", "rand::rng("];
-const PURE: &[&str] = &["invalid", "rng", "nn", "env", "policy", "learner", "checkpoint"];
+const PURE: &[&str] = &["invalid", "rng", "nn", "env", "policy", "learner", "checkpoint", "figure"];
 
 fn sources(dir: &Path) -> Vec<PathBuf> {
     let mut found = Vec::new();
