@@ -15,6 +15,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("recipe", &["policy", "env", "invalid"]),
     ("checkpoint", &["recipe", "policy", "env", "nn", "invalid"]),
     ("learner", &["checkpoint", "recipe", "policy", "env", "nn", "invalid", "rng"]),
+    ("experiment", &["learner", "checkpoint", "recipe", "figure", "policy", "env", "invalid", "rng"]),
     ("store", &["recipe", "invalid"]),
     ("jobs", &["store", "checkpoint", "recipe", "learner", "policy", "env", "invalid", "rng", "wire"]),
     ("serving", &["checkpoint", "recipe", "learner", "policy", "env", "invalid", "rng"]),
@@ -31,6 +32,7 @@ const LAYERS: &[(&str, &[&str])] = &[
             "telemetry",
             "jobs",
             "serving",
+            "experiment",
             "checkpoint",
             "recipe",
             "learner",
@@ -48,7 +50,7 @@ const LAYERS: &[(&str, &[&str])] = &[
 /// What the pure layers never touch.
 const IMPURE: &[&str] =
     &["tokio", "tonic", "axum", "sqlx", "std::fs", "std::net", "std::process", "std::time", "SystemTime", "rand::rng("];
-const PURE: &[&str] = &["invalid", "rng", "nn", "env", "policy", "learner", "checkpoint", "figure"];
+const PURE: &[&str] = &["invalid", "rng", "nn", "env", "policy", "learner", "checkpoint", "figure", "experiment"];
 
 fn sources(dir: &Path) -> Vec<PathBuf> {
     let mut found = Vec::new();
