@@ -10,10 +10,12 @@
 //! | [`service`] | one function per use case |
 //! | [`serving`], [`jobs`] | answering now; running work later |
 //! | [`store`] | the only SQL |
+//! | [`experiment`] | many runs and what they say together |
 //! | [`learner`] | replay, rollout, update, training, evaluation |
 //! | [`checkpoint`] | parameters to and from safetensors |
 //! | [`recipe`] | what a training run is made of: algorithm, preset, resolved configuration |
 //! | [`policy`] | observations, agents, mixers, baselines |
+//! | [`figure`] | data to SVG |
 //! | [`nn`], [`env`] | mathematics; physics |
 //! | [`invalid`], [`rng`] | errors of input; random streams |
 //!
@@ -24,6 +26,8 @@ pub mod checkpoint;
 pub mod cli;
 pub mod config;
 pub mod env;
+pub mod experiment;
+pub mod figure;
 pub mod invalid;
 pub mod jobs;
 pub mod learner;

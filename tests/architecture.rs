@@ -10,10 +10,12 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("wire", &[]),
     ("nn", &["invalid", "rng"]),
     ("env", &["invalid", "rng"]),
+    ("figure", &["env", "invalid"]),
     ("policy", &["env", "nn", "invalid", "rng"]),
     ("recipe", &["policy", "env", "invalid"]),
     ("checkpoint", &["recipe", "policy", "env", "nn", "invalid"]),
     ("learner", &["checkpoint", "recipe", "policy", "env", "nn", "invalid", "rng"]),
+    ("experiment", &["learner", "checkpoint", "recipe", "figure", "policy", "env", "invalid", "rng"]),
     ("store", &["recipe", "invalid"]),
     ("jobs", &["store", "checkpoint", "recipe", "learner", "policy", "env", "invalid", "rng", "wire"]),
     ("serving", &["checkpoint", "recipe", "learner", "policy", "env", "invalid", "rng"]),
@@ -30,9 +32,11 @@ const LAYERS: &[(&str, &[&str])] = &[
             "telemetry",
             "jobs",
             "serving",
+            "experiment",
             "checkpoint",
             "recipe",
             "learner",
+            "figure",
             "policy",
             "env",
             "nn",
@@ -46,7 +50,7 @@ const LAYERS: &[(&str, &[&str])] = &[
 /// What the pure layers never touch.
 const IMPURE: &[&str] =
     &["tokio", "tonic", "axum", "sqlx", "std::fs", "std::net", "std::process", "std::time", "SystemTime", "rand::rng("];
-const PURE: &[&str] = &["invalid", "rng", "nn", "env", "policy", "learner", "checkpoint"];
+const PURE: &[&str] = &["invalid", "rng", "nn", "env", "policy", "learner", "checkpoint", "figure", "experiment"];
 
 fn sources(dir: &Path) -> Vec<PathBuf> {
     let mut found = Vec::new();

@@ -23,16 +23,21 @@ fn mean(episodes: &[EpisodeMetrics]) -> f64 {
 fn each_beats_random_and_knowing_more_is_better() {
     for (uavs, users) in [(2, 4), (3, 5), (4, 8)] {
         let env = EnvConfig { uavs, users, ..EnvConfig::default() };
-        let all: Vec<_> = LIST.iter().map(|b| flown(b.name, &env, 64)).collect();
-        for pair in all.windows(2) {
-            let better = difference(&pair[1], &pair[0]).unwrap().mean_aoi;
-            assert!(better.high < 0.0, "({uavs}, {users}): {better:?}");
+        let all: Vec<_> = LIST.iter().map(|b| (b.name, flown(b.name, &env, 64))).collect();
+        for (i, (worse, before)) in all.iter().enumerate() {
+            for (better, after) in &all[i + 1..] {
+                // Two ways to use the same knowledge: which is better depends on the size.
+                if (*worse, *better) != ("max-aoi", "nearest") {
+                    let d = difference(after, before).unwrap().mean_aoi;
+                    assert!(d.high < 0.0, "({uavs}, {users}): {better} against {worse}: {d:?}");
+                }
+            }
         }
     }
 }
 
 #[test]
-fn mean_aoi_at_the_paper_s_size() {
+fn mean_aoi_at_the_paper_s_sizes() {
     let env = EnvConfig::default();
     // Spec 6: random about 29, greedy-global at most 5.2; sweep searches well enough to find nearly everybody.
     let random = mean(&flown("random", &env, 256));
@@ -42,8 +47,55 @@ fn mean_aoi_at_the_paper_s_size() {
     let sweep = flown("sweep", &env, 256);
     assert!(mean(&sweep) < 7.5, "sweep: {}", mean(&sweep));
     assert!(EpisodeMetrics::mean(&sweep).coverage > 0.95);
-    let nearest = mean(&flown("nearest", &env, 256));
-    assert!(nearest < 15.0, "nearest: {nearest}");
+    for greedy in ["nearest", "max-aoi"] {
+        let aoi = mean(&flown(greedy, &env, 256));
+        assert!(aoi < 15.0, "{greedy}: {aoi}");
+    }
+    // Spec 6: tour about 1.6 and 3.8; at (4, 8), where it was measured on other layouts, 1.2.
+    for (uavs, users, limit) in [(3, 5, 1.6), (2, 4, 3.8), (4, 8, 1.3)] {
+        let tour = mean(&flown("tour", &EnvConfig { uavs, users, ..EnvConfig::default() }, 256));
+        assert!(tour < limit, "tour with ({uavs}, {users}): {tour}");
+    }
+}
+
+#[test]
+fn a_tour_is_planned_once_and_again_when_users_have_walked() {
+    let policy = policy("tour");
+    let users: Vec<Point> = (0..5).map(|j| [0.1 + 0.2 * j as f64, 0.3]).collect();
+    let scene = |users: &[Point]| Slot::from_scene(&[[0.5, 0.5]; 3], users, &[0.0; 5], policy.detection_range());
+    let mut memory = vec![0.0; policy.memory_len(3, 5)];
+    let fly = |slot: &Slot, step, memory: &mut Vec<f32>| {
+        let mut headings = [99; 3];
+        policy.act(&mut [Turn { slot, step, memory, headings: &mut headings, q_values: None }]);
+        headings
+    };
+    fly(&scene(&users), 0, &mut memory);
+    let plan = memory.clone();
+    let near: Vec<Point> = users.iter().map(|u| [u[0], u[1] + 0.05]).collect();
+    fly(&scene(&near), 1, &mut memory);
+    assert_eq!(memory, plan, "nobody left the place that the plan was made for");
+    let far: Vec<Point> = users.iter().map(|u| [u[0], 1.0 - u[1]]).collect();
+    let headings = fly(&scene(&far), 2, &mut memory);
+    assert_ne!(memory, plan);
+    // A memory that makes no sense, as a caller might send one, is a reason to plan again too.
+    for junk in [f32::NAN, f32::INFINITY, -1.0, 1e9, 2.0] {
+        let mut memory = vec![junk; memory.len()];
+        assert_eq!(fly(&scene(&far), 2, &mut memory), headings, "{junk}");
+    }
+}
+
+#[test]
+fn tours_of_large_fleets_are_planned_too() {
+    for (uavs, users) in [(64, 1024), (1, 3000), (200, 3), (5, 5), (9, 40)] {
+        let env = EnvConfig { uavs, users, slots: 12, ..EnvConfig::default() };
+        let begin = std::time::Instant::now();
+        flown("tour", &env, 1);
+        // Generous: tests share their processor.
+        assert!(begin.elapsed().as_secs() < 5, "({uavs}, {users}): {:?}", begin.elapsed());
+    }
+    let env = EnvConfig { uavs: 64, users: 1024, ..EnvConfig::default() };
+    let better = difference(&flown("tour", &env, 4), &flown("sweep", &env, 4)).unwrap().mean_aoi;
+    assert!(better.high < 0.0, "{better:?}");
 }
 
 #[test]
@@ -136,7 +188,7 @@ fn seeds_matter_to_those_that_draw_and_memories_are_finite() {
             assert!(fleet.memory.iter().all(|m| m.is_finite()), "{}", b.name);
             flown
         };
-        let draws = ["random", "persistent", "nearest"].contains(&b.name);
+        let draws = ["random", "persistent", "nearest", "max-aoi"].contains(&b.name);
         assert_eq!(fly(u64::MAX) != fly(u64::MAX - (1 << 48)), draws, "{}", b.name);
         assert_eq!(fly(3), fly(3));
     }

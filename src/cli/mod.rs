@@ -4,6 +4,8 @@ mod bench;
 mod client;
 mod demo;
 mod evaluate;
+mod experiment;
+mod files;
 mod fly;
 mod progress;
 mod run_args;
@@ -34,6 +36,8 @@ enum Command {
     Train(train::TrainArgs),
     /// Compare policies on frozen layouts
     Evaluate(evaluate::EvaluateArgs),
+    /// Run, resume and draw an experiment: many training runs and what they say together
+    Experiment(experiment::ExperimentArgs),
     /// Measure how fast the parts are on this machine
     Bench(bench::BenchArgs),
     /// Run one job for a server; servers start their workers themselves
@@ -47,6 +51,7 @@ pub fn run() -> ExitCode {
         Command::Demo(args) => block_on(demo::run(args)),
         Command::Train(args) => block_on(train::run(args)),
         Command::Evaluate(args) => block_on(evaluate::run(args)),
+        Command::Experiment(args) => block_on(experiment::run(args)),
         Command::Bench(args) => block_on(async { bench::run(args) }),
         // It begins without threads and without a runtime.
         Command::Worker(args) => worker::run(&args),

@@ -52,16 +52,7 @@ impl RunArgs {
         if let Some(steps) = self.steps {
             training.insert("steps".into(), steps.into());
         }
-        for item in &self.set {
-            let (path, text) = item.split_once('=').with_context(|| format!("--set {item}: expected SECTION.FIELD=VALUE"))?;
-            // Bare words are strings, so that `training.mixer=qmix` needs no quotes.
-            let value = serde_json::from_str(text).unwrap_or_else(|_| Value::String(text.to_owned()));
-            match path.split_once('.') {
-                Some(("environment", field)) => environment.insert(field.to_owned(), value),
-                Some(("training", field)) => training.insert(field.to_owned(), value),
-                _ => bail!("--set {item}: {path} is not a field; expected environment.FIELD or training.FIELD"),
-            };
-        }
+        set(&self.set, &mut environment, &mut training)?;
         Ok((environment, training))
     }
 
@@ -94,6 +85,24 @@ impl RunArgs {
         }
         Ok(job)
     }
+}
+
+/// Puts items `environment.FIELD=VALUE` and `training.FIELD=VALUE` into these sections.
+///
+/// # Errors
+/// The first item that is neither.
+pub fn set(items: &[String], environment: &mut Map<String, Value>, training: &mut Map<String, Value>) -> anyhow::Result<()> {
+    for item in items {
+        let (path, text) = item.split_once('=').with_context(|| format!("--set {item}: expected SECTION.FIELD=VALUE"))?;
+        // Bare words are strings, so that `training.mixer=qmix` needs no quotes.
+        let value = serde_json::from_str(text).unwrap_or_else(|_| Value::String(text.to_owned()));
+        match path.split_once('.') {
+            Some(("environment", field)) => environment.insert(field.to_owned(), value),
+            Some(("training", field)) => training.insert(field.to_owned(), value),
+            _ => bail!("--set {item}: {path} is not a field; expected environment.FIELD or training.FIELD"),
+        };
+    }
+    Ok(())
 }
 
 /// Parses a name as the configuration files spell it.

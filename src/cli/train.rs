@@ -10,6 +10,7 @@ use clap::Args;
 use serde_json::Value;
 
 use super::client::Client;
+use super::files::write_whole;
 use super::run_args::{RunArgs, all_cores};
 use super::{progress, table};
 use crate::checkpoint::Checkpoint;
@@ -151,15 +152,6 @@ fn report(config: &TrainConfig, checkpoint: &Checkpoint, out: &Path, threads: us
     println!("best weights by validation, from step {}; on {}:", checkpoint.step(), list.name);
     println!("{}", table::of_policies(&rows));
     Ok(())
-}
-
-/// Writes a file whole or not at all.
-fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
-    let mut partial = path.as_os_str().to_owned();
-    partial.push(".partial");
-    fs::write(&partial, bytes)
-        .and_then(|()| fs::rename(&partial, path))
-        .with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// A training curve as CSV.

@@ -5,6 +5,7 @@ use super::{Needs, Rule, World, own_positions};
 use crate::policy::Slot;
 
 /// Has no memory.
+#[derive(Default)]
 pub(super) struct GreedyGlobal;
 
 impl Rule for GreedyGlobal {

@@ -5,16 +5,19 @@
 
 mod geometry;
 mod greedy_global;
+mod max_aoi;
 mod nearest;
 mod persistent;
 mod random;
 mod search;
 mod sweep;
+mod tour;
 
 use std::sync::Arc;
 
 use rand_chacha::ChaCha8Rng;
 
+use self::search::Search;
 use super::{Needs, Policy, Slot, Turn};
 use crate::env::{EnvConfig, Point};
 use crate::invalid::{Invalid, in_range};
@@ -31,6 +34,8 @@ pub struct World {
     pub detection_range: f64,
     /// A, the number of actions.
     pub headings: usize,
+    /// K, slots per episode: how far those that plan look ahead.
+    pub slots: usize,
 }
 
 impl From<&EnvConfig> for World {
@@ -40,6 +45,7 @@ impl From<&EnvConfig> for World {
             transmission_range: env.transmission_range,
             detection_range: env.detection_range,
             headings: env.headings(),
+            slots: env.slots,
         }
     }
 }
@@ -51,7 +57,7 @@ impl Default for World {
 }
 
 /// A baseline as a list of policies shows it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug)]
 pub struct Description {
     /// The name it is asked for by.
     pub name: &'static str,
@@ -59,35 +65,31 @@ pub struct Description {
     pub text: &'static str,
     /// What it must be told.
     pub needs: Needs,
+    open: fn(World) -> Arc<dyn Policy>,
 }
 
 /// All baselines, from the least to the best informed.
-pub const LIST: [Description; 5] = [
+pub const LIST: [Description; 7] = [
     describe::<random::Random>(),
-    describe::<persistent::Persistent>(),
-    describe::<nearest::Nearest>(),
+    describe::<Search<persistent::Persistent>>(),
+    describe::<Search<max_aoi::MaxAoi>>(),
+    describe::<Search<nearest::Nearest>>(),
     describe::<sweep::Sweep>(),
     describe::<greedy_global::GreedyGlobal>(),
+    describe::<tour::Tour>(),
 ];
 
 /// The baseline called `name`, if there is one.
 pub fn by_name(name: &str, world: World) -> Option<Arc<dyn Policy>> {
-    Some(match name {
-        random::Random::NAME => Arc::new(Baseline { rule: random::Random, world }),
-        persistent::Persistent::NAME => Arc::new(Baseline { rule: persistent::Persistent, world }),
-        nearest::Nearest::NAME => Arc::new(Baseline { rule: nearest::Nearest, world }),
-        sweep::Sweep::NAME => Arc::new(Baseline { rule: sweep::Sweep, world }),
-        greedy_global::GreedyGlobal::NAME => Arc::new(Baseline { rule: greedy_global::GreedyGlobal, world }),
-        _ => return None,
-    })
+    LIST.iter().find(|baseline| baseline.name == name).map(|baseline| (baseline.open)(world))
 }
 
-const fn describe<R: Rule>() -> Description {
-    Description { name: R::NAME, text: R::TEXT, needs: R::NEEDS }
+const fn describe<R: Rule + 'static>() -> Description {
+    Description { name: R::NAME, text: R::TEXT, needs: R::NEEDS, open: |world| Arc::new(Baseline { rule: R::default(), world }) }
 }
 
 /// How one fleet decides one slot.
-trait Rule: Send + Sync {
+trait Rule: Default + Send + Sync {
     const NAME: &'static str;
     const TEXT: &'static str;
     const NEEDS: Needs;

@@ -5,6 +5,7 @@ use rand::RngExt;
 use super::{Needs, Rule, SEED_LEN, World, slot_rng, store_seed};
 use crate::policy::Slot;
 
+#[derive(Default)]
 pub(super) struct Random;
 
 impl Rule for Random {

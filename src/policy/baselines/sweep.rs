@@ -13,6 +13,7 @@ use crate::policy::Slot;
 
 /// Memory of each UAV: a grid of cells, 1 where seen; then per user whether it is known, where, and the slot at which its
 /// data was last collected.
+#[derive(Default)]
 pub(super) struct Sweep;
 
 /// Cells along each side of the square.

@@ -1,0 +1,192 @@
+//! `qedgix experiment`: runs, resumes and draws an experiment described in a TOML file.
+//!
+//! This file owns the flags and what is written in the end. What a file means and what results say is `crate::experiment`.
+
+mod folder;
+mod record;
+mod runner;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::{Context, bail};
+use clap::Args;
+use serde_json::{Value, json};
+
+use self::folder::Folder;
+use self::runner::Runner;
+use super::files::write_whole;
+use super::run_args::{self, all_cores};
+use crate::env::EpisodeMetrics;
+use crate::experiment::{Curve, Experiment, Figure, Outcome, Overrides, figures, readme, report};
+use crate::figure::Flight;
+use crate::learner::{Interval, evaluate};
+use crate::policy::baselines;
+
+/// Flags of `experiment`.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  qedgix experiment experiments/convergence.toml --dry-run      # which runs, and how far they have come
+  qedgix experiment experiments/convergence.toml                # stop with ctrl-c; the same command goes on
+  qedgix experiment experiments/range.toml --seeds 1 --steps 50000 --out /tmp/range")]
+pub struct ExperimentArgs {
+    /// The experiment, as TOML
+    #[arg(env = "QEDGIX_EXPERIMENT")]
+    file: PathBuf,
+    /// Where runs, tables and figures go [default: results/NAME OF THE FILE]
+    #[arg(long, env = "QEDGIX_OUT")]
+    out: Option<PathBuf>,
+    /// Runs at a time, a thread each [default: all cores]
+    #[arg(long, env = "QEDGIX_THREADS")]
+    threads: Option<usize>,
+    /// Environment steps of every run, instead of the file's
+    #[arg(long, env = "QEDGIX_STEPS")]
+    steps: Option<u64>,
+    /// Seeds, instead of the file's
+    #[arg(long, env = "QEDGIX_SEEDS", value_delimiter = ',')]
+    seeds: Option<Vec<u64>>,
+    /// Overrides one field of every run; may be repeated
+    #[arg(long = "set", value_name = "SECTION.FIELD=VALUE")]
+    set: Vec<String>,
+    /// Lists the runs and how far they have come, and does nothing
+    #[arg(long)]
+    dry_run: bool,
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// A file that describes no experiment, a run that fails, an interruption.
+pub async fn run(args: ExperimentArgs) -> anyhow::Result<()> {
+    let experiment = read(&args)?;
+    let out = match &args.out {
+        Some(out) => out.clone(),
+        None => Path::new("results").join(args.file.file_stem().context("the file has no name")?),
+    };
+    if args.dry_run {
+        return list(&experiment, &out);
+    }
+    let stop = Arc::new(AtomicBool::new(false));
+    let flag = Arc::clone(&stop);
+    tokio::spawn(async move {
+        if tokio::signal::ctrl_c().await.is_ok() {
+            flag.store(true, Ordering::Relaxed);
+        }
+    });
+    tokio::task::spawn_blocking(move || {
+        fs::create_dir_all(&out).with_context(|| format!("cannot make {}", out.display()))?;
+        let lock = fs::File::create(out.join(".lock")).with_context(|| format!("cannot write into {}", out.display()))?;
+        if lock.try_lock().is_err() {
+            bail!("{} is being worked on by another process", out.display());
+        }
+        let threads = args.threads.unwrap_or_else(all_cores);
+        if !Runner::new(&experiment, &out, threads, &stop).run()? {
+            bail!("stopped; the same command goes on");
+        }
+        conclude(&experiment, &out, threads, &command(&args))
+    })
+    .await?
+}
+
+/// The experiment of the file, with what the flags override.
+fn read(args: &ExperimentArgs) -> anyhow::Result<Experiment> {
+    let name = args.file.display().to_string();
+    let text = fs::read_to_string(&args.file).with_context(|| name.clone())?;
+    let document: Value = toml::from_str(&text).with_context(|| name.clone())?;
+    let mut overrides = Overrides { seeds: args.seeds.clone(), ..Overrides::default() };
+    run_args::set(&args.set, &mut overrides.environment, &mut overrides.training)?;
+    if let Some(steps) = args.steps {
+        overrides.training.insert("steps".into(), steps.into());
+    }
+    Experiment::resolve(document, &overrides).context(name)
+}
+
+/// The command that does the same again.
+fn command(args: &ExperimentArgs) -> String {
+    let mut words = vec!["qedgix experiment".to_owned(), args.file.display().to_string()];
+    if let Some(steps) = args.steps {
+        words.push(format!("--steps {steps}"));
+    }
+    if let Some(seeds) = &args.seeds {
+        words.push(format!("--seeds {}", seeds.iter().map(u64::to_string).collect::<Vec<_>>().join(",")));
+    }
+    words.extend(args.set.iter().map(|item| format!("--set '{item}'")));
+    words.join(" ")
+}
+
+/// Prints the runs.
+fn list(experiment: &Experiment, out: &Path) -> anyhow::Result<()> {
+    println!("{}: {} runs below {}", experiment.title, experiment.runs.len(), out.display());
+    for run in &experiment.runs {
+        let folder = Folder::new(out, run);
+        let (steps, progress) = (run.config.training.steps, folder.progress()?);
+        let state = match progress.step {
+            _ if folder.outcome(experiment)?.is_some() => "done".to_owned(),
+            _ if progress.trained => "trained".to_owned(),
+            0 => "to do".to_owned(),
+            step => format!("at step {step}"),
+        };
+        println!("  {:<32} {steps:>9} steps  {state:<16} {}", experiment.label(run), run.folder);
+    }
+    Ok(())
+}
+
+/// Writes what all runs say together: numbers, a page, figures; and the measured seconds, which differ from time to time.
+fn conclude(experiment: &Experiment, out: &Path, threads: usize, command: &str) -> anyhow::Result<()> {
+    let mut outcomes: Vec<Outcome> = Vec::new();
+    let mut curves: Vec<Curve> = Vec::new();
+    for run in &experiment.runs {
+        let folder = Folder::new(out, run);
+        outcomes.push(folder.outcome(experiment)?.with_context(|| format!("{} has no result", run.folder))?);
+        curves.push(folder.curve()?);
+    }
+    let report = report(experiment, &outcomes, &references(experiment, threads)?);
+    let drawn = figures(experiment, &report, &curves, &flights(experiment, out)?);
+    let names: Vec<String> = drawn.iter().map(|(name, _)| name.clone()).collect();
+    for (name, svg) in &drawn {
+        write_whole(&out.join(name), svg.as_bytes())?;
+    }
+    let seconds: Vec<Value> = (experiment.runs.iter().zip(&outcomes))
+        .map(|(run, outcome)| json!({"folder": run.folder, "training_seconds": outcome.seconds}))
+        .collect();
+    write_whole(&out.join("timing.json"), &serde_json::to_vec_pretty(&seconds)?)?;
+    write_whole(&out.join("results.json"), &serde_json::to_vec_pretty(&report)?)?;
+    let page = readme(experiment, &report, command, &names);
+    write_whole(&out.join("README.md"), page.as_bytes())?;
+    for row in &report.rows {
+        let Interval { mean, low, high } = row.mean_aoi;
+        let name = [row.point.as_str(), row.series.as_str()].join(" ");
+        println!("{:<32} mean AoI {mean:6.2}  ({low:.2} to {high:.2})", name.trim_start());
+    }
+    println!("{}", out.join("README.md").display());
+    Ok(())
+}
+
+/// The episodes of every baseline at every point.
+fn references(experiment: &Experiment, threads: usize) -> anyhow::Result<Vec<Vec<Vec<EpisodeMetrics>>>> {
+    let mut all = Vec::new();
+    for point in &experiment.points {
+        let mut flown = Vec::new();
+        for name in &experiment.baselines {
+            let policy = baselines::by_name(name, (&point.environment).into()).context("checked when the file was read")?;
+            flown.push(evaluate(policy.as_ref(), &point.environment, &experiment.layout_seeds, threads)?);
+        }
+        all.push(flown);
+    }
+    Ok(all)
+}
+
+/// What the best weights of the first seed fly on the first layout, where that is what the experiment draws.
+fn flights(experiment: &Experiment, out: &Path) -> anyhow::Result<Vec<Flight>> {
+    if experiment.figure != Figure::Trajectories {
+        return Ok(Vec::new());
+    }
+    let first = experiment.runs.iter().take(experiment.series.len() * experiment.points.len());
+    let flight = |run: &crate::experiment::Run| {
+        let policy = Folder::new(out, run).best()?.policy();
+        Ok(record::flight(&policy, &run.config.environment, experiment.layout_seeds[0])?)
+    };
+    first.map(flight).collect()
+}

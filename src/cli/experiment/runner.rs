@@ -1,0 +1,184 @@
+//! Runs several runs at a time, a thread each; with fewer runs left than threads, those that are left get more.
+//!
+//! Training is bit-exact for any number of threads, so a run may change its number at an evaluation, and only time is told.
+
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::time::Instant;
+
+use anyhow::Context;
+use indicatif::{MultiProgress, ProgressBar};
+
+use super::folder::{Folder, Progress};
+use crate::cli::progress;
+use crate::experiment::{Curve, Experiment, Flown, Outcome, Run};
+use crate::learner::{Event, Trainer, evaluate};
+
+/// What the threads share.
+pub struct Runner<'a> {
+    experiment: &'a Experiment,
+    root: &'a Path,
+    threads: usize,
+    stop: &'a AtomicBool,
+    next: AtomicUsize,
+    unfinished: AtomicUsize,
+    bars: MultiProgress,
+    overall: ProgressBar,
+}
+
+impl<'a> Runner<'a> {
+    /// A runner of this experiment, its files below `root`. Set, `stop` makes it keep what is under way and return.
+    pub fn new(experiment: &'a Experiment, root: &'a Path, threads: usize, stop: &'a AtomicBool) -> Self {
+        let bars = MultiProgress::new();
+        let overall = progress::bar_among(&bars, experiment.runs.len() as u64, "runs");
+        Self {
+            experiment,
+            root,
+            threads: threads.max(1),
+            stop,
+            next: AtomicUsize::new(0),
+            unfinished: AtomicUsize::new(0),
+            bars,
+            overall,
+        }
+    }
+
+    /// Runs what is not finished; whether everything is now.
+    ///
+    /// # Errors
+    /// The first run that fails; the others are kept where they are.
+    pub fn run(&self) -> anyhow::Result<bool> {
+        let mut pending = Vec::new();
+        for run in &self.experiment.runs {
+            if Folder::new(self.root, run).outcome(self.experiment)?.is_none() {
+                pending.push(run);
+            }
+        }
+        self.overall.set_position((self.experiment.runs.len() - pending.len()) as u64);
+        self.unfinished.store(pending.len(), Ordering::Relaxed);
+        let workers = self.threads.min(pending.len());
+        let ended: Vec<anyhow::Result<()>> = std::thread::scope(|scope| {
+            let workers: Vec<_> = (0..workers).map(|_| scope.spawn(|| self.work(&pending))).collect();
+            workers.into_iter().map(|w| w.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))).collect()
+        });
+        self.overall.finish_and_clear();
+        ended.into_iter().collect::<anyhow::Result<()>>()?;
+        Ok(self.unfinished.load(Ordering::Relaxed) == 0)
+    }
+
+    fn stopped(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+
+    /// Threads for each run that is left.
+    fn share(&self) -> usize {
+        (self.threads / self.unfinished.load(Ordering::Relaxed).max(1)).max(1)
+    }
+
+    fn work(&self, pending: &[&Run]) -> anyhow::Result<()> {
+        while let Some(run) = pending.get(self.next.fetch_add(1, Ordering::Relaxed)).filter(|_| !self.stopped()) {
+            let label = self.experiment.label(run);
+            let bar = progress::bar_among(&self.bars, run.config.training.steps, "steps");
+            bar.set_message(label.clone());
+            let ended = self.one(run, &label, &bar).with_context(|| format!("{label} ({})", run.folder));
+            bar.finish_and_clear();
+            self.bars.remove(&bar);
+            // The others keep what they have; there is no use in hours of work that end with an error.
+            if ended.is_err() {
+                self.stop.store(true, Ordering::Relaxed);
+            }
+            if let Some(outcome) = ended? {
+                self.unfinished.fetch_sub(1, Ordering::Relaxed);
+                self.overall.inc(1);
+                let aoi = outcome.best.episodes.iter().map(|e| e.mean_aoi).sum::<f64>() / outcome.best.episodes.len() as f64;
+                let note = if outcome.diverged { "  (diverged)" } else { "" };
+                self.say(&format!("done  {label}: mean AoI {aoi:.2} on {}{note}", outcome.layouts));
+            }
+        }
+        Ok(())
+    }
+
+    /// A line above the bars, or on standard error where nobody sees bars.
+    fn say(&self, line: &str) {
+        if self.overall.is_hidden() {
+            eprintln!("{line}");
+        } else {
+            self.overall.println(line);
+        }
+    }
+
+    /// Trains and flies one run; `None` when it was stopped before its end.
+    fn one(&self, run: &Run, label: &str, bar: &ProgressBar) -> anyhow::Result<Option<Outcome>> {
+        let folder = Folder::new(self.root, run);
+        folder.create(run)?;
+        if !folder.progress()?.trained && !self.train(run, &folder, label, bar)? {
+            return Ok(None);
+        }
+        let progress = folder.progress()?;
+        let fly = |checkpoint: &crate::checkpoint::Checkpoint| -> anyhow::Result<Flown> {
+            let seeds = &self.experiment.layout_seeds;
+            let episodes = evaluate(&checkpoint.policy(), &run.config.environment, seeds, self.share())?;
+            Ok(Flown { step: checkpoint.step(), episodes })
+        };
+        let outcome = Outcome {
+            layouts: self.experiment.layouts.clone(),
+            steps: progress.step,
+            diverged: progress.diverged,
+            best: fly(&folder.best()?)?,
+            last: if progress.diverged { None } else { Some(fly(&folder.last()?)?) },
+            seconds: progress.seconds,
+        };
+        folder.finish(&outcome)?;
+        Ok(Some(outcome))
+    }
+
+    /// Trains to the end, or until stopped; whether it is the end.
+    fn train(&self, run: &Run, folder: &Folder, label: &str, bar: &ProgressBar) -> anyhow::Result<bool> {
+        let mut threads = self.share();
+        let (mut trainer, mut curve, before) = folder.restore(run, threads)?;
+        let begun = Instant::now();
+        let progress = |trainer: &Trainer, trained, diverged| Progress {
+            step: trainer.step(),
+            seconds: before + begun.elapsed().as_secs_f64(),
+            trained,
+            diverged,
+        };
+        bar.set_position(trainer.step());
+        bar.reset_eta();
+        while let Some(event) = trainer.next() {
+            for (step, name, value) in event.rows() {
+                curve.push(step, name, value);
+            }
+            bar.set_position(trainer.step().min(run.config.training.steps));
+            let evaluated = if let Event::Evaluation { step, metrics } = event { Some((step, metrics.mean_aoi)) } else { None };
+            if evaluated.is_none() && !self.stopped() {
+                continue;
+            }
+            let snapshot = trainer.snapshot();
+            folder.save(&snapshot, &curve, &progress(&trainer, false, false))?;
+            if let Some((step, aoi)) = evaluated {
+                bar.set_message(format!("{label}: mean AoI {aoi:.2}"));
+                if bar.is_hidden() {
+                    eprintln!("{label}: step {step}, mean AoI {aoi:.2}");
+                }
+            }
+            if self.stopped() {
+                return Ok(false);
+            }
+            if self.share() > threads {
+                threads = self.share();
+                trainer = Trainer::restore(&snapshot, threads)?;
+            }
+        }
+        self.keep(&trainer, folder, &curve, |diverged| progress(&trainer, true, diverged))?;
+        Ok(true)
+    }
+
+    /// Keeps the weights of a run that is over.
+    fn keep(&self, trainer: &Trainer, folder: &Folder, curve: &Curve, progress: impl Fn(bool) -> Progress) -> anyhow::Result<()> {
+        let best = trainer.best()?.context("a run that is over has been evaluated")?;
+        // The last weights of a run that diverged are no checkpoint.
+        let last = trainer.checkpoint().ok();
+        folder.save_weights(&best, last.as_ref(), curve, &progress(last.is_none()))
+    }
+}

@@ -1,0 +1,55 @@
+//! Bars with whiskers, one below the other, the value written behind each.
+
+use plotters::prelude::*;
+use plotters::style::text_anchor::{HPos, VPos};
+
+use super::Bar;
+use super::canvas::{self, INK, SIZE, colour, cut, text};
+use super::scale::{drawable, extent, value};
+
+/// Pixels per bar.
+const ROW: u32 = 38;
+/// Pixels for the names.
+const NAMES: u32 = 190;
+
+/// Bars over one axis, which `y` names with its unit, as SVG; as high as there are bars.
+pub fn bars(title: &str, y: &str, bars: &[Bar]) -> String {
+    let ends = bars.iter().flat_map(|b| [b.mean, b.low, b.high]);
+    let Some(range) = extent(ends.clone()) else { return canvas::no_data(SIZE, title) };
+    let range = extent([0.0, range.start, range.end].into_iter()).unwrap_or(0.0..1.0);
+    // Room for the value behind the longest bar, and before one that is negative.
+    let span = range.end - range.start;
+    let axis = if range.start < 0.0 { range.start - 0.04 * span } else { 0.0 }..range.end + 0.14 * span;
+    let rows = bars.len().min(MOST);
+    let size = (SIZE.0, canvas::TOP + 62 + ROW * rows as u32);
+    canvas::draw(size, |sheet| {
+        canvas::heading(sheet, title)?;
+        // Bar i is around y = -i, so that the first is on top.
+        let mut plot = canvas::axes(sheet, [axis, 0.5 - rows as f64..0.5], [y, ""], (NAMES, 24))?;
+        let left = 12 + NAMES as i32;
+        for (i, bar) in bars[..rows].iter().enumerate() {
+            let at = -(i as f64);
+            let row = plot.backend_coord(&(0.0, at)).1;
+            sheet.draw(&Text::new(cut(&bar.name, 26), (left - 10, row), text(13, INK, HPos::Right, VPos::Center)))?;
+            if !drawable(bar.mean) {
+                continue;
+            }
+            plot.draw_series([Rectangle::new([(0.0, at - 0.3), (bar.mean, at + 0.3)], colour(i).mix(0.75).filled())])?;
+            let interval = [bar.low.min(bar.high), bar.low.max(bar.high)];
+            let known = interval.iter().all(|&x| drawable(x));
+            if known {
+                let style = INK.stroke_width(2);
+                let middle = bar.mean.clamp(interval[0], interval[1]);
+                plot.draw_series([ErrorBar::new_horizontal(at, interval[0], middle, interval[1], style, 10)])?;
+            }
+            let end = if known { bar.mean.max(interval[1]) } else { bar.mean }.max(0.0);
+            let behind = plot.backend_coord(&(end, at)).0 + 9;
+            sheet.draw(&Text::new(value(bar.mean), (behind, row), text(13, INK, HPos::Left, VPos::Center)))?;
+        }
+        plot.draw_series([PathElement::new([(0.0, 0.5 - rows as f64), (0.0, 0.5)], INK)])?;
+        Ok(())
+    })
+}
+
+/// Most bars of a figure; more would be no figure.
+const MOST: usize = 60;

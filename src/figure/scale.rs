@@ -1,0 +1,54 @@
+//! Ranges of axes and the writing of numbers.
+
+use std::ops::Range;
+
+/// Whether a number can be drawn. Beyond this, neighbouring ticks of an axis could be the same f64.
+pub(super) fn drawable(x: f64) -> bool {
+    x.abs() <= 1e12
+}
+
+/// The least range that holds all drawable `values`; nothing when there is none. Never empty: a single value gets room.
+pub(super) fn extent(values: impl Iterator<Item = f64>) -> Option<Range<f64>> {
+    let (low, high) = values.filter(|&x| drawable(x)).fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), x| (l.min(x), h.max(x)));
+    if low > high {
+        return None;
+    }
+    let room = (low.abs().max(high.abs()) * 1e-6).max(1e-6);
+    Some(if high - low < room { low - room..high + room } else { low..high })
+}
+
+/// `extent` with zero in it where that costs little, and air above and below the data.
+pub(super) fn value_axis(extent: &Range<f64>) -> Range<f64> {
+    let air = 0.05 * (extent.end - extent.start);
+    let from_zero = extent.start >= 0.0 && extent.start <= 0.7 * extent.end;
+    let low = if from_zero { 0.0 } else { extent.start - air };
+    low..extent.end + air
+}
+
+/// A tick: few digits, thousands and millions by letter.
+pub(super) fn tick(x: &f64) -> String {
+    let (scaled, unit) = match x.abs() {
+        a if a >= 1e9 => return format!("{x:.0e}"),
+        a if a >= 1e6 => (x / 1e6, "M"),
+        a if a >= 1e4 => (x / 1e3, "k"),
+        a if a > 0.0 && a < 1e-4 => (*x, ""),
+        _ => return short(*x, 4),
+    };
+    if unit.is_empty() {
+        // Noise of counting up to zero, or a truly small number; the axis is then in powers of ten.
+        return if scaled.abs() < 1e-12 { "0".to_owned() } else { format!("{scaled:.0e}") };
+    }
+    short(scaled, 3) + unit
+}
+
+/// `x` with at most `digits` decimals and no trailing zeros.
+fn short(x: f64, digits: usize) -> String {
+    let text = format!("{x:.digits$}");
+    let text = text.trim_end_matches('0').trim_end_matches('.');
+    if text == "-0" { "0".to_owned() } else { text.to_owned() }
+}
+
+/// A measured value, as written beside a bar.
+pub(super) fn value(x: f64) -> String {
+    if x != 0.0 && !(0.01..1e6).contains(&x.abs()) { format!("{x:.2e}") } else { format!("{x:.2}") }
+}

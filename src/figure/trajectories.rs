@@ -1,0 +1,99 @@
+//! What a fleet flew, seen from above (as in the paper's figure of trajectories): users with the circle within which their
+//! data is collected, and the path of every UAV with arrows along it.
+
+use plotters::prelude::*;
+use plotters::style::text_anchor::{HPos, VPos};
+
+use super::Flight;
+use super::canvas::{self, Drawn, INK, Key, Plot, SIDE, Sheet, colour, text};
+use super::scale::{drawable, extent};
+use crate::env::Point;
+
+/// Side of the plot in pixels; one scale for x and y.
+const PLOT: u32 = 490;
+/// Width and height in pixels: heading, legend and axes around the plot.
+const SIZE: (u32, u32) = (12 + AXIS + PLOT + SIDE, canvas::TOP + PLOT + 46 + 8);
+/// Pixels left of the plot, for its axis.
+const AXIS: u32 = 54;
+/// Slots between two arrows.
+const ARROWS: usize = 4;
+/// More users than this go without a number each.
+const NUMBERED: usize = 60;
+const USER: RGBColor = RGBColor(0x55, 0x55, 0x55);
+const START: RGBColor = RGBColor(0x22, 0x22, 0x22);
+
+/// Users, circles and paths over the unit square (and whatever lies beyond it, where UAVs may leave it), as SVG.
+pub fn trajectories(title: &str, flight: &Flight) -> String {
+    let users: Vec<(usize, Point)> = flight.users.iter().copied().enumerate().filter(|(_, p)| visible(p)).collect();
+    let paths: Vec<Vec<Point>> = flight.uavs.iter().map(|path| path.iter().copied().filter(visible).collect()).collect();
+    if users.is_empty() && paths.iter().all(Vec::is_empty) {
+        return canvas::no_data(SIZE, title);
+    }
+    let all = users.iter().map(|(_, p)| p).chain(paths.iter().flatten()).flatten().copied();
+    let range = extent(all.chain([0.0, 1.0])).unwrap_or(0.0..1.0);
+    let scale = f64::from(PLOT) / (range.end - range.start);
+    let circle = if flight.transmission_range > 0.0 { (flight.transmission_range * scale).min(4e3) as i32 } else { 0 };
+    canvas::draw(SIZE, |sheet| {
+        canvas::heading(sheet, title)?;
+        let names = ["x, in sides of the square", "y, in sides of the square"];
+        let mut plot = canvas::axes(sheet, [range.clone(), range.clone()], names, (AXIS, SIDE))?;
+        let area = plot.plotting_area().clone();
+        area.draw(&Rectangle::new([(0.0, 0.0), (1.0, 1.0)], INK.mix(0.6)))?;
+        for (_, [x, y]) in &users {
+            area.draw(&Circle::new((*x, *y), circle, USER.mix(0.07).filled()))?;
+            area.draw(&Circle::new((*x, *y), circle, USER.mix(0.45)))?;
+        }
+        for (i, path) in paths.iter().enumerate() {
+            let line = colour(i).mix(0.75).stroke_width(2);
+            plot.draw_series(LineSeries::new(path.iter().map(|p| (p[0], p[1])), line))?;
+            arrows(&mut plot, i, path, 6.0 / scale)?;
+        }
+        for (number, [x, y]) in &users {
+            area.draw(&Circle::new((*x, *y), 5, USER.filled()))?;
+            if users.len() <= NUMBERED {
+                let words =
+                    EmptyElement::at((*x, *y)) + Text::new(number.to_string(), (8, -10), text(13, INK, HPos::Left, VPos::Center));
+                area.draw(&words)?;
+            }
+        }
+        for (i, path) in paths.iter().enumerate() {
+            let (Some(first), Some(last)) = (path.first(), path.last()) else { continue };
+            area.draw(&Circle::new((first[0], first[1]), 7, START.stroke_width(2)))?;
+            area.draw(&Circle::new((last[0], last[1]), 7, WHITE.filled()))?;
+            area.draw(&Circle::new((last[0], last[1]), 5, colour(i).filled()))?;
+        }
+        key(sheet, paths.len())
+    })
+}
+
+/// Every few slots a triangle in the middle of the step, pointing where the UAV flies; `size` in units of the axes.
+fn arrows(plot: &mut Plot, i: usize, path: &[Point], size: f64) -> Drawn {
+    // Paths of several UAVs often cover each other; their arrows then take turns.
+    for step in path.windows(2).skip((1 + i) % ARROWS).step_by(ARROWS) {
+        let [from, to] = [step[0], step[1]];
+        let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
+        let length = dx.hypot(dy);
+        if length < 0.2 * size {
+            continue;
+        }
+        let (dx, dy) = (dx / length * size, dy / length * size);
+        let (x, y) = (f64::midpoint(from[0], to[0]), f64::midpoint(from[1], to[1]));
+        let corners = vec![(x + dx, y + dy), (x - dx - 0.8 * dy, y - dy + 0.8 * dx), (x - dx + 0.8 * dy, y - dy - 0.8 * dx)];
+        plot.draw_series([Polygon::new(corners, colour(i).filled())])?;
+    }
+    Ok(())
+}
+
+fn key(sheet: &Sheet, uavs: usize) -> Drawn {
+    let mut entries = vec![
+        (Key::Ring(START, 7), "start".to_owned()),
+        (Key::Dot(USER, 5), "user".to_owned()),
+        (Key::Ring(USER, 9), "collects within".to_owned()),
+    ];
+    entries.extend((0..uavs).map(|i| (Key::Line(i, true), format!("UAV {i}, ends at dot"))));
+    canvas::legend(sheet, &entries)
+}
+
+fn visible(p: &Point) -> bool {
+    p.iter().all(|&x| drawable(x))
+}

@@ -1,0 +1,228 @@
+//! `qedgix experiment`: an experiment run whole, interrupted and resumed says the same; mistakes are named before hours pass.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+const TINY: &str = r#"
+title = "Tiny"
+figure = "parameter"
+x = "users"
+seeds = [1, 2]
+layouts = "valid-v1"
+episodes = 6
+baselines = ["sweep", "random"]
+
+[run]
+preset = "practical"
+environment = { uavs = 2, slots = 8 }
+training = { steps = 600, eval_every = 200, eval_episodes = 4, batch = 8, buffer = 32, layers = 1 }
+
+[[series]]
+name = "Qedgix"
+algorithm = "qedgix"
+
+[[series]]
+name = "QMIX"
+algorithm = "qmix"
+training = { learning_rate = 2e-3 }
+
+[[points]]
+name = "2 users"
+x = 2
+environment = { users = 2 }
+
+[[points]]
+name = "3 users"
+x = 3
+environment = { users = 3 }
+"#;
+
+fn qedgix(dir: &Path, words: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_qedgix"));
+    command.current_dir(dir).arg("experiment").args(words).stdin(Stdio::null());
+    command
+}
+
+fn run(dir: &Path, words: &[&str]) -> Output {
+    qedgix(dir, words).output().unwrap()
+}
+
+fn done(dir: &Path, words: &[&str]) -> String {
+    let output = run(dir, words);
+    let (out, err) = (String::from_utf8(output.stdout).unwrap(), String::from_utf8(output.stderr).unwrap());
+    assert!(output.status.success(), "{words:?}: {out}\n{err}");
+    out + &err
+}
+
+fn in_a_directory(toml: &str) -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    fs::write(dir.path().join("tiny.toml"), toml).unwrap();
+    dir
+}
+
+fn read(dir: &Path, name: &str) -> String {
+    fs::read_to_string(dir.join(name)).unwrap_or_else(|e| panic!("{name}: {e}"))
+}
+
+/// Every file below `dir`, by its path, except what measures time.
+fn files(dir: &Path) -> Vec<(String, Vec<u8>)> {
+    let mut found = Vec::new();
+    let mut left = vec![dir.to_path_buf()];
+    while let Some(path) = left.pop() {
+        if path.is_dir() {
+            left.extend(fs::read_dir(path).unwrap().map(|entry| entry.unwrap().path()));
+            continue;
+        }
+        let name = path.strip_prefix(dir).unwrap().display().to_string();
+        if !["timing.json", "result.json", "progress.json"].iter().any(|timed| name.ends_with(timed)) {
+            found.push((name, fs::read(path).unwrap()));
+        }
+    }
+    found.sort();
+    found
+}
+
+#[test]
+fn interrupted_and_resumed_is_the_same_as_never_stopped() {
+    let dir = in_a_directory(TINY);
+    let whole = done(dir.path(), &["tiny.toml", "--threads", "3"]);
+    assert!(whole.contains("Qedgix, 2 users, seed 2: step"), "{whole}");
+    let out = dir.path().join("results/tiny");
+    let results: Value = serde_json::from_str(&read(&out, "results.json")).unwrap();
+    assert_eq!(results["runs"].as_array().unwrap().len(), 8);
+    assert_eq!(results["rows"].as_array().unwrap().len(), 4);
+    assert_eq!(results["baselines"].as_array().unwrap().len(), 4);
+    // Per point: one pair of series, and each with two baselines.
+    assert_eq!(results["differences"].as_array().unwrap().len(), 10);
+    let first = &results["rows"][0];
+    let mean = |path: &Value| path["mean"].as_f64().unwrap();
+    assert!(first["mean_aoi"]["low"].as_f64().unwrap() <= mean(&first["mean_aoi"]));
+    let per_seed = first["per_seed"].as_array().unwrap();
+    let average = per_seed.iter().map(|seed| seed.as_f64().unwrap()).sum::<f64>() / 2.0;
+    assert!((average - mean(&first["mean_aoi"])).abs() < 1e-9);
+    let page = read(&out, "README.md");
+    for part in ["qedgix experiment tiny.toml", "Qedgix", "sweep", "seed 2", "![parameter.svg]"] {
+        assert!(page.contains(part), "{part}: {page}");
+    }
+    assert!(read(&out, "parameter.svg").starts_with("<svg"));
+    assert!(!files(&out).iter().any(|(name, _)| name.ends_with("snapshot") || name.ends_with(".partial")));
+
+    // Killed again and again, at whatever it was doing, then left to finish.
+    for wait in [20, 60, 120, 200] {
+        let mut child = qedgix(dir.path(), &["tiny.toml", "--out", "again", "--threads", "2"])
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
+        let deadline = Instant::now() + Duration::from_millis(wait);
+        while Instant::now() < deadline && child.try_wait().unwrap().is_none() {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let _ = child.kill();
+        child.wait().unwrap();
+    }
+    done(dir.path(), &["tiny.toml", "--out", "again", "--threads", "1"]);
+    let strip =
+        |files: Vec<(String, Vec<u8>)>| files.into_iter().filter(|(name, _)| !name.ends_with(".partial")).collect::<Vec<_>>();
+    let (whole, again) = (strip(files(&out)), strip(files(&dir.path().join("again"))));
+    assert_eq!(names(&whole), names(&again));
+    for ((name, a), (_, b)) in whole.iter().zip(&again) {
+        assert!(a == b, "{name} differs");
+    }
+
+    // What is finished is not trained again; more layouts are flown with the weights that are there.
+    let second = done(dir.path(), &["tiny.toml"]);
+    assert!(!second.contains("step 0"), "{second}");
+    fs::write(dir.path().join("tiny.toml"), TINY.replace("episodes = 6", "episodes = 9")).unwrap();
+    let more = done(dir.path(), &["tiny.toml"]);
+    assert!(!more.contains("step 0"), "{more}");
+    let results: Value = serde_json::from_str(&read(&out, "results.json")).unwrap();
+    assert_eq!(results["runs"][0]["per_layout"].as_array().unwrap().len(), 9);
+}
+
+fn names(files: &[(String, Vec<u8>)]) -> Vec<&str> {
+    files.iter().map(|(name, _)| name.as_str()).collect()
+}
+
+#[test]
+fn the_other_figures_are_drawn() {
+    let convergence = TINY.replace("\"parameter\"", "\"convergence\"");
+    let dir = in_a_directory(&convergence);
+    done(dir.path(), &["tiny.toml", "--out", "c", "--steps", "200"]);
+    for name in ["convergence-2-users.svg", "reached-2-users.svg", "convergence-3-users.svg"] {
+        assert!(read(&dir.path().join("c"), name).contains("Qedgix"), "{name}");
+    }
+    fs::write(dir.path().join("tiny.toml"), TINY.replace("\"parameter\"", "\"trajectories\"")).unwrap();
+    // The same runs, drawn otherwise: nothing is trained.
+    let out = done(dir.path(), &["tiny.toml", "--out", "c", "--steps", "200"]);
+    assert!(!out.contains("step 0"), "{out}");
+    for name in ["trajectories-qedgix-2-users.svg", "trajectories-qmix-3-users.svg"] {
+        assert!(read(&dir.path().join("c"), name).starts_with("<svg"), "{name}");
+    }
+}
+
+#[test]
+fn a_dry_run_lists_the_runs_and_does_nothing() {
+    let dir = in_a_directory(TINY);
+    let listed = done(dir.path(), &["tiny.toml", "--dry-run", "--seeds", "7,8,9"]);
+    assert_eq!(listed.lines().filter(|line| line.contains("to do")).count(), 12, "{listed}");
+    assert!(listed.contains("QMIX, 3 users, seed 9"), "{listed}");
+    assert!(!dir.path().join("results").exists());
+    let other = done(dir.path(), &["tiny.toml", "--dry-run", "--seeds", "7", "--set", "training.gamma=0.9"]);
+    let folder = |text: &str| text.lines().nth(1).unwrap().rsplit(' ').next().unwrap().to_owned();
+    assert_ne!(folder(&listed), folder(&other), "another configuration is another folder");
+}
+
+#[test]
+fn mistakes_name_the_file_the_table_and_the_field() {
+    for (from, to, hint) in [
+        ("seeds = [1, 2]", "seeds = [1, 1]", "seeds: 1 twice"),
+        ("seeds = [1, 2]", "sedes = [1, 2]", "sedes"),
+        ("\"parameter\"", "\"pie\"", "figure"),
+        ("\"valid-v1\"", "\"valid-v0\"", "layouts"),
+        ("episodes = 6", "episodes = 0", "episodes"),
+        ("\"random\"", "\"rundom\"", "baselines[1]"),
+        ("algorithm = \"qmix\"", "algorithm = \"ppo\"", "series[1].algorithm"),
+        ("name = \"QMIX\"", "name = \"qedgix\"", "series[1].name"),
+        ("learning_rate = 2e-3", "learning_rate = 2", "series[1].training.learning_rate"),
+        ("learning_rate = 2e-3", "learningrate = 2", "series[1].training.learningrate"),
+        ("users = 3", "users = \"three\"", "points[1].environment.users"),
+        ("slots = 8", "slots = 0", "run.environment.slots"),
+        ("x = 3", "", "points[1].x"),
+        ("x = 3", "y = 3", "points[1].y"),
+        ("[run]", "[run", "line"),
+    ] {
+        assert!(TINY.contains(from), "{from}");
+        let dir = in_a_directory(&TINY.replacen(from, to, 1));
+        let output = run(dir.path(), &["tiny.toml"]);
+        let message = String::from_utf8(output.stderr).unwrap();
+        assert!(!output.status.success() && message.contains("tiny.toml") && message.contains(hint), "{to}: {message}");
+        assert!(!dir.path().join("results").exists(), "{to}: nothing is begun");
+    }
+    let dir = in_a_directory(TINY);
+    for (words, hint) in [
+        (vec!["tiny.toml", "--set", "training.bach=3"], "--set.training.bach"),
+        (vec!["tiny.toml", "--set", "bach=3"], "environment.FIELD"),
+        (vec!["absent.toml"], "absent.toml"),
+    ] {
+        let message = String::from_utf8(run(dir.path(), &words).stderr).unwrap();
+        assert!(message.contains(hint), "{words:?}: {message}");
+    }
+}
+
+#[test]
+fn the_experiments_of_the_repository_are_sound() {
+    let dir = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/experiments"));
+    let mut found = Vec::new();
+    for entry in fs::read_dir(dir).unwrap() {
+        let name = entry.unwrap().file_name().into_string().unwrap();
+        done(dir, &[&name, "--dry-run"]);
+        found.push(name);
+    }
+    found.sort();
+    assert_eq!(found, ["convergence.toml", "range.toml", "scale.toml", "trajectories.toml"]);
+}
