@@ -2,10 +2,12 @@
 
 mod bench;
 mod client;
+mod comparison;
 mod demo;
 mod evaluate;
 mod fly;
 mod progress;
+mod report;
 mod run_args;
 mod serve;
 mod table;
