@@ -81,15 +81,17 @@ impl Comparison {
     /// What was flown, in one line.
     pub fn conditions(&self) -> String {
         let Self { env, disturbance, .. } = self;
-        let mut line =
-            format!("{} of {}, {} UAVs, {} users, {} slots", self.episodes, self.layouts.name, env.uavs, env.users, env.slots);
-        if let Some(loss) = disturbance.lose {
-            line += &format!(", UAV {} lost from slot {} on", loss.uav, loss.slot);
-        }
+        let mut parts = vec![
+            format!("{} of {}", self.episodes, self.layouts.name),
+            format!("{} UAVs", env.uavs),
+            format!("{} users", env.users),
+            format!("{} slots", env.slots),
+        ];
+        parts.extend(disturbance.lose.map(|loss| format!("UAV {} lost from slot {} on", loss.uav, loss.slot)));
         if disturbance.position_noise > 0.0 {
-            line += &format!(", positions seen with an error of {}", disturbance.position_noise);
+            parts.push(format!("positions seen with an error of {}", disturbance.position_noise));
         }
-        line
+        parts.join(", ")
     }
 
     /// Everything as JSON.

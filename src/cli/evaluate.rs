@@ -174,8 +174,8 @@ impl EvaluateArgs {
     /// The command that repeats this evaluation: what was typed, and what came from environment variables.
     fn command_line(&self) -> String {
         let usual = EnvConfig::default();
-        let mut line = "qedgix evaluate".to_owned();
-        let mut add = |flag: &str, value: String| line += &format!(" --{flag} {}", quoted(&value));
+        let mut words = vec!["qedgix evaluate".to_owned()];
+        let mut add = |flag: &str, value: String| words.push(format!("--{flag} {}", quoted(&value)));
         for policy in &self.policy {
             add("policy", policy.clone());
         }
@@ -207,7 +207,7 @@ impl EvaluateArgs {
         if let Some(directory) = &self.report {
             add("report", directory.display().to_string());
         }
-        line
+        words.join(" ")
     }
 }
 
@@ -263,7 +263,7 @@ mod tests {
     fn wrong_flags_are_named() {
         for (words, hint) in [
             (vec!["--lose-uav", "1"], "UAV@SLOT"),
-            (vec!["--lose-uav", "-1@3"], "UAV@SLOT"),
+            (vec!["--lose-uav", "one@3"], "UAV@SLOT"),
             (vec!["--lose-uav", "3@0"], "lose.uav"),
             (vec!["--lose-uav", "0@80"], "lose.slot"),
             (vec!["--position-noise", "nan"], "position_noise"),

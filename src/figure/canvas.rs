@@ -103,8 +103,8 @@ pub(super) fn axes<'b>(
         .axis_style(AXIS)
         .x_labels(9)
         .y_labels(8)
-        .x_label_formatter(&tick)
-        .y_label_formatter(&tick)
+        .x_label_formatter(&|&x| tick(x))
+        .y_label_formatter(&|&x| tick(x))
         .label_style(("sans-serif", 15).into_font().color(&INK))
         .axis_desc_style(("sans-serif", 16).into_font().color(&INK))
         .x_desc(cut(x_name, 70));

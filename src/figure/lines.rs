@@ -11,7 +11,7 @@ use super::{Chart, Series};
 /// Curves with their bands (or, with markers, error bars), as SVG.
 pub fn lines(chart: &Chart) -> String {
     let all = || chart.series.iter().flat_map(|s| finite(&s.points));
-    let bands = chart.series.iter().flat_map(|s| runs(s)).flatten().filter_map(|(_, band)| band).flatten();
+    let bands = chart.series.iter().flat_map(runs).flatten().filter_map(|(_, band)| band).flatten();
     let (Some(x), Some(y)) = (extent(all().map(|p| p[0])), extent(all().map(|p| p[1]).chain(bands))) else {
         return canvas::no_data(SIZE, &chart.title);
     };

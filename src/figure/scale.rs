@@ -26,13 +26,13 @@ pub(super) fn value_axis(extent: &Range<f64>) -> Range<f64> {
 }
 
 /// A tick: few digits, thousands and millions by letter.
-pub(super) fn tick(x: &f64) -> String {
+pub(super) fn tick(x: f64) -> String {
     let (scaled, unit) = match x.abs() {
         a if a >= 1e9 => return format!("{x:.0e}"),
         a if a >= 1e6 => (x / 1e6, "M"),
         a if a >= 1e4 => (x / 1e3, "k"),
-        a if a > 0.0 && a < 1e-4 => (*x, ""),
-        _ => return short(*x, 4),
+        a if a > 0.0 && a < 1e-4 => (x, ""),
+        _ => return short(x, 4),
     };
     if unit.is_empty() {
         // Noise of counting up to zero, or a truly small number; the axis is then in powers of ten.

@@ -31,11 +31,14 @@ pub fn trajectories(title: &str, flight: &Flight) -> String {
     }
     let all = users.iter().map(|(_, p)| p).chain(paths.iter().flatten()).flatten().copied();
     let range = extent(all.chain([0.0, 1.0])).unwrap_or(0.0..1.0);
+    // Some room, as circles reach over the border.
+    let room = 0.04 * (range.end - range.start);
+    let range = range.start - room..range.end + room;
     let scale = f64::from(PLOT) / (range.end - range.start);
     let circle = if flight.transmission_range > 0.0 { (flight.transmission_range * scale).min(4e3) as i32 } else { 0 };
     canvas::draw(SIZE, |sheet| {
         canvas::heading(sheet, title)?;
-        let names = ["x, in sides of the square", "y, in sides of the square"];
+        let names = ["x (sides of the square)", "y (sides of the square)"];
         let mut plot = canvas::axes(sheet, [range.clone(), range.clone()], names, (AXIS, SIDE))?;
         let area = plot.plotting_area().clone();
         area.draw(&Rectangle::new([(0.0, 0.0), (1.0, 1.0)], INK.mix(0.6)))?;

@@ -3,7 +3,6 @@
 //! This file owns the flags and what is written in the end. What a file means and what results say is `crate::experiment`.
 
 mod folder;
-mod record;
 mod runner;
 
 use std::fs;
@@ -22,7 +21,7 @@ use super::run_args::{self, all_cores};
 use crate::env::EpisodeMetrics;
 use crate::experiment::{Curve, Experiment, Figure, Outcome, Overrides, figures, readme, report};
 use crate::figure::Flight;
-use crate::learner::{Interval, evaluate};
+use crate::learner::{Disturbance, Interval, evaluate, survey};
 use crate::policy::baselines;
 
 /// Flags of `experiment`.
@@ -188,7 +187,10 @@ fn flights(experiment: &Experiment, out: &Path) -> anyhow::Result<Vec<Flight>> {
     let first = experiment.runs.iter().take(experiment.series.len() * experiment.points.len());
     let flight = |run: &crate::experiment::Run| {
         let policy = Folder::new(out, run).best()?.policy();
-        Ok(record::flight(&policy, &run.config.environment, experiment.layout_seeds[0])?)
+        let env = &run.config.environment;
+        let track = survey(&policy, env, &experiment.layout_seeds[..1], 0, &Disturbance::default(), 1)?.track;
+        let users = track.users.iter().filter_map(|path| path.first().copied()).collect();
+        Ok(Flight { uavs: track.uavs, users, transmission_range: env.transmission_range })
     };
     first.map(flight).collect()
 }

@@ -158,7 +158,8 @@ fn over_slots(flown: &[&Flown]) -> Section {
     };
     Section {
         title: "Over slots".to_owned(),
-        text: "All data is fresh at slot 0. It ages while users are searched for, then settles at what serving them keeps up."
+        text: "All data is fresh at slot 0. A curve that levels off keeps up with its users; one that keeps rising leaves some \
+               of them alone."
             .to_owned(),
         table: None,
         figures: vec![Figure {

@@ -40,12 +40,12 @@ h1 { font-size: 1.8rem; margin: 0 0 1rem; }
 h2 { font-size: 1.25rem; margin: 2.5rem 0 .5rem; padding-top: 1rem; border-top: 1px solid #e4e4e4; }
 p { max-width: 48rem; margin: .5rem 0 1rem; }
 pre { background: #f6f6f6; padding: .7rem 1rem; border-radius: 6px; white-space: pre-wrap; overflow-wrap: anywhere; }
-.wide { overflow-x: auto; }
+.wide { overflow-x: auto; max-width: 100%; }
 table { border-collapse: collapse; margin: 0 0 1.2rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .35rem .9rem; text-align: left; border-bottom: 1px solid #e4e4e4; overflow-wrap: anywhere; }
 th { border-bottom: 2px solid #999; font-weight: 600; }
 .n { text-align: right; white-space: nowrap; }
-.figures { display: flex; flex-wrap: wrap; gap: 1rem; }
+.row { display: flex; flex-wrap: wrap; gap: 1rem 2rem; align-items: flex-start; }
 figure { margin: 0; max-width: 100%; }
 figure svg { max-width: 100%; height: auto; display: block; }
 figcaption { color: #555; font-size: .9rem; padding-left: 1rem; overflow-wrap: anywhere; }
@@ -62,17 +62,12 @@ pub(super) fn html(document: &Document) -> String {
         escaped(&document.command)
     );
     for section in &document.sections {
-        page += &format!("<h2>{}</h2>\n<p>{}</p>\n", escaped(&section.title), code(&escaped(&section.text)));
-        if let Some(table) = &section.table {
-            page += &html_table(table);
-        }
-        if section.figures.is_empty() {
-            continue;
-        }
-        page += "<div class=\"figures\">\n";
+        let _ = write!(page, "<h2>{}</h2>\n<p>{}</p>\n", escaped(&section.title), code(&escaped(&section.text)));
+        page += "<div class=\"row\">\n";
+        page += &section.table.as_ref().map(html_table).unwrap_or_default();
         for figure in &section.figures {
             let caption = escaped(&figure.caption);
-            page += &format!("<figure>\n{}<figcaption>{caption}</figcaption>\n</figure>\n", figure.svg);
+            let _ = write!(page, "<figure>\n{}<figcaption>{caption}</figcaption>\n</figure>\n", figure.svg);
         }
         page += "</div>\n";
     }
