@@ -68,7 +68,7 @@ fn read(dir: &Path, name: &str) -> String {
     fs::read_to_string(dir.join(name)).unwrap_or_else(|e| panic!("{name}: {e}"))
 }
 
-/// Every file below `dir`, by its path, except what measures time.
+/// Every file below `dir`, by its path, except what measures time and what a killed process was writing.
 fn files(dir: &Path) -> Vec<(String, Vec<u8>)> {
     let mut found = Vec::new();
     let mut left = vec![dir.to_path_buf()];
@@ -78,7 +78,7 @@ fn files(dir: &Path) -> Vec<(String, Vec<u8>)> {
             continue;
         }
         let name = path.strip_prefix(dir).unwrap().display().to_string();
-        if !["timing.json", "result.json", "progress.json"].iter().any(|timed| name.ends_with(timed)) {
+        if !["timing.json", "result.json", "progress.json", ".partial"].iter().any(|timed| name.ends_with(timed)) {
             found.push((name, fs::read(path).unwrap()));
         }
     }
@@ -109,7 +109,6 @@ fn interrupted_and_resumed_is_the_same_as_never_stopped() {
         assert!(page.contains(part), "{part}: {page}");
     }
     assert!(read(&out, "parameter.svg").starts_with("<svg"));
-    assert!(!files(&out).iter().any(|(name, _)| name.ends_with("snapshot") || name.ends_with(".partial")));
 
     // Killed again and again, at whatever it was doing, then left to finish.
     for wait in [20, 60, 120, 200] {
@@ -126,9 +125,8 @@ fn interrupted_and_resumed_is_the_same_as_never_stopped() {
         child.wait().unwrap();
     }
     done(dir.path(), &["tiny.toml", "--out", "again", "--threads", "1"]);
-    let strip =
-        |files: Vec<(String, Vec<u8>)>| files.into_iter().filter(|(name, _)| !name.ends_with(".partial")).collect::<Vec<_>>();
-    let (whole, again) = (strip(files(&out)), strip(files(&dir.path().join("again"))));
+    let (whole, again) = (files(&out), files(&dir.path().join("again")));
+    assert!(!names(&whole).iter().any(|name| name.contains("snapshot")));
     assert_eq!(names(&whole), names(&again));
     for ((name, a), (_, b)) in whole.iter().zip(&again) {
         assert!(a == b, "{name} differs");
@@ -205,8 +203,9 @@ fn mistakes_name_the_file_the_table_and_the_field() {
     }
     let dir = in_a_directory(TINY);
     for (words, hint) in [
-        (vec!["tiny.toml", "--set", "training.bach=3"], "--set.training.bach"),
+        (vec!["tiny.toml", "--set", "training.bach=3"], "command line, training.bach"),
         (vec!["tiny.toml", "--set", "bach=3"], "environment.FIELD"),
+        (vec!["tiny.toml", "--steps", "0"], "command line, training.steps"),
         (vec!["absent.toml"], "absent.toml"),
     ] {
         let message = String::from_utf8(run(dir.path(), &words).stderr).unwrap();
@@ -225,4 +224,25 @@ fn the_experiments_of_the_repository_are_sound() {
     }
     found.sort();
     assert_eq!(found, ["convergence.toml", "range.toml", "scale.toml", "trajectories.toml"]);
+}
+
+#[cfg(unix)]
+#[test]
+fn ctrl_c_keeps_the_runs_that_are_under_way() {
+    let dir = in_a_directory(TINY);
+    // Too long to end by itself: evaluations only at the beginning and far away.
+    let long = ["tiny.toml", "--steps", "100000000", "--set", "training.eval_every=100000000", "--threads", "2"];
+    let mut child = qedgix(dir.path(), &long).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    let snapshots = || files(dir.path()).iter().filter(|(name, _)| name.ends_with("snapshot")).count();
+    let deadline = Instant::now() + Duration::from_secs(60);
+    while snapshots() < 2 && Instant::now() < deadline {
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let busy = run(dir.path(), &long);
+    assert!(String::from_utf8_lossy(&busy.stderr).contains("another process"), "two would write the same files");
+    let interrupted = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(interrupted.success());
+    assert!(!child.wait().unwrap().success());
+    let listed = done(dir.path(), &[&long[..5], &["--dry-run"]].concat());
+    assert_eq!(listed.lines().filter(|line| line.contains("at step")).count(), 2, "{listed}");
 }

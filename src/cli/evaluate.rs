@@ -1,16 +1,16 @@
 //! `qedgix evaluate`: policies side by side on frozen layouts (spec 7), here or through a server's `Act`.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::{Context, ensure};
 use clap::Args;
-use serde_json::{Value, json};
 
-use super::{fly, progress, run_args::all_cores, table};
+use super::comparison::{Comparison, Flown};
+use super::{fly, progress, report, run_args::all_cores, table};
 use crate::checkpoint::Checkpoint;
-use crate::env::{EnvConfig, EpisodeMetrics};
-use crate::learner::{Summary, difference, evaluate, layouts, summarize};
+use crate::env::EnvConfig;
+use crate::learner::{Disturbance, Layouts, Loss, Survey, Track, layouts, survey};
 use crate::policy::{Policy, baselines};
 use crate::serving::bundled;
 
@@ -18,8 +18,14 @@ use crate::serving::bundled;
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   qedgix evaluate --policy sweep --policy nearest
+  qedgix evaluate --policy qedgix --policy sweep --report report      # then open report/index.html
+  qedgix evaluate --policy sweep --policy my-job:1 --server 127.0.0.1:50051 --episodes 16
+
+How a policy does where it was not trained:
   qedgix evaluate --policy policy.safetensors --policy sweep --uavs 4 --users 8 --json
-  qedgix evaluate --policy sweep --policy my-job:1 --server 127.0.0.1:50051 --episodes 16")]
+  qedgix evaluate --policy qedgix --policy sweep --detection-range 0.2 --user-speed 0.01
+  qedgix evaluate --policy qedgix --policy sweep --lose-uav 1@20      # UAV 1 of 0, 1, 2 is gone from slot 20 on
+  qedgix evaluate --policy qedgix --policy sweep --position-noise 0.02")]
 pub struct EvaluateArgs {
     /// A checkpoint file, a bundled policy or a baseline; with --server, any policy it serves. May be repeated
     #[arg(long, required = true, env = "QEDGIX_POLICY", value_delimiter = ',')]
@@ -42,12 +48,30 @@ pub struct EvaluateArgs {
     /// Detection range, in units of the square's side
     #[arg(long, env = "QEDGIX_DETECTION_RANGE", default_value_t = 0.28)]
     detection_range: f64,
+    /// Range within which data is collected, in units of the square's side
+    #[arg(long, env = "QEDGIX_TRANSMISSION_RANGE", default_value_t = 0.12)]
+    transmission_range: f64,
+    /// Distance that users walk per slot, in units of the square's side; 0: they stay
+    #[arg(long, env = "QEDGIX_USER_SPEED", default_value_t = 0.0)]
+    user_speed: f64,
+    /// Loses a UAV (counted from 0) from a slot on: it neither moves, collects, sees nor is seen
+    #[arg(long, env = "QEDGIX_LOSE_UAV", value_name = "UAV@SLOT", value_parser = loss)]
+    lose_uav: Option<Loss>,
+    /// Standard deviation of the error in every coordinate that policies see, in units of the square's side
+    #[arg(long, env = "QEDGIX_POSITION_NOISE", value_name = "SIGMA", default_value_t = 0.0)]
+    position_noise: f64,
     /// Threads [default: all cores]
     #[arg(long, env = "QEDGIX_THREADS")]
     threads: Option<usize>,
     /// Fly through gRPC Act of the server at HOST:PORT
     #[arg(long, env = "QEDGIX_SERVER", value_name = "HOST:PORT")]
     server: Option<String>,
+    /// Write a report with tables and figures into this directory: index.html, report.md, report.json, *.svg
+    #[arg(long, env = "QEDGIX_REPORT", value_name = "DIR")]
+    report: Option<PathBuf>,
+    /// Layout whose flights the report draws, counted from 0
+    #[arg(long, env = "QEDGIX_REPORT_LAYOUT", value_name = "N", default_value_t = 0)]
+    report_layout: usize,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -56,66 +80,148 @@ pub struct EvaluateArgs {
 /// Runs the command.
 ///
 /// # Errors
-/// An unknown policy or list, a policy that does not fit, a server that refuses.
+/// An unknown policy or list, a policy that does not fit, a server that refuses, a directory that cannot be written.
 pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
-    let mut env = EnvConfig {
-        uavs: args.uavs,
-        users: args.users,
-        slots: args.slots,
-        detection_range: args.detection_range,
-        ..EnvConfig::default()
-    };
-    env.validate()?;
-    ensure!(args.episodes > 0, "--episodes: 0 is not valid; expected at least 1");
-    let list = layouts(&args.layouts)?;
-    let seeds = list.seeds(args.episodes);
-    let bar = progress::bar(args.policy.len() as u64, "policies");
-    let mut flown = Vec::new();
+    let (list, seeds, env) = check(&args)?;
+    let disturbance = args.disturbance();
+    // Gaps are told where there is room for them.
+    let asked = |name: &str| args.policy.iter().any(|p| p == name);
+    let references: &[&str] = if args.json || args.report.is_some() { &Comparison::REFERENCES } else { &[] };
+    let references = references.iter().copied().filter(|name| !asked(name) && baselines::by_name(name, (&env).into()).is_some());
+    let names: Vec<(&str, bool)> =
+        args.policy.iter().map(|name| (name.as_str(), false)).chain(references.map(|name| (name, true))).collect();
+
     let mut server = match &args.server {
         Some(address) => Some(fly::connect(address).await?),
         None => None,
     };
-    for name in &args.policy {
-        bar.set_message(name.clone());
-        let episodes = if let Some(server) = &mut server {
-            fly::episodes(server, name, &env, &seeds).await?
-        } else {
-            let policy = open(name, &env)?;
-            env.hover = policy.actions() > EnvConfig::COMPASS;
-            evaluate(policy.as_ref(), &env, &seeds, args.threads.unwrap_or_else(all_cores))
-                .with_context(|| format!("policy {name}"))?
+    let bar = progress::bar(names.len() as u64, "policies");
+    let mut flown = Vec::new();
+    for (name, reference) in names {
+        bar.set_message(name.to_owned());
+        let survey = match &mut server {
+            Some(server) if !reference => {
+                let episodes = fly::episodes(server, name, &env, &seeds).await?;
+                Survey { episodes, aoi: Vec::new(), track: Track::default() }
+            }
+            _ => {
+                let policy = open(name, &env)?;
+                let env = EnvConfig { hover: policy.actions() > EnvConfig::COMPASS, ..env.clone() };
+                let threads = args.threads.unwrap_or_else(all_cores);
+                survey(policy.as_ref(), &env, &seeds, args.report_layout, &disturbance, threads)
+                    .with_context(|| format!("policy {name}"))?
+            }
         };
-        flown.push((name.clone(), episodes));
+        flown.push(Flown::new(name, reference, survey)?);
         bar.inc(1);
     }
     bar.finish_and_clear();
-    let rows: Vec<(String, Summary)> =
-        flown.iter().map(|(name, episodes)| Ok((name.clone(), summarize(episodes)?))).collect::<anyhow::Result<_>>()?;
+
+    let comparison = Comparison { layouts: list, episodes: seeds.len(), env, disturbance, flown };
+    if let Some(directory) = &args.report {
+        report::write(directory, &comparison, &args.command_line())
+            .with_context(|| format!("writing the report to {}", directory.display()))?;
+    }
     if args.json {
-        let report = json!({
-            "layouts": list.name,
-            "episodes": seeds.len(),
-            "environment": env,
-            "policies": rows.iter().map(|(name, summary)| json!({"policy": name, "summary": summary})).collect::<Vec<_>>(),
-            "differences": differences(&flown)?,
-        });
-        println!("{}", serde_json::to_string_pretty(&report)?);
-    } else {
-        println!("{} of {}, {} UAVs, {} users, {} slots; AoI in slots", seeds.len(), list.name, env.uavs, env.users, env.slots);
-        println!("{}", table::of_policies(&rows));
+        println!("{}", serde_json::to_string_pretty(&comparison.json()?)?);
+        return Ok(());
+    }
+    println!("{}; AoI in slots", comparison.conditions());
+    let asked = comparison.flown.iter().filter(|f| !f.reference);
+    println!("{}", table::of_policies(&asked.map(|f| (f.name.clone(), f.summary)).collect::<Vec<_>>()));
+    if let Some(directory) = &args.report {
+        println!("Report: {}", directory.join("index.html").display());
     }
     Ok(())
 }
 
-/// Every pair of policies on the same layouts: first minus second.
-fn differences(flown: &[(String, Vec<EpisodeMetrics>)]) -> anyhow::Result<Vec<Value>> {
-    let mut pairs = Vec::new();
-    for (i, (first, a)) in flown.iter().enumerate() {
-        for (second, b) in &flown[i + 1..] {
-            pairs.push(json!({"first": first, "second": second, "difference": difference(a, b)?}));
-        }
+/// What the flags ask for, before anything is flown.
+fn check(args: &EvaluateArgs) -> anyhow::Result<(Layouts, Vec<u64>, EnvConfig)> {
+    let env = EnvConfig {
+        uavs: args.uavs,
+        users: args.users,
+        slots: args.slots,
+        detection_range: args.detection_range,
+        transmission_range: args.transmission_range,
+        user_speed: args.user_speed,
+        ..EnvConfig::default()
+    };
+    env.validate()?;
+    args.disturbance().validate(&env)?;
+    ensure!(args.episodes > 0, "--episodes: 0 is not valid; expected at least 1");
+    let list = layouts(&args.layouts)?;
+    let seeds = list.seeds(args.episodes);
+    ensure!(
+        args.report_layout < seeds.len(),
+        "--report-layout: {} is not valid; expected a number from 0 to {}",
+        args.report_layout,
+        seeds.len() - 1
+    );
+    let here = args.report.is_some() || args.disturbance() != Disturbance::default();
+    ensure!(
+        args.server.is_none() || !here,
+        "--report, --lose-uav and --position-noise are for policies that fly here: files, bundled policies and baselines; \
+         leave out --server"
+    );
+    Ok((list, seeds, env))
+}
+
+impl EvaluateArgs {
+    fn disturbance(&self) -> Disturbance {
+        Disturbance { lose: self.lose_uav, position_noise: self.position_noise }
     }
-    Ok(pairs)
+
+    /// The command that repeats this evaluation: what was typed, and what came from environment variables.
+    fn command_line(&self) -> String {
+        let usual = EnvConfig::default();
+        let mut line = "qedgix evaluate".to_owned();
+        let mut add = |flag: &str, value: String| line += &format!(" --{flag} {}", quoted(&value));
+        for policy in &self.policy {
+            add("policy", policy.clone());
+        }
+        add("layouts", self.layouts.clone());
+        add("episodes", self.episodes.to_string());
+        for (flag, value, usual) in
+            [("uavs", self.uavs, usual.uavs), ("users", self.users, usual.users), ("slots", self.slots, usual.slots)]
+        {
+            if value != usual {
+                add(flag, value.to_string());
+            }
+        }
+        for (flag, value, usual) in [
+            ("detection-range", self.detection_range, usual.detection_range),
+            ("transmission-range", self.transmission_range, usual.transmission_range),
+            ("user-speed", self.user_speed, usual.user_speed),
+            ("position-noise", self.position_noise, 0.0),
+        ] {
+            if value != usual {
+                add(flag, value.to_string());
+            }
+        }
+        if let Some(Loss { uav, slot }) = self.lose_uav {
+            add("lose-uav", format!("{uav}@{slot}"));
+        }
+        if self.report_layout > 0 {
+            add("report-layout", self.report_layout.to_string());
+        }
+        if let Some(directory) = &self.report {
+            add("report", directory.display().to_string());
+        }
+        line
+    }
+}
+
+/// `UAV@SLOT`, both counted from 0.
+fn loss(text: &str) -> Result<Loss, String> {
+    let parts = text.split_once('@').and_then(|(uav, slot)| Some((uav.parse().ok()?, slot.parse().ok()?)));
+    let (uav, slot) = parts.ok_or("expected UAV@SLOT, two whole numbers counted from 0, as in 1@20")?;
+    Ok(Loss { uav, slot })
+}
+
+/// `word` as a shell takes it for one word.
+fn quoted(word: &str) -> String {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "_-./:@=+%".contains(c);
+    if !word.is_empty() && word.chars().all(plain) { word.to_owned() } else { format!("'{}'", word.replace('\'', "'\\''")) }
 }
 
 /// A policy by what it is called on the command line: a file, a bundled policy or a baseline.
@@ -135,4 +241,54 @@ pub fn open(name: &str, env: &EnvConfig) -> anyhow::Result<Arc<dyn Policy>> {
     };
     let checkpoint = Checkpoint::from_bytes(&bytes).with_context(|| format!("{name} is no checkpoint"))?;
     Ok(Arc::new(checkpoint.policy()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(clap::Parser)]
+    struct Line {
+        #[command(flatten)]
+        args: EvaluateArgs,
+    }
+
+    fn parse(words: &[&str]) -> Result<EvaluateArgs, String> {
+        use clap::Parser;
+        let words = ["x", "--policy", "sweep"].iter().chain(words);
+        Line::try_parse_from(words).map(|line| line.args).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn wrong_flags_are_named() {
+        for (words, hint) in [
+            (vec!["--lose-uav", "1"], "UAV@SLOT"),
+            (vec!["--lose-uav", "-1@3"], "UAV@SLOT"),
+            (vec!["--lose-uav", "3@0"], "lose.uav"),
+            (vec!["--lose-uav", "0@80"], "lose.slot"),
+            (vec!["--position-noise", "nan"], "position_noise"),
+            (vec!["--position-noise", "2"], "position_noise"),
+            (vec!["--user-speed", "-1"], "'-1'"),
+            (vec!["--user-speed", "3"], "user_speed"),
+            (vec!["--transmission-range", "0.5"], "detection_range"),
+            (vec!["--report-layout", "256"], "from 0 to 255"),
+            (vec!["--report", "r", "--server", "localhost:1"], "leave out --server"),
+            (vec!["--lose-uav", "0@1", "--server", "localhost:1"], "leave out --server"),
+        ] {
+            let refused = parse(&words).and_then(|args| check(&args).map(|_| ()).map_err(|e| format!("{e:#}")));
+            let error = refused.expect_err("must be refused");
+            assert!(error.contains(hint), "{words:?}: {error}");
+        }
+    }
+
+    #[test]
+    fn the_command_line_repeats_itself() {
+        let words = ["--policy", "it's mine.safetensors", "--uavs", "4", "--lose-uav", "1@20", "--position-noise", "0.02"];
+        let line = parse(&words).expect("flags parse").command_line();
+        assert_eq!(
+            line,
+            "qedgix evaluate --policy sweep --policy 'it'\\''s mine.safetensors' --layouts eval-v1 --episodes 256 --uavs 4 \
+             --position-noise 0.02 --lose-uav 1@20"
+        );
+    }
 }

@@ -2,12 +2,14 @@
 
 mod bench;
 mod client;
+mod comparison;
 mod demo;
 mod evaluate;
 mod experiment;
 mod files;
 mod fly;
 mod progress;
+mod report;
 mod run_args;
 mod serve;
 mod table;

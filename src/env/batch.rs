@@ -35,6 +35,8 @@ pub struct BatchEnv {
     moves: Vec<Point>,
     /// Per-user weights, scaled to mean 1.
     weights: Vec<f64>,
+    /// (M) UAVs that neither move nor collect.
+    grounded: Vec<bool>,
     uav_xy: Vec<f32>,
     user_xy: Vec<f32>,
     aoi: Vec<f32>,
@@ -59,6 +61,7 @@ impl BatchEnv {
             slot: 0,
             moves: DIRECTIONS[..config.headings()].iter().map(|d| [d[0] * config.speed, d[1] * config.speed]).collect(),
             weights: config.user_weights(),
+            grounded: vec![false; m],
             uav_xy: vec![0.0; copies * m * 2],
             user_xy: vec![0.0; copies * n * 2],
             aoi: vec![0.0; copies * n],
@@ -80,6 +83,7 @@ impl BatchEnv {
         assert_eq!(seeds.len(), self.copies, "one seed per copy");
         let (m, n) = (self.config.uavs, self.config.users);
         self.slot = 0;
+        self.grounded.fill(false);
         self.aoi.fill(0.0);
         self.reward.fill(0.0);
         self.tally.clear();
@@ -110,7 +114,11 @@ impl BatchEnv {
         assert!(self.slot < self.config.slots, "the episode is over");
         assert_eq!(actions.len(), self.copies * self.config.uavs, "one action per UAV");
         let clamp = self.config.boundary == Boundary::Clamp;
-        for (xy, &action) in self.uav_xy.chunks_exact_mut(2).zip(actions) {
+        let flying = self.grounded.iter().cycle().map(|grounded| !grounded);
+        for ((xy, &action), flying) in self.uav_xy.chunks_exact_mut(2).zip(actions).zip(flying) {
+            if !flying {
+                continue;
+            }
             let by = self.moves[action as usize];
             for (x, by) in xy.iter_mut().zip(by) {
                 let to = f64::from(*x) + by;
@@ -158,9 +166,9 @@ impl BatchEnv {
             let mut sum = 0.0;
             for ((user, age), weight) in users.chunks_exact(2).zip(aoi.iter_mut()).zip(&self.weights) {
                 let (x, y) = (f64::from(user[0]), f64::from(user[1]));
-                let collected = uavs.chunks_exact(2).any(|uav| {
+                let collected = uavs.chunks_exact(2).zip(&self.grounded).any(|(uav, grounded)| {
                     let (dx, dy) = (f64::from(uav[0]) - x, f64::from(uav[1]) - y);
-                    dx * dx + dy * dy <= range
+                    dx * dx + dy * dy <= range && !grounded
                 });
                 *age = if collected { 0.0 } else { *age + 1.0 };
                 sum += weight * f64::from(*age);
@@ -168,6 +176,24 @@ impl BatchEnv {
             self.tally.add(b, aoi);
             self.reward[b] = (-factor * sum / n as f64) as f32;
         }
+    }
+
+    /// Until the next reset, UAV `uav` of every copy stays where it is, whatever its actions, and collects nothing.
+    ///
+    /// # Panics
+    /// When there is no such UAV.
+    pub fn ground(&mut self, uav: usize) {
+        self.grounded[uav] = true;
+    }
+
+    /// Mean AoI over the users of copy `b` in this slot (weighted, where users have weights), in slots.
+    ///
+    /// # Panics
+    /// When `b` is not a copy.
+    pub fn mean_aoi(&self, b: usize) -> f64 {
+        let n = self.config.users;
+        let aoi = &self.aoi[b * n..(b + 1) * n];
+        aoi.iter().zip(&self.weights).map(|(&a, w)| w * f64::from(a)).sum::<f64>() / n as f64
     }
 
     /// Figures of copy `b` over the slots flown so far.

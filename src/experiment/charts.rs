@@ -52,6 +52,7 @@ fn convergence(experiment: &Experiment, report: &Report, curves: &[Curve]) -> Ve
             .map(|row| bar(&row.series, &row.mean_aoi))
             .chain(report.baselines.iter().filter(|b| b.point == point.name).map(|b| bar(&b.name, &b.mean_aoi)))
             .collect();
+        let title = format!("{title}: best weights");
         files.push((named("reached", &point.name), bars(&title, &format!("{AOI} on {}", report.layouts), &reached)));
     }
     files

@@ -65,7 +65,8 @@ impl Table {
 /// What a table says about the runs it is for: the same fields in `run`, in a series and in a point.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Section {
-    path: String,
+    /// What stands before its fields in a message.
+    prefix: String,
     algorithm: Option<Algorithm>,
     preset: Option<Preset>,
     environment: Map<String, Value>,
@@ -78,7 +79,7 @@ impl Section {
 
     pub fn read(table: &mut Table) -> Result<Self, Invalid> {
         Ok(Self {
-            path: table.path.clone(),
+            prefix: table.at(""),
             algorithm: table.optional("algorithm")?,
             preset: table.optional("preset")?,
             environment: table.optional("environment")?.unwrap_or_default(),
@@ -89,7 +90,7 @@ impl Section {
     /// What the command line says.
     pub fn overrides(overrides: &Overrides) -> Self {
         let Overrides { environment, training, .. } = overrides.clone();
-        Self { path: "--set".into(), environment, training, ..Self::default() }
+        Self { prefix: "on the command line, ".into(), environment, training, ..Self::default() }
     }
 
     /// The configuration of one run: later sections override earlier ones.
@@ -119,7 +120,7 @@ impl Section {
             };
             // Where no section has the field, it is the whole that does not fit together.
             if let Some(section) = sections.iter().rev().find(holds) {
-                wrong.field = format!("{}.{}", section.path, wrong.field);
+                wrong.field = format!("{}{}", section.prefix, wrong.field);
             }
             wrong
         })

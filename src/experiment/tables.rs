@@ -22,8 +22,7 @@ pub fn readme(experiment: &Experiment, report: &Report, command: &str, figures: 
     page.line("## Learned policies");
     let seeds: Vec<String> = report.seeds.iter().map(|seed| format!("seed {seed}")).collect();
     let header = ["point", "series", "mean AoI", "95 % interval", "last weights", "p95", "peak", "coverage", "fairness"];
-    page.row(points, header.into_iter().chain(seeds.iter().map(String::as_str)));
-    page.rule(points, header.len() + seeds.len());
+    page.head(points, header.into_iter().chain(seeds.iter().map(String::as_str)));
     for row in &report.rows {
         let last = row.last_mean_aoi.map_or("diverged".to_owned(), |last| format!("{:.2}", last.mean));
         let m = &row.mean;
@@ -42,8 +41,7 @@ pub fn readme(experiment: &Experiment, report: &Report, command: &str, figures: 
     }
     if !report.baselines.is_empty() {
         page.line("## Baselines on the same layouts");
-        page.row(points, ["point", "policy", "mean AoI", "95 % interval", "p95", "peak", "coverage", "fairness"]);
-        page.rule(points, 8);
+        page.head(points, ["point", "policy", "mean AoI", "95 % interval", "p95", "peak", "coverage", "fairness"]);
         for b in &report.baselines {
             let m = &b.mean;
             page.row(
@@ -64,8 +62,7 @@ pub fn readme(experiment: &Experiment, report: &Report, command: &str, figures: 
     if !report.differences.is_empty() {
         page.line("## Differences on the same layouts and seeds");
         page.line("First minus second: negative where the first keeps data fresher.");
-        page.row(points, ["point", "first", "second", "difference", "95 % interval", "first is better"]);
-        page.rule(points, 6);
+        page.head(points, ["point", "first", "second", "difference", "95 % interval", "first is better"]);
         for d in &report.differences {
             page.row(
                 points,
@@ -81,8 +78,7 @@ pub fn readme(experiment: &Experiment, report: &Report, command: &str, figures: 
         }
     }
     page.line("## Runs");
-    page.row(points, ["point", "series", "seed", "steps", "best step", "best", "last", "folder"]);
-    page.rule(points, 8);
+    page.head(points, ["point", "series", "seed", "steps", "best step", "best", "last", "folder"]);
     for run in &report.runs {
         page.row(
             points,
@@ -112,9 +108,15 @@ impl Page {
     /// A paragraph, a heading, a picture.
     fn line(&mut self, text: &str) {
         writeln!(self.0, "\n{text}").expect("a string takes what is written");
-        if text.starts_with("##") || text.starts_with("First") {
-            self.0.push('\n');
-        }
+    }
+
+    /// The head of a table.
+    fn head<T: AsRef<str>>(&mut self, points: bool, cells: impl IntoIterator<Item = T>) {
+        let cells: Vec<T> = cells.into_iter().collect();
+        let columns = cells.len();
+        self.0.push('\n');
+        self.row(points, cells);
+        self.row(points, std::iter::repeat_n("---", columns));
     }
 
     /// A row of a table; the first cell, the point, only where there are points.
@@ -122,9 +124,5 @@ impl Page {
         let cells: Vec<String> =
             cells.into_iter().skip(usize::from(!points)).map(|cell| cell.as_ref().replace('|', "\\|")).collect();
         writeln!(self.0, "| {} |", cells.join(" | ")).expect("a string takes what is written");
-    }
-
-    fn rule(&mut self, points: bool, columns: usize) {
-        self.row(points, std::iter::repeat_n("---", columns));
     }
 }

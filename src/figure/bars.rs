@@ -30,7 +30,7 @@ pub fn bars(title: &str, y: &str, bars: &[Bar]) -> String {
         for (i, bar) in bars[..rows].iter().enumerate() {
             let at = -(i as f64);
             let row = plot.backend_coord(&(0.0, at)).1;
-            sheet.draw(&Text::new(cut(&bar.name, 26), (left - 10, row), text(13, INK, HPos::Right, VPos::Center)))?;
+            sheet.draw(&Text::new(cut(&bar.name, 26), (left - 10, row), text(15, INK, HPos::Right, VPos::Center)))?;
             if !drawable(bar.mean) {
                 continue;
             }
@@ -38,13 +38,14 @@ pub fn bars(title: &str, y: &str, bars: &[Bar]) -> String {
             let interval = [bar.low.min(bar.high), bar.low.max(bar.high)];
             let known = interval.iter().all(|&x| drawable(x));
             if known {
-                let style = INK.stroke_width(2);
-                let middle = bar.mean.clamp(interval[0], interval[1]);
-                plot.draw_series([ErrorBar::new_horizontal(at, interval[0], middle, interval[1], style, 10)])?;
+                let [low, high] = interval;
+                let strokes =
+                    [[(low, at), (high, at)], [(low, at - 0.13), (low, at + 0.13)], [(high, at - 0.13), (high, at + 0.13)]];
+                plot.draw_series(strokes.map(|stroke| PathElement::new(stroke, INK.stroke_width(2))))?;
             }
             let end = if known { bar.mean.max(interval[1]) } else { bar.mean }.max(0.0);
             let behind = plot.backend_coord(&(end, at)).0 + 9;
-            sheet.draw(&Text::new(value(bar.mean), (behind, row), text(13, INK, HPos::Left, VPos::Center)))?;
+            sheet.draw(&Text::new(value(bar.mean), (behind, row), text(15, INK, HPos::Left, VPos::Center)))?;
         }
         plot.draw_series([PathElement::new([(0.0, 0.5 - rows as f64), (0.0, 0.5)], INK)])?;
         Ok(())

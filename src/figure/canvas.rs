@@ -65,7 +65,7 @@ pub(super) fn draw(size: (u32, u32), body: impl FnOnce(&Sheet) -> Drawn) -> Stri
 pub(super) fn no_data(size: (u32, u32), title: &str) -> String {
     draw(size, |sheet| {
         heading(sheet, title)?;
-        let style = text(15, AXIS, HPos::Center, VPos::Center);
+        let style = text(17, AXIS, HPos::Center, VPos::Center);
         let middle = (size.0 as i32 / 2, size.1 as i32 / 2);
         sheet.draw(&Text::new("no data", middle, style))
     })
@@ -78,7 +78,7 @@ pub(super) fn text(size: i32, colour: RGBColor, horizontal: HPos, vertical: VPos
 
 /// The heading of a figure.
 pub(super) fn heading(sheet: &Sheet, title: &str) -> Drawn {
-    let style = ("sans-serif", 17, FontStyle::Bold).into_font().color(&INK).pos(Pos::new(HPos::Left, VPos::Center));
+    let style = ("sans-serif", 19, FontStyle::Bold).into_font().color(&INK).pos(Pos::new(HPos::Left, VPos::Center));
     sheet.draw(&Text::new(cut(title, 80), (16, 22), style))
 }
 
@@ -105,8 +105,8 @@ pub(super) fn axes<'b>(
         .y_labels(8)
         .x_label_formatter(&tick)
         .y_label_formatter(&tick)
-        .label_style(("sans-serif", 13).into_font().color(&INK))
-        .axis_desc_style(("sans-serif", 14).into_font().color(&INK))
+        .label_style(("sans-serif", 15).into_font().color(&INK))
+        .axis_desc_style(("sans-serif", 16).into_font().color(&INK))
         .x_desc(cut(x_name, 70));
     if y_name.is_empty() {
         mesh.disable_y_mesh().disable_y_axis();
@@ -135,7 +135,7 @@ pub(super) fn legend(sheet: &Sheet, entries: &[(Key, String)]) -> Drawn {
     let left = (width - SIDE) as i32 + 14;
     let fit = ((height as i32 - TOP as i32 - 60) / ROW).max(1) as usize;
     let shown = if entries.len() > fit { fit - 1 } else { entries.len() };
-    let style = text(13, INK, HPos::Left, VPos::Center);
+    let style = text(15, INK, HPos::Left, VPos::Center);
     let place = |row: usize| TOP as i32 + 10 + ROW * row as i32;
     for (row, (key, name)) in entries[..shown].iter().enumerate() {
         let y = place(row);

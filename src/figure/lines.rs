@@ -30,10 +30,7 @@ pub fn distribution(title: &str, x: &str, series: &[(String, Vec<f64>)]) -> Stri
         let mut values: Vec<f64> = values.iter().copied().filter(|&v| drawable(v)).collect();
         values.sort_by(f64::total_cmp);
         let share = |i: usize| i as f64 / values.len() as f64;
-        let mut points: Vec<[f64; 2]> = vec![[axis.start, 0.0]];
-        points.extend(values.iter().enumerate().flat_map(|(i, &v)| [[v, share(i)], [v, share(i + 1)]]));
-        points.push([axis.end, 1.0]);
-        let points = if values.is_empty() { Vec::new() } else { points };
+        let points = values.iter().enumerate().flat_map(|(i, &v)| [[v, share(i)], [v, share(i + 1)]]).collect();
         Series { name: name.clone(), points, band: None }
     });
     let chart = Chart {

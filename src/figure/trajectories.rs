@@ -52,7 +52,7 @@ pub fn trajectories(title: &str, flight: &Flight) -> String {
             area.draw(&Circle::new((*x, *y), 5, USER.filled()))?;
             if users.len() <= NUMBERED {
                 let words =
-                    EmptyElement::at((*x, *y)) + Text::new(number.to_string(), (8, -10), text(13, INK, HPos::Left, VPos::Center));
+                    EmptyElement::at((*x, *y)) + Text::new(number.to_string(), (8, -10), text(15, INK, HPos::Left, VPos::Center));
                 area.draw(&words)?;
             }
         }

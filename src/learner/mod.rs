@@ -1,8 +1,10 @@
 //! Learning (spec 5): replay, rollout, targets, the update, training as an iterator of events, evaluation.
 
+mod disturbance;
 mod episodes;
 mod evaluation;
 mod event;
+mod flight;
 pub mod objective;
 pub mod replay;
 mod rollout;
@@ -10,9 +12,11 @@ mod snapshot;
 mod trainer;
 mod update;
 
+pub use disturbance::{Disturbance, Loss};
 pub use episodes::{Episodes, Symmetry};
-pub use evaluation::{Difference, Interval, LAYOUTS, Summary, difference, evaluate, layouts, summarize};
+pub use evaluation::{Difference, Interval, LAYOUTS, Layouts, Summary, difference, layouts, summarize};
 pub use event::{Event, Iteration};
+pub use flight::{Survey, Track, evaluate, survey};
 pub use rollout::Rollout;
 pub use snapshot::SnapshotError;
 pub use trainer::{Evaluated, Trainer};

@@ -130,9 +130,13 @@ impl Folder {
     /// Ends the run: its result is there, its snapshot is of no more use.
     pub fn finish(&self, outcome: &Outcome) -> anyhow::Result<()> {
         self.write("result.json", &serde_json::to_vec(outcome)?)?;
-        match fs::remove_file(self.path.join("snapshot")) {
-            Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(e).context("removing a snapshot"),
-            _ => Ok(()),
+        // What a process left that was killed while it wrote goes too.
+        for name in ["snapshot", "snapshot.partial"] {
+            match fs::remove_file(self.path.join(name)) {
+                Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(e).context("removing a snapshot"),
+                _ => {}
+            }
         }
+        Ok(())
     }
 }

@@ -103,9 +103,11 @@ fn read(args: &ExperimentArgs) -> anyhow::Result<Experiment> {
     Experiment::resolve(document, &overrides).context(name)
 }
 
-/// The command that does the same again.
+/// The command that does the same again, from the same directory.
 fn command(args: &ExperimentArgs) -> String {
-    let mut words = vec!["qedgix experiment".to_owned(), args.file.display().to_string()];
+    let here = std::env::current_dir().unwrap_or_default();
+    let file = args.file.strip_prefix(here).unwrap_or(&args.file);
+    let mut words = vec!["qedgix experiment".to_owned(), file.display().to_string()];
     if let Some(steps) = args.steps {
         words.push(format!("--steps {steps}"));
     }

@@ -11,7 +11,7 @@ use indicatif::{MultiProgress, ProgressBar};
 
 use super::folder::{Folder, Progress};
 use crate::cli::progress;
-use crate::experiment::{Curve, Experiment, Flown, Outcome, Run};
+use crate::experiment::{Experiment, Flown, Outcome, Run};
 use crate::learner::{Event, Trainer, evaluate};
 
 /// What the threads share.
@@ -30,7 +30,8 @@ impl<'a> Runner<'a> {
     /// A runner of this experiment, its files below `root`. Set, `stop` makes it keep what is under way and return.
     pub fn new(experiment: &'a Experiment, root: &'a Path, threads: usize, stop: &'a AtomicBool) -> Self {
         let bars = MultiProgress::new();
-        let overall = progress::bar_among(&bars, experiment.runs.len() as u64, "runs");
+        let overall =
+            progress::bar_among(&bars, experiment.runs.iter().map(|run| run.config.training.steps).sum(), "steps of all runs");
         Self {
             experiment,
             root,
@@ -54,7 +55,10 @@ impl<'a> Runner<'a> {
                 pending.push(run);
             }
         }
-        self.overall.set_position((self.experiment.runs.len() - pending.len()) as u64);
+        let left: u64 = pending.iter().map(|run| run.config.training.steps).sum();
+        self.overall.set_position(self.overall.length().unwrap_or(left) - left);
+        self.overall.reset_eta();
+        self.count(pending.len());
         self.unfinished.store(pending.len(), Ordering::Relaxed);
         let workers = self.threads.min(pending.len());
         let ended: Vec<anyhow::Result<()>> = std::thread::scope(|scope| {
@@ -88,14 +92,18 @@ impl<'a> Runner<'a> {
                 self.stop.store(true, Ordering::Relaxed);
             }
             if let Some(outcome) = ended? {
-                self.unfinished.fetch_sub(1, Ordering::Relaxed);
-                self.overall.inc(1);
+                self.count(self.unfinished.fetch_sub(1, Ordering::Relaxed) - 1);
                 let aoi = outcome.best.episodes.iter().map(|e| e.mean_aoi).sum::<f64>() / outcome.best.episodes.len() as f64;
                 let note = if outcome.diverged { "  (diverged)" } else { "" };
                 self.say(&format!("done  {label}: mean AoI {aoi:.2} on {}{note}", outcome.layouts));
             }
         }
         Ok(())
+    }
+
+    fn count(&self, unfinished: usize) {
+        let all = self.experiment.runs.len();
+        self.overall.set_message(format!("{} of {all} runs done", all - unfinished));
     }
 
     /// A line above the bars, or on standard error where nobody sees bars.
@@ -143,13 +151,18 @@ impl<'a> Runner<'a> {
             trained,
             diverged,
         };
-        bar.set_position(trainer.step());
+        let steps = run.config.training.steps;
+        let mut told = trainer.step().min(steps);
+        bar.set_position(told);
         bar.reset_eta();
+        self.overall.inc(told);
         while let Some(event) = trainer.next() {
             for (step, name, value) in event.rows() {
                 curve.push(step, name, value);
             }
-            bar.set_position(trainer.step().min(run.config.training.steps));
+            let step = trainer.step().min(steps);
+            bar.set_position(step);
+            self.overall.inc(step - std::mem::replace(&mut told, step));
             let evaluated = if let Event::Evaluation { step, metrics } = event { Some((step, metrics.mean_aoi)) } else { None };
             if evaluated.is_none() && !self.stopped() {
                 continue;
@@ -170,15 +183,10 @@ impl<'a> Runner<'a> {
                 trainer = Trainer::restore(&snapshot, threads)?;
             }
         }
-        self.keep(&trainer, folder, &curve, |diverged| progress(&trainer, true, diverged))?;
-        Ok(true)
-    }
-
-    /// Keeps the weights of a run that is over.
-    fn keep(&self, trainer: &Trainer, folder: &Folder, curve: &Curve, progress: impl Fn(bool) -> Progress) -> anyhow::Result<()> {
         let best = trainer.best()?.context("a run that is over has been evaluated")?;
         // The last weights of a run that diverged are no checkpoint.
         let last = trainer.checkpoint().ok();
-        folder.save_weights(&best, last.as_ref(), curve, &progress(last.is_none()))
+        folder.save_weights(&best, last.as_ref(), &curve, &progress(&trainer, true, last.is_none()))?;
+        Ok(true)
     }
 }

@@ -31,7 +31,7 @@ struct Flown {
 /// The best tour of UAV `uav` through these users: a short one, begun at the nearest users, either way round.
 fn best_tour(scene: &Scene, uav: usize, mut users: Vec<u32>) -> Flown {
     /// Users that a tour may begin with.
-    const BEGINNINGS: usize = 3;
+    const BEGINNINGS: usize = 2;
     users.sort_unstable();
     shorten(&mut users, scene.users);
     let n = users.len();

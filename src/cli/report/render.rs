@@ -1,0 +1,170 @@
+//! A report as a page that needs nothing else, and as Markdown beside its figures. Names come from users and are escaped.
+
+use std::fmt::Write;
+
+/// A report.
+pub(super) struct Document {
+    pub(super) title: String,
+    /// The command that repeats it.
+    pub(super) command: String,
+    pub(super) sections: Vec<Section>,
+}
+
+/// A heading with what follows it.
+pub(super) struct Section {
+    pub(super) title: String,
+    pub(super) text: String,
+    pub(super) table: Option<Table>,
+    pub(super) figures: Vec<Figure>,
+}
+
+/// Rows as wide as the header; columns from `numbers_from` on are aligned right.
+pub(super) struct Table {
+    pub(super) header: Vec<String>,
+    pub(super) rows: Vec<Vec<String>>,
+    pub(super) numbers_from: usize,
+}
+
+/// A figure and the file it is in.
+pub(super) struct Figure {
+    pub(super) file: String,
+    pub(super) caption: String,
+    pub(super) svg: String,
+}
+
+const STYLE: &str = "
+:root { color-scheme: light; }
+body { margin: 0 auto; max-width: 94rem; padding: 2rem 1.5rem 4rem; background: #fff; color: #222;
+  font: 16px/1.5 system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif; }
+h1 { font-size: 1.8rem; margin: 0 0 1rem; }
+h2 { font-size: 1.25rem; margin: 2.5rem 0 .5rem; padding-top: 1rem; border-top: 1px solid #e4e4e4; }
+p { max-width: 48rem; margin: .5rem 0 1rem; }
+pre { background: #f6f6f6; padding: .7rem 1rem; border-radius: 6px; white-space: pre-wrap; overflow-wrap: anywhere; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; margin: 0 0 1.2rem; font-variant-numeric: tabular-nums; }
+th, td { padding: .35rem .9rem; text-align: left; border-bottom: 1px solid #e4e4e4; overflow-wrap: anywhere; }
+th { border-bottom: 2px solid #999; font-weight: 600; }
+.n { text-align: right; white-space: nowrap; }
+.figures { display: flex; flex-wrap: wrap; gap: 1rem; }
+figure { margin: 0; max-width: 100%; }
+figure svg { max-width: 100%; height: auto; display: block; }
+figcaption { color: #555; font-size: .9rem; padding-left: 1rem; overflow-wrap: anywhere; }
+footer { margin-top: 3rem; color: #777; font-size: .9rem; }
+";
+
+/// The page.
+pub(super) fn html(document: &Document) -> String {
+    let title = escaped(&document.title);
+    let mut page = format!(
+        "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<title>{title}</title>\n\
+         <style>{STYLE}</style>\n</head>\n<body>\n<h1>{title}</h1>\n<pre>{}</pre>\n",
+        escaped(&document.command)
+    );
+    for section in &document.sections {
+        page += &format!("<h2>{}</h2>\n<p>{}</p>\n", escaped(&section.title), code(&escaped(&section.text)));
+        if let Some(table) = &section.table {
+            page += &html_table(table);
+        }
+        if section.figures.is_empty() {
+            continue;
+        }
+        page += "<div class=\"figures\">\n";
+        for figure in &section.figures {
+            let caption = escaped(&figure.caption);
+            page += &format!("<figure>\n{}<figcaption>{caption}</figcaption>\n</figure>\n", figure.svg);
+        }
+        page += "</div>\n";
+    }
+    page + &format!("<footer>qedgix {}</footer>\n</body>\n</html>\n", env!("CARGO_PKG_VERSION"))
+}
+
+fn html_table(table: &Table) -> String {
+    let cells = |row: &[String], tag: &str| -> String {
+        let cell = |(i, text): (usize, &String)| {
+            let class = if i >= table.numbers_from { " class=\"n\"" } else { "" };
+            format!("<{tag}{class}>{}</{tag}>", escaped(text))
+        };
+        format!("<tr>{}</tr>\n", row.iter().enumerate().map(cell).collect::<String>())
+    };
+    let rows: String = table.rows.iter().map(|row| cells(row, "td")).collect();
+    format!("<div class=\"wide\"><table>\n<thead>{}</thead>\n<tbody>{rows}</tbody>\n</table></div>\n", cells(&table.header, "th"))
+}
+
+/// The same as Markdown.
+pub(super) fn markdown(document: &Document) -> String {
+    let mut text = format!("# {}\n\n```sh\n{}\n```\n", document.title, document.command.replace("```", "'''"));
+    for section in &document.sections {
+        let _ = write!(text, "\n## {}\n\n{}\n", plain(&section.title), section.text);
+        if let Some(table) = &section.table {
+            let line = |cells: Vec<String>| format!("| {} |\n", cells.join(" | "));
+            text += "\n";
+            text += &line(table.header.iter().map(|c| plain(c)).collect());
+            text +=
+                &line((0..table.header.len()).map(|i| if i < table.numbers_from { ":--" } else { "--:" }.to_owned()).collect());
+            text.extend(table.rows.iter().map(|row| line(row.iter().map(|c| plain(c)).collect())));
+        }
+        for figure in &section.figures {
+            let _ = write!(text, "\n![{}]({})\n", plain(&figure.caption), figure.file);
+        }
+    }
+    text
+}
+
+/// `text` as HTML shows it, in elements and in attributes.
+fn escaped(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '<' => out += "&lt;",
+            '>' => out += "&gt;",
+            '&' => out += "&amp;",
+            '"' => out += "&quot;",
+            '\'' => out += "&#39;",
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+/// Escaped text with what stands between backquotes as code.
+fn code(text: &str) -> String {
+    let parts = text.split('`').enumerate();
+    parts.map(|(i, part)| if i % 2 == 1 { format!("<code>{part}</code>") } else { part.to_owned() }).collect()
+}
+
+/// `text` in one line without anything that Markdown would take for markup.
+fn plain(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '\\' | '`' | '*' | '_' | '|' | '[' | ']' | '#' => out.extend(['\\', c]),
+            '<' => out += "&lt;",
+            '&' => out += "&amp;",
+            c if c.is_control() => out.push(' '),
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_cannot_break_out() {
+        let name = "<script>alert('x')</script> | `a` & \"b\"\n# c";
+        let table = Table { header: vec!["policy".to_owned()], rows: vec![vec![name.to_owned()]], numbers_from: 1 };
+        let figure = Figure { file: "a.svg".to_owned(), caption: name.to_owned(), svg: "<svg></svg>\n".to_owned() };
+        let section = Section { title: name.to_owned(), text: "t".to_owned(), table: Some(table), figures: vec![figure] };
+        let document = Document { title: "t".to_owned(), command: name.to_owned(), sections: vec![section] };
+        let page = html(&document);
+        assert!(!page.contains("<script") && page.contains("&lt;script&gt;"));
+        assert!(page.contains("<svg></svg>") && !page.contains("http"));
+        let text = markdown(&document);
+        let (_, after_command) = text.split_once("```\n\n").expect("the command comes first");
+        assert!(!after_command.contains("<script") && !after_command.contains("\n# c"));
+        assert!(after_command.contains("![") && after_command.contains("(a.svg)"));
+    }
+}

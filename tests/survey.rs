@@ -1,0 +1,184 @@
+//! What reports are made of: surveys agree with plain evaluations, and disturbances do what they say and no more.
+
+use std::sync::Mutex;
+
+use qedgix::env::{EnvConfig, EpisodeMetrics};
+use qedgix::invalid::Invalid;
+use qedgix::learner::{Disturbance, Loss, Survey, evaluate, layouts, survey};
+use qedgix::policy::baselines::{self, World};
+use qedgix::policy::{Needs, Policy, Turn};
+
+fn flown(name: &str, env: &EnvConfig, disturbance: &Disturbance, threads: usize) -> Survey {
+    let policy = baselines::by_name(name, World::from(env)).unwrap();
+    survey(&*policy, env, &layouts("valid-v1").unwrap().seeds(11), 7, disturbance, threads).unwrap()
+}
+
+fn losing(uav: usize, slot: usize) -> Disturbance {
+    Disturbance { lose: Some(Loss { uav, slot }), ..Disturbance::default() }
+}
+
+#[test]
+fn without_disturbance_a_survey_is_an_evaluation() {
+    let env = EnvConfig { user_speed: 0.01, ..EnvConfig::default() };
+    let seeds = layouts("valid-v1").unwrap().seeds(11);
+    for name in ["sweep", "random", "greedy-global"] {
+        let plain = evaluate(&*baselines::by_name(name, World::default()).unwrap(), &env, &seeds, 1).unwrap();
+        let survey = flown(name, &env, &Disturbance::default(), 1);
+        assert_eq!(plain, survey.episodes, "{name}");
+        assert_eq!(survey.aoi.len(), env.slots + 1);
+        assert_eq!(survey.aoi[0], 0.0);
+        let over_slots = survey.aoi[1..].iter().sum::<f64>() / env.slots as f64;
+        assert!((over_slots - EpisodeMetrics::mean(&plain).mean_aoi).abs() < 1e-9, "{name}: {over_slots}");
+    }
+}
+
+#[test]
+fn the_track_is_the_episode_that_was_asked_for() {
+    let env = EnvConfig::default();
+    let Survey { episodes, track, .. } = flown("sweep", &env, &Disturbance::default(), 3);
+    assert_eq!(track.seed, layouts("valid-v1").unwrap().first + 7);
+    assert_eq!((track.uavs.len(), track.users.len(), track.aoi.len()), (env.uavs, env.users, env.users));
+    assert!(track.uavs.iter().chain(&track.users).all(|path| path.len() == env.slots + 1));
+    let sum: f32 = track.aoi.iter().flat_map(|ages| &ages[1..]).sum();
+    assert!((f64::from(sum) / (env.users * env.slots) as f64 - episodes[7].mean_aoi).abs() < 1e-9);
+}
+
+#[test]
+fn any_number_of_threads_gives_the_same_bits() {
+    let env = EnvConfig { user_speed: 0.01, ..EnvConfig::default() };
+    let disturbance = Disturbance { position_noise: 0.02, ..losing(1, 20) };
+    for name in ["sweep", "nearest"] {
+        let one = flown(name, &env, &disturbance, 1);
+        for threads in [2, 3, 50] {
+            assert_eq!(one, flown(name, &env, &disturbance, threads), "{name}, {threads} threads");
+        }
+    }
+}
+
+#[test]
+fn a_lost_uav_stays_where_it_was_and_collects_no_more() {
+    // One UAV, one user in its range: collected in every slot until the UAV is lost.
+    let middle = vec![[0.5, 0.5]];
+    let env = EnvConfig {
+        uavs: 1,
+        users: 1,
+        layout: qedgix::env::Layout::Given(middle),
+        transmission_range: 0.2,
+        speed: 0.0,
+        ..EnvConfig::default()
+    };
+    let track = flown("random", &env, &losing(0, 30), 1).track;
+    assert!(track.aoi[0][..=30].iter().all(|&a| a == 0.0));
+    assert!(track.aoi[0][31..].iter().enumerate().all(|(i, &a)| a == i as f32 + 1.0));
+
+    let env = EnvConfig::default();
+    let track = flown("sweep", &env, &losing(2, 10), 1).track;
+    let before = flown("sweep", &env, &Disturbance::default(), 1).track;
+    assert!(track.uavs[2][10..].iter().all(|at| *at == track.uavs[2][10]));
+    assert_eq!(track.uavs[2][..=10], before.uavs[2][..=10]);
+    assert_ne!(track.uavs[0][10], track.uavs[0][11], "the others fly on");
+}
+
+/// Flies east and writes down, per slot, what it was shown: who sees whom, and all positions.
+struct Spy(Mutex<Vec<Shown>>);
+
+#[derive(Clone, Debug, PartialEq)]
+struct Shown {
+    step: u64,
+    seen: Vec<Vec<u32>>,
+    uavs: Vec<[f64; 2]>,
+    users: Vec<[f64; 2]>,
+}
+
+impl Spy {
+    fn shown(env: &EnvConfig, disturbance: &Disturbance) -> Vec<Shown> {
+        let spy = Self(Mutex::default());
+        survey(&spy, env, &[5], 0, disturbance, 1).unwrap();
+        spy.0.into_inner().unwrap()
+    }
+}
+
+impl Policy for Spy {
+    fn actions(&self) -> usize {
+        8
+    }
+    fn needs(&self) -> Needs {
+        Needs::FullScene
+    }
+    fn detection_range(&self) -> f64 {
+        0.28
+    }
+    fn check_fleet(&self, _uavs: usize, _users: usize) -> Result<(), Invalid> {
+        Ok(())
+    }
+    fn memory_len(&self, _uavs: usize, _users: usize) -> usize {
+        0
+    }
+    fn start(&self, _uavs: usize, _users: usize, _seed: u64, _memory: &mut [f32]) {}
+    fn act(&self, turns: &mut [Turn<'_>]) {
+        for turn in turns {
+            let slot = turn.slot;
+            let seen = (0..slot.uavs() + slot.users()).map(|i| slot.detections(i).iter().map(|d| d.target).collect());
+            self.0.lock().unwrap().push(Shown {
+                step: turn.step,
+                seen: seen.collect(),
+                uavs: slot.uav_positions().unwrap().to_vec(),
+                users: slot.user_positions().unwrap().to_vec(),
+            });
+            turn.headings.fill(0);
+        }
+    }
+}
+
+#[test]
+fn a_lost_uav_neither_sees_nor_is_seen() {
+    for users in [5, 60] {
+        // The largest ranges there are, and errors as large as they may be.
+        let env = EnvConfig { users, detection_range: 2.0, boundary: qedgix::env::Boundary::Free, ..EnvConfig::default() };
+        for position_noise in [0.0, 1.0] {
+            let shown = Spy::shown(&env, &Disturbance { position_noise, ..losing(1, 40) });
+            for Shown { step, seen, uavs, .. } in shown {
+                let alone = seen[1].is_empty() && seen.iter().all(|targets| !targets.contains(&1));
+                if position_noise == 0.0 || step >= 40 {
+                    assert_eq!(alone, step >= 40, "slot {step}");
+                }
+                assert!(uavs.iter().flatten().all(|x| x.is_finite()));
+            }
+        }
+    }
+}
+
+#[test]
+fn noise_moves_what_is_seen_by_its_standard_deviation_and_nothing_else() {
+    let env = EnvConfig { users: 40, slots: 200, ..EnvConfig::default() };
+    let truth = Spy::shown(&env, &Disturbance::default());
+    let noisy = Spy::shown(&env, &Disturbance { position_noise: 0.05, ..Disturbance::default() });
+    assert_eq!(noisy, Spy::shown(&env, &Disturbance { position_noise: 0.05, ..Disturbance::default() }));
+    let positions =
+        |shown: &[Shown]| -> Vec<f64> { shown.iter().flat_map(|s| s.uavs.iter().chain(&s.users).flatten().copied()).collect() };
+    let errors: Vec<f64> = positions(&noisy).iter().zip(positions(&truth)).map(|(a, b)| a - b).collect();
+    let n = errors.len() as f64;
+    let mean = errors.iter().sum::<f64>() / n;
+    let deviation = (errors.iter().map(|e| e * e).sum::<f64>() / n).sqrt();
+    assert!(mean.abs() < 2e-3 && (deviation - 0.05).abs() < 2e-3, "mean {mean}, deviation {deviation}");
+    // It flew the same way: the spy ignores what it sees, so the world must not have changed.
+    let metrics = |noise| {
+        survey(&Spy(Mutex::default()), &env, &[5], 0, &Disturbance { position_noise: noise, ..Disturbance::default() }, 1)
+    };
+    assert_eq!(metrics(0.05).unwrap(), metrics(0.0).unwrap());
+}
+
+#[test]
+fn what_does_not_fit_is_named() {
+    let env = EnvConfig::default();
+    for (disturbance, field) in [
+        (losing(3, 0), "lose.uav"),
+        (losing(0, 80), "lose.slot"),
+        (Disturbance { position_noise: -0.1, ..Disturbance::default() }, "position_noise"),
+        (Disturbance { position_noise: f64::NAN, ..Disturbance::default() }, "position_noise"),
+    ] {
+        let error = survey(&Spy(Mutex::default()), &env, &[1], 0, &disturbance, 1).unwrap_err();
+        assert_eq!(error.field, field);
+    }
+    assert_eq!(survey(&Spy(Mutex::default()), &env, &[1], 1, &Disturbance::default(), 1).unwrap_err().field, "drawn");
+}
