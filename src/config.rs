@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use crate::invalid::{Invalid, in_range};
+use crate::serving::EngineConfig;
 
 /// Everything that a server is told when it starts.
 #[derive(Clone, Debug)]
@@ -29,10 +30,8 @@ pub struct Config {
     pub max_sessions: usize,
     /// Largest gRPC message and HTTP body, in bytes.
     pub max_message_size: usize,
-    /// Threads that compute headings.
-    pub engine_threads: usize,
-    /// Fleets that may wait for the engine.
-    pub engine_queue: usize,
+    /// The engine that computes headings.
+    pub engine: EngineConfig,
     /// Time that requests in flight are given when the server stops.
     pub drain_timeout: Duration,
     /// Whether it may listen where others can reach it, although nobody has to say who they are.
@@ -54,8 +53,7 @@ impl Config {
             session_ttl: Duration::from_secs(600),
             max_sessions: 100_000,
             max_message_size: 4 << 20,
-            engine_threads: cores.min(4),
-            engine_queue: 4096,
+            engine: EngineConfig { threads: cores.min(4), queue: 4096, max_batch: 64, max_batch_delay: Duration::ZERO },
             drain_timeout: Duration::from_secs(20),
             insecure: false,
         }
@@ -72,8 +70,10 @@ impl Config {
         in_range("--session-ttl (seconds)", self.session_ttl.as_secs_f64(), 0.001..=1e9)?;
         in_range("--max-sessions", self.max_sessions, 1..=100_000_000)?;
         in_range("--max-message-size", self.max_message_size, 1024..=1 << 30)?;
-        in_range("--engine-threads", self.engine_threads, 1..=1024)?;
-        in_range("--engine-queue", self.engine_queue, 1..=10_000_000)?;
+        in_range("--engine-threads", self.engine.threads, 1..=1024)?;
+        in_range("--engine-queue", self.engine.queue, 1..=10_000_000)?;
+        in_range("--max-batch", self.engine.max_batch, 1..=65_536)?;
+        in_range("--max-batch-delay (seconds)", self.engine.max_batch_delay.as_secs_f64(), 0.0..=10.0)?;
         for (flag, addr) in [("--grpc-addr", self.grpc_addr), ("--http-addr", self.http_addr)] {
             if !addr.ip().is_loopback() && !self.insecure {
                 let expected = "a loopback address such as 127.0.0.1, or --insecure: whoever reaches this server may use it";

@@ -177,7 +177,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         store,
         registry: Registry::default(),
         sessions: Sessions::new(sessions, clock.clone()),
-        engine: Engine::start(config.engine_threads, config.engine_queue).map_err(Error::Engine)?,
+        engine: Engine::start(config.engine).map_err(Error::Engine)?,
         clock,
         draining: Draining::default(),
     };

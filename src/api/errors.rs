@@ -55,6 +55,12 @@ impl From<Error> for Status {
     }
 }
 
+/// The same as a part of an answer, for slots that are refused on their own.
+pub fn act_error(error: &Error) -> crate::wire::v1::ActError {
+    log_internal(error);
+    crate::wire::v1::ActError { status: row(error).0.into(), code: error.code().to_owned(), message: error.to_string() }
+}
+
 /// RFC 9457 problem details.
 #[derive(Debug, Serialize)]
 pub struct Problem {

@@ -9,7 +9,7 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use crate::config::Config;
 use crate::server::{self, DataDir, Listeners};
-use crate::serving::Clock;
+use crate::serving::{Clock, EngineConfig};
 use crate::telemetry;
 
 /// Flags of `serve`.
@@ -52,6 +52,12 @@ pub struct ServeArgs {
     /// Fleets that may wait to be computed; more are refused
     #[arg(long, env = "QEDGIX_ENGINE_QUEUE", default_value_t = 4096, value_name = "FLEETS")]
     engine_queue: usize,
+    /// Most fleets computed together; they gather while the engine is busy
+    #[arg(long, env = "QEDGIX_MAX_BATCH", default_value_t = 64, value_name = "FLEETS")]
+    max_batch: usize,
+    /// How long a fleet may wait for company, counted from the oldest of a batch: seconds, or 500us, 2ms
+    #[arg(long, env = "QEDGIX_MAX_BATCH_DELAY", default_value = "0s", value_parser = duration)]
+    max_batch_delay: Duration,
     /// Time that requests in flight are given when the server stops
     #[arg(long, env = "QEDGIX_DRAIN_TIMEOUT", default_value = "20s", value_parser = duration)]
     drain_timeout: Duration,
@@ -108,8 +114,12 @@ impl ServeArgs {
             session_ttl: self.session_ttl,
             max_sessions: self.max_sessions,
             max_message_size: self.max_message_size,
-            engine_threads: self.engine_threads.unwrap_or(default.engine_threads),
-            engine_queue: self.engine_queue,
+            engine: EngineConfig {
+                threads: self.engine_threads.unwrap_or(default.engine.threads),
+                queue: self.engine_queue,
+                max_batch: self.max_batch,
+                max_batch_delay: self.max_batch_delay,
+            },
             drain_timeout: self.drain_timeout,
             insecure: self.insecure,
             ..default

@@ -7,9 +7,8 @@ pub mod policies;
 pub mod sessions;
 pub mod worker;
 
-use std::sync::atomic::{AtomicBool, Ordering};
-
 pub use error::Error;
+use tokio_util::sync::CancellationToken;
 
 use crate::jobs::Jobs;
 use crate::serving::{Clock, Engine, Registry, Sessions};
@@ -35,17 +34,22 @@ pub struct App {
 
 /// Whether the server is shutting down: new work is refused, work in flight goes on.
 #[derive(Debug, Default)]
-pub struct Draining(AtomicBool);
+pub struct Draining(CancellationToken);
 
 impl Draining {
     /// From now on new work is refused.
     pub fn begin(&self) {
-        self.0.store(true, Ordering::SeqCst);
+        self.0.cancel();
     }
 
     /// Whether [`Draining::begin`] was called.
     pub fn begun(&self) -> bool {
-        self.0.load(Ordering::SeqCst)
+        self.0.is_cancelled()
+    }
+
+    /// Returns when it is called.
+    pub async fn wait(&self) {
+        self.0.cancelled().await;
     }
 }
 

@@ -1,7 +1,9 @@
 //! Where headings are computed: threads of its own behind a bounded queue, so that a large fleet delays no I/O.
 //!
-//! A caller that gave up (its future was dropped, or its deadline passed) is not computed for. A policy that panics is a
-//! fault of the server, told to its caller; the thread goes on.
+//! A thread takes the fleet that waits longest and, with it, whatever waits for the same policy version, into one forward
+//! pass; answers are the same bits as alone. By default nobody waits for company: a batch is what has gathered while the
+//! threads were busy. A caller that gave up (its future was dropped, or its deadline passed) is not computed for. A policy
+//! that panics is a fault of the server, told to the callers of the batch; the thread goes on.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -12,6 +14,22 @@ use tokio::sync::oneshot;
 
 use super::{Error, LoadedPolicy};
 use crate::policy::{Slot, Turn};
+
+/// Nodes of a batch beyond which no further fleet joins it: company must not make a small fleet wait for large ones.
+const NODES: usize = 4096;
+
+/// Limits of an engine.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct EngineConfig {
+    /// Threads that compute.
+    pub threads: usize,
+    /// Fleets that may wait; more are refused.
+    pub queue: usize,
+    /// Most fleets of a batch.
+    pub max_batch: usize,
+    /// How long the oldest fleet of a batch may wait for company; zero: not at all.
+    pub max_batch_delay: Duration,
+}
 
 /// One fleet's turn.
 #[derive(Debug)]
@@ -57,6 +75,24 @@ struct Queued {
     reply: oneshot::Sender<Result<Outcome, Error>>,
 }
 
+impl Queued {
+    fn nodes(&self) -> usize {
+        self.task.slot.uavs() + self.task.slot.users()
+    }
+
+    /// Whether somebody still waits for the answer; who waited too long is told.
+    fn wanted(self, now: Instant) -> Option<Self> {
+        if self.reply.is_closed() {
+            return None;
+        }
+        if self.deadline.is_some_and(|deadline| now >= deadline) {
+            let _ = self.reply.send(Err(Error::Deadline("in the engine's queue")));
+            return None;
+        }
+        Some(self)
+    }
+}
+
 #[derive(Default)]
 struct Queue {
     waiting: VecDeque<Queued>,
@@ -66,7 +102,7 @@ struct Queue {
 struct Shared {
     queue: Mutex<Queue>,
     filled: Condvar,
-    capacity: usize,
+    config: EngineConfig,
 }
 
 impl Shared {
@@ -75,17 +111,49 @@ impl Shared {
         self.queue.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Waits for work; `None` when the engine was dropped.
-    fn next(&self) -> Option<Queued> {
+    /// Waits for work and puts it into `batch`: fleets of one policy version, the oldest first. False when the engine was
+    /// dropped.
+    fn next(&self, batch: &mut Vec<Queued>) -> bool {
+        let EngineConfig { max_batch, max_batch_delay, .. } = self.config;
         let mut queue = self.lock();
         loop {
-            if let Some(next) = queue.waiting.pop_front() {
-                return Some(next);
-            }
             if queue.closed {
-                return None;
+                return false;
             }
-            queue = self.filled.wait(queue).unwrap_or_else(PoisonError::into_inner);
+            let Some(oldest) = queue.waiting.front() else {
+                queue = self.filled.wait(queue).unwrap_or_else(PoisonError::into_inner);
+                continue;
+            };
+            let waited = oldest.since.elapsed();
+            let alike = |q: &&Queued| Arc::ptr_eq(&q.task.policy, &oldest.task.policy);
+            if waited < max_batch_delay && queue.waiting.iter().filter(alike).count() < max_batch {
+                let rest = max_batch_delay - waited;
+                queue = self.filled.wait_timeout(queue, rest).unwrap_or_else(PoisonError::into_inner).0;
+                continue;
+            }
+            self.gather(&mut queue, batch);
+            return true;
+        }
+    }
+
+    /// Takes the oldest and what joins it, each at its first chance; the others keep their order.
+    fn gather(&self, queue: &mut Queue, batch: &mut Vec<Queued>) {
+        let Some(oldest) = queue.waiting.pop_front() else { return };
+        let mut nodes = oldest.nodes();
+        batch.push(oldest);
+        let mut i = 0;
+        while i < queue.waiting.len() && batch.len() < self.config.max_batch {
+            let next = &queue.waiting[i];
+            if Arc::ptr_eq(&next.task.policy, &batch[0].task.policy) && nodes + next.nodes() <= NODES {
+                nodes += next.nodes();
+                batch.extend(queue.waiting.remove(i));
+            } else {
+                i += 1;
+            }
+        }
+        // Notices may have been meant for what is left.
+        if !queue.waiting.is_empty() {
+            self.filled.notify_one();
         }
     }
 }
@@ -93,27 +161,32 @@ impl Shared {
 /// The engine; dropping it ends its threads after the work they have begun.
 pub struct Engine {
     shared: Arc<Shared>,
-    threads: usize,
 }
 
 impl Engine {
-    /// Starts `threads` threads with room for `capacity` waiting fleets.
+    /// Starts its threads.
     ///
     /// # Errors
     /// The system refuses a thread.
-    pub fn start(threads: usize, capacity: usize) -> std::io::Result<Self> {
-        let shared = Arc::new(Shared { queue: Mutex::default(), filled: Condvar::new(), capacity });
-        let engine = Self { shared: shared.clone(), threads };
-        for i in 0..threads {
+    pub fn start(config: EngineConfig) -> std::io::Result<Self> {
+        let shared = Arc::new(Shared { queue: Mutex::default(), filled: Condvar::new(), config });
+        let engine = Self { shared: shared.clone() };
+        for i in 0..config.threads {
             let shared = shared.clone();
             let work = move || {
-                while let Some(queued) = shared.next() {
-                    compute(queued);
+                let mut batch = Vec::new();
+                while shared.next(&mut batch) {
+                    compute(&mut batch);
                 }
             };
             std::thread::Builder::new().name(format!("engine-{i}")).spawn(work)?;
         }
         Ok(engine)
+    }
+
+    /// Fleets that wait.
+    pub fn waiting(&self) -> usize {
+        self.shared.lock().waiting.len()
     }
 
     /// Computes one turn.
@@ -124,8 +197,13 @@ impl Engine {
         let (reply, answer) = oneshot::channel();
         {
             let mut queue = self.shared.lock();
-            if queue.waiting.len() >= self.shared.capacity {
-                return Err(Error::Busy(format!("the engine's queue is full ({} fleets)", self.shared.capacity)));
+            let capacity = self.shared.config.queue;
+            if queue.waiting.len() >= capacity {
+                // Who gave up makes room.
+                queue.waiting.retain(|queued| !queued.reply.is_closed());
+            }
+            if queue.waiting.len() >= capacity {
+                return Err(Error::Busy(format!("the engine's queue is full ({capacity} fleets)")));
             }
             queue.waiting.push_back(Queued { task, since: Instant::now(), deadline, reply });
         }
@@ -151,31 +229,52 @@ impl Drop for Engine {
 
 impl std::fmt::Debug for Engine {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "Engine({} threads)", self.threads)
+        write!(f, "Engine({:?})", self.shared.config)
     }
 }
 
-fn compute(queued: Queued) {
-    let Queued { task, since, deadline, reply } = queued;
-    if reply.is_closed() {
-        return;
-    }
+/// One forward pass over a batch, which is empty afterwards.
+fn compute(batch: &mut Vec<Queued>) {
     let begun = Instant::now();
-    if deadline.is_some_and(|deadline| begun >= deadline) {
-        let _ = reply.send(Err(Error::Deadline("in the engine's queue")));
-        return;
+    let batch: Vec<Queued> = batch.drain(..).filter_map(|queued| queued.wanted(begun)).collect();
+    let Some(first) = batch.first() else { return };
+    let policy = first.task.policy.clone();
+    let name = policy.reference.to_string();
+    let actions = policy.policy.actions();
+    let batch_size = batch.len() as u32;
+    let mut replies = Vec::with_capacity(batch.len());
+    let mut tasks = Vec::with_capacity(batch.len());
+    for Queued { task: Task { slot, step, memory, .. }, since, reply, .. } in batch {
+        let outcome = Outcome {
+            memory,
+            headings: vec![0; slot.uavs()],
+            q_values: vec![f32::NAN; slot.uavs() * actions],
+            timings: Timings { queue: begun - since, compute: Duration::ZERO, batch_size },
+        };
+        tasks.push((slot, step, outcome));
+        replies.push(reply);
     }
-    let name = task.policy.reference.to_string();
-    // The task is owned by the closure: nothing half-written is seen after a panic.
-    let outcome = catch_unwind(AssertUnwindSafe(move || {
-        let Task { policy, slot, step, mut memory } = task;
-        let mut headings = vec![0; slot.uavs()];
-        let mut q_values = vec![f32::NAN; slot.uavs() * policy.policy.actions()];
-        let turn = Turn { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: Some(&mut q_values) };
-        policy.policy.act(&mut [turn]);
-        let timings = Timings { queue: begun - since, compute: begun.elapsed(), batch_size: 1 };
-        Outcome { memory, headings, q_values, timings }
+    // The tasks are owned by the closure: nothing half-written is seen after a panic.
+    let outcomes = catch_unwind(AssertUnwindSafe(move || {
+        let mut turns: Vec<Turn<'_>> = tasks
+            .iter_mut()
+            .map(|(slot, step, outcome)| Turn {
+                slot,
+                step: *step,
+                memory: &mut outcome.memory,
+                headings: &mut outcome.headings,
+                q_values: Some(&mut outcome.q_values),
+            })
+            .collect();
+        policy.policy.act(&mut turns);
+        drop(turns);
+        let compute = begun.elapsed();
+        tasks.into_iter().map(move |(_, _, outcome)| Outcome { timings: Timings { compute, ..outcome.timings }, ..outcome }).collect::<Vec<_>>()
     }));
-    // A caller that left meanwhile needs no answer.
-    let _ = reply.send(outcome.map_err(|_| Error::Fault(format!("policy {name} panicked"))));
+    metrics::histogram!("qedgix_act_batch_size").record(f64::from(batch_size));
+    match outcomes {
+        // A caller that left meanwhile needs no answer.
+        Ok(outcomes) => replies.into_iter().zip(outcomes).for_each(|(reply, outcome)| drop(reply.send(Ok(outcome)))),
+        Err(_) => replies.into_iter().for_each(|reply| drop(reply.send(Err(Error::Fault(format!("policy {name} panicked")))))),
+    }
 }

@@ -14,7 +14,7 @@ mod registry;
 mod sessions;
 
 pub use clock::Clock;
-pub use engine::{Engine, Outcome, Task, Timings};
+pub use engine::{Engine, EngineConfig, Outcome, Task, Timings};
 pub use error::Error;
 pub use fleet::Fleet;
 pub use memory::HeldState;

@@ -13,7 +13,7 @@ use qedgix::config::Config;
 use qedgix::jobs::{Executor, Exit, Jobs, Launch, Settings};
 use qedgix::server::{self, DataDir, Listeners};
 use qedgix::service::{App, Draining};
-use qedgix::serving::{Clock, Engine, Registry, Sessions, SessionsConfig};
+use qedgix::serving::{Clock, Engine, EngineConfig, Registry, Sessions, SessionsConfig};
 use qedgix::store::Store;
 use qedgix::wire::v1::job_service_client::JobServiceClient;
 use qedgix::wire::v1::worker_service_client::WorkerServiceClient;
@@ -157,7 +157,7 @@ impl Server {
             store,
             registry: Registry::default(),
             sessions: Sessions::new(SessionsConfig { ttl: config.session_ttl, max: 1 }, clock.clone()),
-            engine: Engine::start(1, 1).unwrap(),
+            engine: Engine::start(EngineConfig { threads: 1, queue: 1, max_batch: 1, max_batch_delay: Duration::ZERO }).unwrap(),
             clock,
             draining: Draining::default(),
         });

@@ -200,7 +200,7 @@ async fn act_within(server: &Server, timeout: &'static str, request: v1::ActRequ
 
 #[tokio::test]
 async fn a_deadline_is_kept_in_the_queue_and_changes_nothing() {
-    let server = Server::with(|config| config.engine_threads = 1).await;
+    let server = Server::with(|config| config.engine.threads = 1).await;
     let gate = Arc::new(Gate::default());
     server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
     let mut client = server.grpc().await;
@@ -243,7 +243,7 @@ async fn a_retry_that_overtakes_its_first_attempt_gets_the_same_answer() {
 
 #[tokio::test]
 async fn a_full_queue_is_said_and_empties() {
-    let server = Server::with(|config| (config.engine_threads, config.engine_queue) = (1, 1)).await;
+    let server = Server::with(|config| (config.engine.threads, config.engine.queue) = (1, 1)).await;
     let gate = Arc::new(Gate::default());
     server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
     let client = server.grpc().await;
@@ -276,7 +276,7 @@ async fn sessions_are_bounded() {
 
 #[tokio::test]
 async fn a_policy_that_panics_is_an_internal_error_and_no_more() {
-    let server = Server::with(|config| config.engine_threads = 1).await;
+    let server = Server::with(|config| config.engine.threads = 1).await;
     server.add("panics", 1, Arc::new(Deed::Panic));
     let mut client = server.grpc().await;
     client.open_session(open("panics", "s")).await.unwrap();

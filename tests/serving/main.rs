@@ -2,6 +2,7 @@
 //! tests move.
 
 mod act;
+mod batch;
 mod conversion;
 mod harness;
 mod limits;

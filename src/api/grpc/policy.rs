@@ -1,11 +1,16 @@
 //! `PolicyService`: decode, call one use case, encode.
 
 use std::sync::Arc;
+use std::time::Instant;
 
-use tonic::{Request, Response, Status};
+use futures::future::join_all;
+use futures::stream::{BoxStream, StreamExt};
+use tonic::{Request, Response, Status, Streaming};
 
 use super::deadline;
 use crate::api::convert::{request::open_session, response::act_response};
+use crate::api::errors::act_error;
+use crate::invalid::in_range;
 use crate::service::{App, Error, act, policies, sessions};
 use crate::serving::PolicySpec;
 use crate::wire::v1;
@@ -16,22 +21,79 @@ pub fn service(app: Arc<App>) -> PolicyServiceServer<impl PolicyService> {
     PolicyServiceServer::new(Handlers(app))
 }
 
+/// Most slots of one `ActBatch`.
+const LARGEST_BATCH: usize = 1024;
+/// Slots of one `ActStream` that are worked on together; the caller's next ones wait in the transport.
+const IN_FLIGHT: usize = 64;
+
 struct Handlers(Arc<App>);
+
+/// Answers one slot, however it came.
+async fn answer(app: &App, request: v1::ActRequest, deadline: Option<Instant>) -> Result<v1::ActResponse, Error> {
+    let values = request.return_q_values;
+    let request = act::Request::try_from(request)?;
+    Ok(act_response(act::act(app, request, deadline).await?, values))
+}
+
+/// One slot of several: answered or refused.
+fn act_result(answer: Result<v1::ActResponse, Error>) -> v1::ActResult {
+    use v1::act_result::Result as Told;
+    let told = answer.map_or_else(|error| Told::Error(act_error(&error)), Told::Response);
+    v1::ActResult { result: Some(told) }
+}
 
 #[tonic::async_trait]
 impl PolicyService for Handlers {
     async fn act(&self, request: Request<v1::ActRequest>) -> Result<Response<v1::ActResponse>, Status> {
         let deadline = deadline(request.extensions());
-        let request = request.into_inner();
-        let values = request.return_q_values;
-        let request = act::Request::try_from(request).map_err(Error::from)?;
-        let answer = act::act(&self.0, request, deadline).await?;
-        Ok(Response::new(act_response(answer, values)))
+        Ok(Response::new(answer(&self.0, request.into_inner(), deadline).await?))
+    }
+
+    async fn act_batch(&self, request: Request<v1::ActBatchRequest>) -> Result<Response<v1::ActBatchResponse>, Status> {
+        let deadline = deadline(request.extensions());
+        let requests = request.into_inner().requests;
+        in_range("requests", requests.len(), 1..=LARGEST_BATCH).map_err(Error::from)?;
+        let answers = requests.into_iter().map(|request| answer(&self.0, request, deadline));
+        let results = join_all(answers).await.into_iter().map(act_result).collect();
+        Ok(Response::new(v1::ActBatchResponse { results }))
+    }
+
+    type ActStreamStream = BoxStream<'static, Result<v1::ActResult, Status>>;
+
+    async fn act_stream(&self, request: Request<Streaming<v1::ActRequest>>) -> Result<Response<Self::ActStreamStream>, Status> {
+        let deadline = deadline(request.extensions());
+        let app = self.0.clone();
+        let draining = app.clone();
+        // What was asked before the server drains is answered; then the stream ends, so that it does not hold up the end.
+        let requests = request.into_inner().take_until(async move { draining.draining.wait().await });
+        let answers = requests.map(move |request| {
+            let app = app.clone();
+            async move {
+                // A message that does not decode, or a caller that left: the stream is over.
+                let request = request?;
+                Ok(act_result(answer(&app, request, deadline).await))
+            }
+        });
+        Ok(Response::new(answers.buffered(IN_FLIGHT).boxed()))
     }
 
     async fn open_session(&self, request: Request<v1::OpenSessionRequest>) -> Result<Response<v1::Session>, Status> {
         let (policy, how) = open_session(request.into_inner()).map_err(Error::from)?;
         Ok(Response::new(sessions::open(&self.0, &policy, how).await?.into()))
+    }
+
+    async fn get_session(&self, request: Request<v1::GetSessionRequest>) -> Result<Response<v1::Session>, Status> {
+        Ok(Response::new(sessions::get(&self.0, &request.into_inner().session_id)?.into()))
+    }
+
+    async fn list_sessions(
+        &self,
+        request: Request<v1::ListSessionsRequest>,
+    ) -> Result<Response<v1::ListSessionsResponse>, Status> {
+        let request = request.into_inner();
+        let (page, next) = sessions::list(&self.0, request.page_size, &request.page_token)?;
+        let sessions = page.into_iter().map(Into::into).collect();
+        Ok(Response::new(v1::ListSessionsResponse { sessions, next_page_token: next.unwrap_or_default() }))
     }
 
     async fn close_session(&self, request: Request<v1::CloseSessionRequest>) -> Result<Response<v1::Session>, Status> {
