@@ -70,6 +70,7 @@ impl From<MixerKind> for Mixing {
 /// Everything about learning that is not the environment. `steps` counts environment slots.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[allow(clippy::struct_excessive_bools, reason = "a document of independent switches")]
 pub struct Training {
     /// Observation of every node.
     pub observation: Observation,

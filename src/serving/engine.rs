@@ -124,10 +124,9 @@ impl Shared {
                 queue = self.filled.wait(queue).unwrap_or_else(PoisonError::into_inner);
                 continue;
             };
-            let waited = oldest.since.elapsed();
+            let rest = max_batch_delay.saturating_sub(oldest.since.elapsed());
             let alike = |q: &&Queued| Arc::ptr_eq(&q.task.policy, &oldest.task.policy);
-            if waited < max_batch_delay && queue.waiting.iter().filter(alike).count() < max_batch {
-                let rest = max_batch_delay - waited;
+            if !rest.is_zero() && queue.waiting.iter().filter(alike).count() < max_batch {
                 queue = self.filled.wait_timeout(queue, rest).unwrap_or_else(PoisonError::into_inner).0;
                 continue;
             }
