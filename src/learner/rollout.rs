@@ -133,7 +133,7 @@ impl Rollout {
         for (b, now) in self.env.aoi().chunks_exact(n).enumerate() {
             let before = &e.aoi[(b * (slots + 1) + slot) * n..][..n];
             let gains = factors.iter().zip(before).zip(now).filter(|(_, now)| **now == 0.0);
-            e.reward[b * slots + slot] = gains.map(|((f, before), _)| f * (f64::from(*before) + 1.0)).sum::<f64>() as f32;
+            e.reward[b * slots + slot] = gains.fold(0.0, |sum, ((f, before), _)| sum + f * (f64::from(*before) + 1.0)) as f32;
         }
     }
 }
@@ -169,6 +169,7 @@ mod tests {
         config.environment.slots = 30;
         config.environment.user_speed = user_speed;
         config.training.envs = envs;
+        config.training.shaping = false;
         config
     }
 

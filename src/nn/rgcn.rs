@@ -6,6 +6,7 @@
 use super::HIDDEN as H;
 use super::batch::{Batch, Rows, RowsMut};
 use super::graph::Graph;
+use super::kernels::simd;
 use super::linear::{Linear, transpose};
 use super::matmul::{Lhs, Out, Rhs, Start, matmul};
 use super::params::{Init, Layout, Weights};
@@ -56,12 +57,17 @@ impl Rgcn {
     ) {
         let nodes = y.len;
         cache.means.reset_zero(2 * H, nodes);
-        for (i, means) in cache.means.as_mut_slice().chunks_exact_mut(2 * H).enumerate() {
-            for (kind, j, share) in neighbours(graph, i) {
-                let x = &x.data[j * x.stride..][..H];
-                means[kind * H..][..H].iter_mut().zip(x).for_each(|(m, &x)| *m = x.mul_add(share, *m));
-            }
-        }
+        let means = cache.means.as_mut_slice().as_chunks_mut::<H>().0;
+        simd(
+            #[inline(always)]
+            || {
+                for (i, means) in means.chunks_exact_mut(2).enumerate() {
+                    for (kind, j, share) in neighbours(graph, i) {
+                        add_share(&x.data[j * x.stride..][..H], share, &mut means[kind]);
+                    }
+                }
+            },
+        );
         let stride = y.stride;
         self.root.forward(w, Rows { len: nodes, ..x }, RowsMut { data: &mut *y.data, ..y });
         for (run, relations) in Self::runs(graph, nodes) {
@@ -97,16 +103,30 @@ impl Rgcn {
                 matmul((run.len(), H, H), Lhs::rows(d, dy.stride), turned, out, Start::Zero);
             }
         }
-        for (i, means) in cache.means.as_slice().chunks_exact(2 * H).enumerate() {
-            for (kind, j, share) in neighbours(graph, i) {
-                let d = &means[kind * H..][..H];
-                dx.row_mut(j).iter_mut().zip(d).for_each(|(x, &d)| *x = d.mul_add(share, *x));
-            }
-        }
+        let means = cache.means.as_slice().as_chunks::<H>().0;
+        simd(
+            #[inline(always)]
+            || {
+                for (i, means) in means.chunks_exact(2).enumerate() {
+                    for (kind, j, share) in neighbours(graph, i) {
+                        add_share(&means[kind], share, dx.row_mut(j));
+                    }
+                }
+            },
+        );
+    }
+}
+
+/// Adds `share` times `from` to `to`, both H wide.
+#[inline(always)]
+fn add_share<T: Real>(from: &[T], share: T, to: &mut [T]) {
+    for (to, &from) in to[..H].iter_mut().zip(&from[..H]) {
+        *to = from.mul_add(share, *to);
     }
 }
 
 /// Neighbours of a node: kind, index, and weight in the mean over that kind.
+#[inline(always)]
 fn neighbours<T: Real>(graph: &Graph, i: usize) -> impl Iterator<Item = (usize, usize, T)> {
     let all = graph.neighbours(i);
     let kind = |&&j: &&u32| usize::from(j as usize >= graph.first_kind());
