@@ -389,3 +389,38 @@ fn overridden<T: Serialize + DeserializeOwned>(section: &str, base: &T, patch: &
     }
     Ok(serde_json::from_value(fields).expect("checked field by field"))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_table_of_presets_in_the_documentation_is_the_presets() {
+        let text = include_str!("../docs/algorithms.md");
+        let fields = |preset| {
+            let mut config = TrainConfig::resolve(Algorithm::Qedgix, preset, &Map::new(), &Map::new(), 1).unwrap();
+            // What the table writes in terms of K and N.
+            config.environment.reward_scale = None;
+            let (mut all, training) = (serde_json::to_value(&config.environment).unwrap(), config.training);
+            let Value::Object(training) = serde_json::to_value(training).unwrap() else { unreachable!("a struct") };
+            all.as_object_mut().unwrap().extend(training);
+            all
+        };
+        let presets = [Preset::Paper, Preset::Authors, Preset::Practical].map(fields);
+        let mut checked = 0;
+        for line in text.lines() {
+            let cells: Vec<&str> = line.trim_matches('|').split('|').map(str::trim).collect();
+            let [field, values @ ..] = &cells[..] else { continue };
+            let name = field.split('`').nth(1).unwrap_or("");
+            if values.len() != 3 || name == "reward_scale" || presets[0].get(name).is_none() {
+                continue;
+            }
+            for (preset, value) in presets.iter().zip(values) {
+                let actual = preset[name].as_str().map_or_else(|| preset[name].to_string(), str::to_owned);
+                assert_eq!(&actual, value, "{name}");
+            }
+            checked += 1;
+        }
+        assert_eq!(checked, 18, "rows of the table that name a field");
+    }
+}

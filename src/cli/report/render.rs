@@ -42,7 +42,7 @@ p { max-width: 48rem; margin: .5rem 0 1rem; }
 pre { background: #f6f6f6; padding: .7rem 1rem; border-radius: 6px; white-space: pre-wrap; overflow-wrap: anywhere; }
 .wide { overflow-x: auto; max-width: 100%; }
 table { border-collapse: collapse; margin: 0 0 1.2rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .35rem .9rem; text-align: left; border-bottom: 1px solid #e4e4e4; overflow-wrap: anywhere; }
+th, td { padding: .35rem .9rem; text-align: left; border-bottom: 1px solid #e4e4e4; min-width: 4.5rem; overflow-wrap: anywhere; }
 th { border-bottom: 2px solid #999; font-weight: 600; }
 .n { text-align: right; white-space: nowrap; }
 .row { display: flex; flex-wrap: wrap; gap: 1rem 2rem; align-items: flex-start; }
