@@ -3,4 +3,7 @@
 //! They are published into the store at start like any other checkpoint; publishing equal bytes twice changes nothing.
 
 /// Name and bytes (safetensors) of each bundled policy; `policies/README.md` has the command that made each.
-pub const BUNDLED: &[(&str, &[u8])] = &[("qedgix", include_bytes!("../../policies/qedgix.safetensors"))];
+pub const BUNDLED: &[(&str, &[u8])] = &[
+    ("qedgix", include_bytes!("../../policies/qedgix.safetensors")),
+    ("qmix", include_bytes!("../../policies/qmix.safetensors")),
+];
