@@ -23,6 +23,11 @@ const ROWS: usize = 24;
 /// Parameters reduced together.
 const BLOCK: usize = 4096;
 
+/// Episodes of a chunk, for fleets of this size.
+pub fn chunk_of(uavs: usize) -> usize {
+    (ROWS / uavs).max(1)
+}
+
 /// Discounting.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Returns {
@@ -147,7 +152,7 @@ impl<T: Real> Objective<T> {
             self.agent.prepare(flat, turned);
             self.mixer.prepare(flat, turned);
         }
-        let per_chunk = (ROWS / dims.uavs).max(1);
+        let per_chunk = chunk_of(dims.uavs);
         let count = episodes.len.div_ceil(per_chunk);
         let len = self.layout.len();
         let empty = || Chunk { grads: vec![T::ZERO; len], loss: 0.0, q_tot: 0.0, trace: Trace::default() };

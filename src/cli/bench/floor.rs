@@ -7,11 +7,9 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use crate::learner::Episodes;
+use crate::learner::objective::chunk_of;
 use crate::nn::matmul::{Lhs, Out, Rhs, Start, matmul};
 use crate::policy::{Agent, Geometry};
-
-/// Episodes whose products are made together, as the learner does.
-const EPISODES: usize = 8;
 
 /// What an update cannot do without.
 pub(super) struct Floor {
@@ -23,7 +21,7 @@ pub(super) struct Floor {
 
 /// The floor of an update with `batch`.
 pub(super) fn of(agent: &Agent, batch: &Episodes, threads: usize, repeat: usize) -> Floor {
-    let chunks = batch.len.div_ceil(EPISODES);
+    let chunks = batch.len.div_ceil(chunk_of(batch.uavs));
     let slots = batch.slots + 1;
     let products: Vec<[usize; 3]> = agent
         .products(&geometry(agent, batch), slots)
