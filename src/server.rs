@@ -23,7 +23,7 @@ use crate::config::Config;
 use crate::invalid::Invalid;
 use crate::jobs::{Jobs, LocalProcess, Settings};
 use crate::service::{App, Draining, policies};
-use crate::serving::{Clock, Engine, Registry, Sessions, SessionsConfig};
+use crate::serving::{Clock, Engine, Limits, Registry, Sessions};
 use crate::store::{self, Store};
 use crate::telemetry;
 
@@ -160,7 +160,7 @@ impl DataDir {
 /// The database or a policy in it cannot be read.
 pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<App>, Error> {
     config.validate()?;
-    let sessions = SessionsConfig { ttl: config.session_ttl, max: config.max_sessions };
+    let sessions = Limits { ttl: config.session_ttl, max: config.max_sessions };
     let store = Store::open(&data.path).await?;
     let executor = match &config.worker {
         Some(program) => LocalProcess { program: program.clone() },

@@ -80,8 +80,7 @@ impl From<crate::serving::Error> for Error {
         use crate::serving::Error as E;
         match error {
             E::Invalid(e) => Self::Invalid(e),
-            E::UnknownPolicy(id) => Self::not_found("policy", id),
-            E::UnknownSession(id) => Self::not_found("session", id),
+            E::Unknown { what, id } => Self::NotFound { what, id },
             E::Precondition { code, message } => Self::Precondition { code, message },
             E::Exists(message) => Self::Conflict { code: "already_exists", message },
             E::Busy(message) => Self::Busy { message, retry_after: std::time::Duration::from_secs(1) },

@@ -36,6 +36,7 @@ pub async fn close(app: &App, id: &str) -> Result<SessionInfo, Error> {
 /// A page size out of range.
 pub fn list(app: &App, size: u32, token: &str) -> Result<(Vec<SessionInfo>, Option<String>), Error> {
     let (page, more) = app.sessions.list(token, page_size(size)?);
+    let page: Vec<SessionInfo> = page.iter().map(|session| session.info(app.sessions.ttl())).collect();
     let next = page.last().filter(|_| more).map(|last| last.id.clone());
     Ok((page, next))
 }

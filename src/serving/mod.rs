@@ -12,6 +12,7 @@ mod observation;
 mod reference;
 mod registry;
 mod sessions;
+mod table;
 
 pub use clock::Clock;
 pub use engine::{Engine, EngineConfig, Outcome, Task, Timings};
@@ -21,4 +22,5 @@ pub use memory::HeldState;
 pub use observation::{Graph, MAX_DETECTIONS, MAX_NODES, Observation, Seen, Sighting};
 pub use reference::{PolicyRef, PolicySpec, Which, check_name};
 pub use registry::{Kind, LoadedPolicy, Registry};
-pub use sessions::{Answered, Opened, Session, SessionInfo, Sessions, SessionsConfig, Turn};
+pub use sessions::{Answered, Opened, Session, SessionInfo, Sessions, Turn};
+pub use table::{Entry, LastUse, Limits, Table};

@@ -13,7 +13,7 @@ use qedgix::config::Config;
 use qedgix::jobs::{Executor, Exit, Jobs, Launch, Settings};
 use qedgix::server::{self, DataDir, Listeners};
 use qedgix::service::{App, Draining};
-use qedgix::serving::{Clock, Engine, EngineConfig, Registry, Sessions, SessionsConfig};
+use qedgix::serving::{Clock, Engine, EngineConfig, Limits, Registry, Sessions};
 use qedgix::store::Store;
 use qedgix::wire::v1::job_service_client::JobServiceClient;
 use qedgix::wire::v1::worker_service_client::WorkerServiceClient;
@@ -156,7 +156,7 @@ impl Server {
             jobs: Jobs::open(store.clone(), settings, executor).await.unwrap(),
             store,
             registry: Registry::default(),
-            sessions: Sessions::new(SessionsConfig { ttl: config.session_ttl, max: 1 }, clock.clone()),
+            sessions: Sessions::new(Limits { ttl: config.session_ttl, max: 1 }, clock.clone()),
             engine: Engine::start(EngineConfig { threads: 1, queue: 1, max_batch: 1, max_batch_delay: Duration::ZERO }).unwrap(),
             clock,
             draining: Draining::default(),
