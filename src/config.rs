@@ -28,6 +28,12 @@ pub struct Config {
     pub session_ttl: Duration,
     /// Most open sessions.
     pub max_sessions: usize,
+    /// A hosted environment idle for longer expires.
+    pub environment_ttl: Duration,
+    /// Most hosted environments.
+    pub max_environments: usize,
+    /// Memory that all hosted environments may take together, in bytes.
+    pub environment_memory: usize,
     /// Largest gRPC message and HTTP body, in bytes.
     pub max_message_size: usize,
     /// The engine that computes headings.
@@ -52,6 +58,9 @@ impl Config {
             worker: None,
             session_ttl: Duration::from_secs(600),
             max_sessions: 100_000,
+            environment_ttl: Duration::from_secs(600),
+            max_environments: 1024,
+            environment_memory: 1 << 30,
             max_message_size: 4 << 20,
             engine: EngineConfig { threads: cores.min(4), queue: 4096, max_batch: 64, max_batch_delay: Duration::ZERO },
             drain_timeout: Duration::from_secs(20),
@@ -69,6 +78,9 @@ impl Config {
         in_range("--snapshot-every (seconds)", self.snapshot_every.as_secs_f64(), 0.0..=1e9)?;
         in_range("--session-ttl (seconds)", self.session_ttl.as_secs_f64(), 0.001..=1e9)?;
         in_range("--max-sessions", self.max_sessions, 1..=100_000_000)?;
+        in_range("--environment-ttl (seconds)", self.environment_ttl.as_secs_f64(), 0.001..=1e9)?;
+        in_range("--max-environments", self.max_environments, 1..=100_000_000)?;
+        in_range("--environment-memory", self.environment_memory, 1 << 20..=1 << 40)?;
         in_range("--max-message-size", self.max_message_size, 1024..=1 << 30)?;
         in_range("--engine-threads", self.engine.threads, 1..=1024)?;
         in_range("--engine-queue", self.engine.queue, 1..=10_000_000)?;

@@ -370,6 +370,39 @@ const LETTERS: [(&str, &str); 9] = [
     ("anneal", "epsilon_anneal"),
 ];
 
+/// The environment that a document describes: its fields over the defaults, every default filled in.
+///
+/// # Errors
+/// The first field that is unknown, of the wrong type or out of range, named as `environment.uavs`.
+pub fn environment(mut document: Value) -> Result<EnvConfig, Invalid> {
+    integral(&mut document);
+    let Value::Object(fields) = &document else {
+        return Err(Invalid::schema("environment", &document, "an object"));
+    };
+    let mut config = overridden("environment", &EnvConfig::default(), fields)?;
+    config.validate().map_err(|e| e.within("environment"))?;
+    config.reward_scale = Some(config.reward_factor());
+    Ok(config)
+}
+
+/// Largest integer that every JSON reader and a `google.protobuf.Struct` hold exactly.
+pub const EXACT: u64 = (1 << 53) - 1;
+
+/// Makes whole numbers integers however they are written, because a `google.protobuf.Struct` has no integers.
+pub fn integral(value: &mut Value) {
+    match value {
+        Value::Number(number) => {
+            let float = number.as_f64().filter(|x| number.is_f64() && x.fract() == 0.0 && x.abs() <= EXACT as f64);
+            if let Some(float) = float {
+                *value = Value::from(float as i64);
+            }
+        }
+        Value::Array(items) => items.iter_mut().for_each(integral),
+        Value::Object(fields) => fields.values_mut().for_each(integral),
+        Value::Null | Value::Bool(_) | Value::String(_) => {}
+    }
+}
+
 /// `base` with the fields of `patch` put over it, one at a time, so that a message names the field that is wrong.
 fn overridden<T: Serialize + DeserializeOwned>(section: &str, base: &T, patch: &Map<String, Value>) -> Result<T, Invalid> {
     let mut fields = serde_json::to_value(base).expect("a configuration is plain data");

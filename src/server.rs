@@ -23,7 +23,7 @@ use crate::config::Config;
 use crate::invalid::Invalid;
 use crate::jobs::{Jobs, LocalProcess, Settings};
 use crate::service::{App, Draining, policies};
-use crate::serving::{Clock, Engine, Registry, Sessions, SessionsConfig};
+use crate::serving::{Clock, Engine, Environments, EnvironmentsConfig, Limits, Registry, Sessions};
 use crate::store::{self, Store};
 use crate::telemetry;
 
@@ -160,7 +160,9 @@ impl DataDir {
 /// The database or a policy in it cannot be read.
 pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<App>, Error> {
     config.validate()?;
-    let sessions = SessionsConfig { ttl: config.session_ttl, max: config.max_sessions };
+    let sessions = Limits { ttl: config.session_ttl, max: config.max_sessions };
+    let limits = Limits { ttl: config.environment_ttl, max: config.max_environments };
+    let environments = EnvironmentsConfig { limits, memory: config.environment_memory };
     let store = Store::open(&data.path).await?;
     let executor = match &config.worker {
         Some(program) => LocalProcess { program: program.clone() },
@@ -177,6 +179,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         store,
         registry: Registry::default(),
         sessions: Sessions::new(sessions, clock.clone()),
+        environments: Environments::new(environments, clock.clone()),
         engine: Engine::start(config.engine).map_err(Error::Engine)?,
         clock,
         draining: Draining::default(),
@@ -222,7 +225,7 @@ pub async fn run(
     let serve_rest = axum::serve(http, router).with_graceful_shutdown(stop.clone().cancelled_owned());
 
     let scheduling = tokio::spawn(app.jobs.clone().run(format!("http://{}", from_here(endpoints.grpc))));
-    let housekeeping = tokio::spawn(housekeeping(app.clone(), metrics, config.session_ttl));
+    let housekeeping = tokio::spawn(housekeeping(app.clone(), metrics, config.session_ttl.min(config.environment_ttl)));
     data.publish(endpoints)?;
     tracing::info!(grpc = %endpoints.grpc, http = %endpoints.http, policies = app.registry.len(), "serving");
 
@@ -265,6 +268,7 @@ async fn housekeeping(app: Arc<App>, metrics: metrics_exporter_prometheus::Prome
     loop {
         tokio::time::sleep(pause).await;
         app.sessions.sweep();
+        app.environments.table().sweep();
         metrics.run_upkeep();
     }
 }

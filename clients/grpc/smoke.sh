@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Flies three slots through a server's gRPC with grpcurl and fails on any surprise.
+# Flies three slots of Act and one of an environment through a server's gRPC with grpcurl and fails on any surprise.
 #
 #   clients/grpc/smoke.sh HOST:PORT
 #
@@ -18,7 +18,7 @@ fail() {
     exit 1
 }
 
-# Calls a method; answers are compared without the whitespace that the two programs set differently.
+# Calls a method of $service; answers are compared without the whitespace that the two programs set differently.
 call() {
     local method=$1 request=$2
     "$grpcurl" --plaintext -d "$request" "$address" "$service/$method" | tr -d ' \n\t'
@@ -43,7 +43,7 @@ slot() {
 }
 
 services=$("$grpcurl" --plaintext "$address" list)
-for name in "$service" grpc.health.v1.Health; do
+for name in "$service" qedgix.v1.EnvironmentService grpc.health.v1.Health; do
     grep -qxF "$name" <<<"$services" || fail "the list of services lacks $name: $services"
 done
 
@@ -86,5 +86,22 @@ if refused=$(call CloseSession "{\"session_id\":\"$session\"}" 2>&1); then
     fail "a closed session was closed again: $refused"
 fi
 expect "CloseSession, again" "$refused" '(NotFound|NOT_FOUND)'
+
+service=qedgix.v1.EnvironmentService
+environment="\"environment_id\":\"$session\""
+answer=$(call CreateEnvironment "{$environment,\"environment\":{\"M\":2,\"N\":4,\"K\":1},\"count\":2}")
+expect CreateEnvironment "$answer" '"slots":1[,}]'
+answer=$(call Reset "{$environment}")
+expect Reset "$answer" '"uavs":\[\{"id":"uav-0","x":0.5,"y":0.5\}'
+flight="{$environment,\"step\":0,\"actions\":[{\"headings\":[0,3]},{\"headings\":[5,1]}]}"
+answer=$(call Step "$flight")
+expect Step "$answer" '"meanAoi":[0-9.]+'
+[ "$(call Step "$flight")" = "$answer" ] || fail "a repeated Step was answered differently"
+if refused=$(call Step "${flight/:0,/:1,}" 2>&1); then
+    fail "a step after the last was answered: $refused"
+fi
+expect "Step, after the last" "$refused" '(FailedPrecondition|FAILED_PRECONDITION)'
+answer=$(call DeleteEnvironment "{$environment}")
+expect DeleteEnvironment "$answer" "\"environmentId\":\"$session\""
 
 echo "smoke: ok: $policy flew three slots at $address"

@@ -43,6 +43,15 @@ pub struct ServeArgs {
     /// Most open sessions
     #[arg(long, env = "QEDGIX_MAX_SESSIONS", default_value_t = 100_000)]
     max_sessions: usize,
+    /// A hosted environment idle for longer expires: seconds, or 90s, 10m, 2h
+    #[arg(long, env = "QEDGIX_ENVIRONMENT_TTL", default_value = "10m", value_parser = duration)]
+    environment_ttl: Duration,
+    /// Most hosted environments
+    #[arg(long, env = "QEDGIX_MAX_ENVIRONMENTS", default_value_t = 1024)]
+    max_environments: usize,
+    /// Memory that all hosted environments may take together, in bytes
+    #[arg(long, env = "QEDGIX_ENVIRONMENT_MEMORY", default_value_t = 1 << 30, value_name = "BYTES")]
+    environment_memory: usize,
     /// Largest gRPC message and HTTP body, in bytes
     #[arg(long, env = "QEDGIX_MAX_MESSAGE_SIZE", default_value_t = 4 << 20, value_name = "BYTES")]
     max_message_size: usize,
@@ -113,6 +122,9 @@ impl ServeArgs {
             snapshot_every: self.snapshot_every,
             session_ttl: self.session_ttl,
             max_sessions: self.max_sessions,
+            environment_ttl: self.environment_ttl,
+            max_environments: self.max_environments,
+            environment_memory: self.environment_memory,
             max_message_size: self.max_message_size,
             engine: EngineConfig {
                 threads: self.engine_threads.unwrap_or(default.engine.threads),

@@ -7,14 +7,11 @@ use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 
 use crate::invalid::{Invalid, expectation, in_range};
-use crate::recipe::{Algorithm, Preset, TrainConfig};
+use crate::recipe::{Algorithm, EXACT, Preset, TrainConfig, integral};
 use crate::store::{JobKind, JobSpec};
 
 const FIELDS: [&str; 10] =
     ["kind", "algorithm", "preset", "environment", "training", "threads", "priority", "seed", "name", "labels"];
-
-/// Largest integer that every JSON reader and a `google.protobuf.Struct` hold exactly.
-const EXACT: u64 = (1 << 53) - 1;
 
 /// A job as it was sent: checked, every default filled in, and the digest by which the same body is known again.
 #[derive(Clone, Debug)]
@@ -30,7 +27,7 @@ pub struct Request {
 /// # Errors
 /// The first field that is unknown, of the wrong type or out of range.
 pub fn parse(mut document: Value, cpu_budget: usize) -> Result<Request, Invalid> {
-    integers(&mut document);
+    integral(&mut document);
     // Objects are ordered by key, so this is canonical.
     let digest = Sha256::digest(document.to_string()).into();
     let Value::Object(mut fields) = document else {
@@ -82,20 +79,6 @@ fn kind_of(value: &Value) -> &'static str {
         Value::String(_) => "a string",
         Value::Array(_) => "an array",
         Value::Object(_) => "an object",
-    }
-}
-
-fn integers(value: &mut Value) {
-    match value {
-        Value::Number(number) => {
-            let float = number.as_f64().filter(|x| number.is_f64() && x.fract() == 0.0 && x.abs() <= EXACT as f64);
-            if let Some(float) = float {
-                *value = Value::from(float as i64);
-            }
-        }
-        Value::Array(items) => items.iter_mut().for_each(integers),
-        Value::Object(fields) => fields.values_mut().for_each(integers),
-        Value::Null | Value::Bool(_) | Value::String(_) => {}
     }
 }
 

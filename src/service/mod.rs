@@ -1,6 +1,7 @@
 //! Use cases: one function each, one error type. Both transports call only this.
 
 pub mod act;
+pub mod environments;
 mod error;
 pub mod jobs;
 pub mod policies;
@@ -11,7 +12,7 @@ pub use error::Error;
 use tokio_util::sync::CancellationToken;
 
 use crate::jobs::Jobs;
-use crate::serving::{Clock, Engine, Registry, Sessions};
+use crate::serving::{Clock, Engine, Environments, Registry, Sessions};
 use crate::store::Store;
 
 /// What use cases work with; shared by all connections behind an `Arc`.
@@ -24,6 +25,8 @@ pub struct App {
     pub registry: Registry,
     /// Fleets whose memory the server keeps.
     pub sessions: Sessions,
+    /// Environments that learners elsewhere fly.
+    pub environments: Environments,
     /// Where headings are computed.
     pub engine: Engine,
     /// The time of day.
@@ -80,8 +83,7 @@ impl From<crate::serving::Error> for Error {
         use crate::serving::Error as E;
         match error {
             E::Invalid(e) => Self::Invalid(e),
-            E::UnknownPolicy(id) => Self::not_found("policy", id),
-            E::UnknownSession(id) => Self::not_found("session", id),
+            E::Unknown { what, id } => Self::NotFound { what, id },
             E::Precondition { code, message } => Self::Precondition { code, message },
             E::Exists(message) => Self::Conflict { code: "already_exists", message },
             E::Busy(message) => Self::Busy { message, retry_after: std::time::Duration::from_secs(1) },

@@ -1,8 +1,10 @@
 //! Opening, showing and ending sessions.
 
+use std::sync::Arc;
+
 use super::{App, Error};
 use crate::invalid::{Invalid, in_range};
-use crate::serving::{Opened, PolicySpec, SessionInfo};
+use crate::serving::{Entry, Opened, PolicySpec, SessionInfo, Table};
 
 /// Opens a session pinned to what `policy` names now.
 ///
@@ -35,8 +37,14 @@ pub async fn close(app: &App, id: &str) -> Result<SessionInfo, Error> {
 /// # Errors
 /// A page size out of range.
 pub fn list(app: &App, size: u32, token: &str) -> Result<(Vec<SessionInfo>, Option<String>), Error> {
-    let (page, more) = app.sessions.list(token, page_size(size)?);
-    let next = page.last().filter(|_| more).map(|last| last.id.clone());
+    let (page, next) = page(&app.sessions, size, token)?;
+    Ok((page.iter().map(|session| session.info(app.sessions.ttl())).collect(), next))
+}
+
+/// A page of what `table` holds, and the token of the next one.
+pub(super) fn page<T: Entry>(table: &Table<T>, size: u32, token: &str) -> Result<(Vec<Arc<T>>, Option<String>), Invalid> {
+    let (page, more) = table.list(token, page_size(size)?);
+    let next = page.last().filter(|_| more).map(|last| last.id().to_owned());
     Ok((page, next))
 }
 

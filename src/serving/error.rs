@@ -8,12 +8,14 @@ pub enum Error {
     /// Input that cannot be used.
     #[error(transparent)]
     Invalid(#[from] Invalid),
-    /// No policy, version or alias of this name.
-    #[error("no policy {0:?}")]
-    UnknownPolicy(String),
-    /// No session of this name, and none that expired lately.
-    #[error("no session {0:?}")]
-    UnknownSession(String),
+    /// Nothing of this name, and nothing that expired lately.
+    #[error("no {what} {id:?}")]
+    Unknown {
+        /// `policy`, `session`, ...
+        what: &'static str,
+        /// What was asked for.
+        id: String,
+    },
     /// It exists, but not in a state in which this can be done.
     #[error("{message}")]
     Precondition {
@@ -37,6 +39,11 @@ pub enum Error {
 }
 
 impl Error {
+    /// No `what` called `id`.
+    pub fn unknown(what: &'static str, id: impl Into<String>) -> Self {
+        Self::Unknown { what, id: id.into() }
+    }
+
     /// A state in which this cannot be done.
     pub fn precondition(code: &'static str, message: impl Into<String>) -> Self {
         Self::Precondition { code, message: message.into() }

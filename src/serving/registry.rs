@@ -82,7 +82,7 @@ impl Registry {
     /// The version that `spec` names now.
     ///
     /// # Errors
-    /// [`Error::UnknownPolicy`].
+    /// [`Error::Unknown`].
     pub fn resolve(&self, spec: &PolicySpec) -> Result<Arc<LoadedPolicy>, Error> {
         let entries = self.read();
         let found = entries.get(&spec.name).and_then(|entry| match &spec.which {
@@ -90,7 +90,7 @@ impl Registry {
             Which::Alias(alias) => entry.aliases.get(alias).and_then(|version| entry.versions.get(version)),
             Which::Version(version) => entry.versions.get(version),
         });
-        found.cloned().ok_or_else(|| Error::UnknownPolicy(spec.to_string()))
+        found.cloned().ok_or_else(|| Error::unknown("policy", spec.to_string()))
     }
 
     /// The version of `name` with this digest.

@@ -13,7 +13,7 @@ use qedgix::config::Config;
 use qedgix::jobs::{Executor, Exit, Jobs, Launch, Settings};
 use qedgix::server::{self, DataDir, Listeners};
 use qedgix::service::{App, Draining};
-use qedgix::serving::{Clock, Engine, EngineConfig, Registry, Sessions, SessionsConfig};
+use qedgix::serving::{Clock, Engine, EngineConfig, Environments, EnvironmentsConfig, Limits, Registry, Sessions};
 use qedgix::store::Store;
 use qedgix::wire::v1::job_service_client::JobServiceClient;
 use qedgix::wire::v1::worker_service_client::WorkerServiceClient;
@@ -152,11 +152,13 @@ impl Server {
         let mut settings = Settings::new(cpu_budget);
         adjust(&mut settings);
         let clock = Clock::system();
+        let limits = Limits { ttl: config.session_ttl, max: 1 };
         let app = Arc::new(App {
             jobs: Jobs::open(store.clone(), settings, executor).await.unwrap(),
             store,
             registry: Registry::default(),
-            sessions: Sessions::new(SessionsConfig { ttl: config.session_ttl, max: 1 }, clock.clone()),
+            sessions: Sessions::new(limits, clock.clone()),
+            environments: Environments::new(EnvironmentsConfig { limits, memory: 1 << 20 }, clock.clone()),
             engine: Engine::start(EngineConfig { threads: 1, queue: 1, max_batch: 1, max_batch_delay: Duration::ZERO }).unwrap(),
             clock,
             draining: Draining::default(),

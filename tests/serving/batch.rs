@@ -112,9 +112,10 @@ async fn fleets_that_wait_for_one_policy_fly_together_and_alone_alike() {
     }
     gate.open();
     soon(blocked).await.unwrap();
+    // All are waited for before one is asked alone, or it would fly with those that are left.
+    let learned: Vec<_> = soon(futures::future::join_all(learned)).await.into_iter().map(Result::unwrap).collect();
     let mut sizes = Vec::new();
-    for (seed, answer) in learned.into_iter().enumerate() {
-        let together = soon(answer).await.unwrap();
+    for (seed, together) in learned.into_iter().enumerate() {
         let alone = client.clone().act(held("qedgix", Bytes::new(), scene(3, 5, seed as u64))).await.unwrap().into_inner();
         assert_eq!((headings(&together), &together.recurrent_state), (headings(&alone), &alone.recurrent_state));
         sizes.push(together.timings.unwrap().batch_size);

@@ -4,6 +4,7 @@
 mod act;
 mod batch;
 mod conversion;
+mod environments;
 mod harness;
 mod limits;
 mod published;

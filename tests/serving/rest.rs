@@ -5,17 +5,17 @@ use serde_json::{Value, json};
 
 use super::harness::*;
 
-struct Rest<'a> {
+pub struct Rest<'a> {
     server: &'a Server,
     http: Client,
 }
 
 impl<'a> Rest<'a> {
-    fn new(server: &'a Server) -> Self {
+    pub fn new(server: &'a Server) -> Self {
         Self { server, http: Client::new() }
     }
 
-    async fn send(&self, method: Method, path: &str, body: impl Into<reqwest::Body>) -> (StatusCode, Value) {
+    pub async fn send(&self, method: Method, path: &str, body: impl Into<reqwest::Body>) -> (StatusCode, Value) {
         let answer = self.http.request(method, self.server.url(path)).body(body).send().await.unwrap();
         let (status, kind) = (answer.status(), answer.headers().get("content-type").cloned());
         assert!(answer.headers().contains_key("x-request-id"));
@@ -26,16 +26,16 @@ impl<'a> Rest<'a> {
         (status, serde_json::from_str(&text).unwrap_or(Value::String(text)))
     }
 
-    async fn post(&self, path: &str, body: &Value) -> (StatusCode, Value) {
+    pub async fn post(&self, path: &str, body: &Value) -> (StatusCode, Value) {
         self.send(Method::POST, path, body.to_string()).await
     }
 
-    async fn get(&self, path: &str) -> (StatusCode, Value) {
+    pub async fn get(&self, path: &str) -> (StatusCode, Value) {
         self.send(Method::GET, path, "").await
     }
 
     /// A body that is refused: status, code and detail.
-    async fn refused(&self, path: &str, body: &str) -> (u16, String, String) {
+    pub async fn refused(&self, path: &str, body: &str) -> (u16, String, String) {
         let (status, problem) = self.send(Method::POST, path, body.to_owned()).await;
         assert_eq!(problem["status"], status.as_u16());
         let text = |name: &str| problem[name].as_str().unwrap().to_owned();

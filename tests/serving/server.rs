@@ -58,7 +58,7 @@ async fn new_work_is_refused_while_draining() {
 async fn health_tells_of_every_service() {
     let server = Server::start().await;
     let mut health = HealthClient::new(server.channel().await);
-    for service in ["", "qedgix.v1.PolicyService"] {
+    for service in ["", "qedgix.v1.PolicyService", "qedgix.v1.EnvironmentService"] {
         let answer = health.check(HealthCheckRequest { service: service.into() }).await.unwrap().into_inner();
         assert_eq!(answer.status(), ServingStatus::Serving, "{service}");
     }
@@ -107,6 +107,9 @@ fn settings_are_checked() {
     assert_eq!(refused(|c| c.http_addr = "192.0.2.1:80".parse().unwrap()), "--http-addr");
     assert_eq!(refused(|c| c.cpu_budget = 0), "--cpu-budget");
     assert_eq!(refused(|c| c.max_sessions = 0), "--max-sessions");
+    assert_eq!(refused(|c| c.max_environments = 0), "--max-environments");
+    assert_eq!(refused(|c| c.environment_memory = 1), "--environment-memory");
+    assert_eq!(refused(|c| c.environment_ttl = std::time::Duration::ZERO), "--environment-ttl (seconds)");
     let mut open = Config::new("unused");
     (open.insecure, open.http_addr) = (true, "0.0.0.0:80".parse().unwrap());
     assert!(open.validate().is_ok());

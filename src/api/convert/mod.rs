@@ -1,6 +1,7 @@
 //! Wire types to domain types and back. Wire types stop here; everything that can be wrong with a request and does not
 //! depend on the policy is found here, with the path of the field.
 
+pub mod environments;
 mod fleet;
 mod graph;
 pub mod jobs;

@@ -1,8 +1,10 @@
 //! REST: JSON under `/v1`, probes, metrics. Every error is a problem of RFC 9457, also those of paths and methods.
 
 mod act;
+mod environments;
 pub mod extract;
 mod jobs;
+mod observation;
 mod ops;
 mod policies;
 mod sessions;
@@ -37,6 +39,7 @@ pub fn router(app: Arc<App>, metrics: PrometheusHandle, max_body: usize) -> Rout
         .route("/v1/sessions/{id}", get(sessions::get).delete(sessions::close))
         .route("/v1/policies", get(policies::list))
         .route("/v1/policies/{policy}", get(policies::get))
+        .merge(environments::router())
         .merge(jobs::router())
         .fallback(|request: Request| async move { Error::not_found("endpoint", request.uri().path()).into_response() })
         .method_not_allowed_fallback(|request: Request| async move {

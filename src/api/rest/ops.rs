@@ -22,6 +22,10 @@ pub(super) async fn index() -> Json<Value> {
             "GET|DELETE /v1/sessions/{id}",
             "GET /v1/policies",
             "GET /v1/policies/{policy}",
+            "GET|POST /v1/environments",
+            "GET|DELETE /v1/environments/{id}",
+            "POST /v1/environments/{id}/reset",
+            "POST /v1/environments/{id}/step",
             "GET|POST /v1/jobs",
             "GET|DELETE /v1/jobs/{id}",
             "GET /livez",
@@ -45,6 +49,7 @@ pub(super) async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, E
 /// Prometheus text.
 pub(super) fn metrics(handle: &PrometheusHandle, app: &App) -> impl IntoResponse + use<> {
     metrics::gauge!("qedgix_sessions").set(app.sessions.len() as f64);
+    metrics::gauge!("qedgix_environments").set(app.environments.table().len() as f64);
     metrics::gauge!("qedgix_policy_versions").set(app.registry.len() as f64);
     ([(header::CONTENT_TYPE, "text/plain; version=0.0.4")], handle.render())
 }

@@ -153,15 +153,15 @@ impl From<v1::Policy> for Policy {
     }
 }
 
-fn seconds(duration: &prost_types::Duration) -> String {
+pub(super) fn seconds(duration: &prost_types::Duration) -> String {
     format!("{}.{:09}s", duration.seconds, duration.nanos)
 }
 
-fn time(time: &prost_types::Timestamp) -> Option<String> {
+pub(super) fn time(time: &prost_types::Timestamp) -> Option<String> {
     jiff::Timestamp::new(time.seconds, time.nanos).ok().map(|time| time.to_string())
 }
 
-fn document(document: prost_types::Struct) -> Value {
+pub(super) fn document(document: prost_types::Struct) -> Value {
     Value::Object(document.fields.into_iter().map(|(name, value)| (name, json(value))).collect())
 }
 

@@ -4,13 +4,14 @@
 use std::collections::VecDeque;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use jiff::Timestamp;
 use tokio::sync::{Mutex, MutexGuard};
 
 use super::{Opened, SessionInfo};
+use crate::serving::table::{Entry, LastUse};
 use crate::serving::{Clock, Error, Fleet, LoadedPolicy, Outcome, Timings};
 
 /// Former runs that a session remembers, to refuse them.
@@ -23,8 +24,7 @@ pub struct Session {
     policy: Arc<LoadedPolicy>,
     opened_at: Timestamp,
     clock: Clock,
-    /// Last request, in milliseconds since the epoch.
-    touched: AtomicI64,
+    used: LastUse,
     /// Copy of `State::steps`, readable while a slot is in flight.
     steps: AtomicU64,
     state: Mutex<State>,
@@ -94,13 +94,8 @@ impl Session {
             memory: Vec::new(),
             last: None,
         };
-        let touched = AtomicI64::new(opened_at.as_millisecond());
-        Self { id, policy, opened_at, clock, touched, steps: AtomicU64::new(0), state: Mutex::new(state) }
-    }
-
-    /// Its name.
-    pub fn id(&self) -> &str {
-        &self.id
+        let used = LastUse::at(opened_at);
+        Self { id, policy, opened_at, clock, used, steps: AtomicU64::new(0), state: Mutex::new(state) }
     }
 
     /// The policy version it is pinned to.
@@ -118,7 +113,7 @@ impl Session {
     pub async fn turn(&self, fleet: Fleet, step: Option<u64>, run_id: Option<&str>) -> Result<Turn<'_>, Error> {
         let state = self.state.lock().await;
         if state.ended {
-            return Err(Error::UnknownSession(self.id.clone()));
+            return Err(Error::unknown(Self::WHAT, &self.id));
         }
         let new_run = state.judge_run(&self.id, run_id)?;
         // A run that begins on an untouched session needs no reset, but is remembered all the same.
@@ -172,7 +167,7 @@ impl Session {
             None => {}
         }
         self.steps.store(state.steps, Ordering::Relaxed);
-        self.touch(self.clock.now());
+        self.used.touch(self.clock.now());
         Ok(())
     }
 
@@ -180,16 +175,8 @@ impl Session {
         self.state.lock().await.ended = true;
     }
 
-    pub(super) fn touch(&self, now: Timestamp) {
-        self.touched.fetch_max(now.as_millisecond(), Ordering::Relaxed);
-    }
-
-    pub(super) fn idle_longer_than(&self, ttl: Duration, now: Timestamp) -> bool {
-        let idle = now.as_millisecond().saturating_sub(self.touched.load(Ordering::Relaxed));
-        u128::try_from(idle).is_ok_and(|idle| idle > ttl.as_millis())
-    }
-
-    pub(super) fn info(&self, ttl: Duration) -> SessionInfo {
+    /// What a caller is told of it.
+    pub fn info(&self, ttl: Duration) -> SessionInfo {
         SessionInfo {
             id: self.id.clone(),
             policy: self.policy.reference.clone(),
@@ -197,6 +184,19 @@ impl Session {
             opened_at: self.opened_at,
             ttl,
         }
+    }
+}
+
+impl Entry for Session {
+    const WHAT: &'static str = "session";
+    const EXPIRED: &'static str = "session_expired";
+
+    fn id(&self) -> &str {
+        &self.id
+    }
+
+    fn used(&self) -> &LastUse {
+        &self.used
     }
 }
 
@@ -243,7 +243,7 @@ impl NextTurn<'_> {
         state.steps = self.step + 1;
         state.last = Some(answered.clone());
         self.session.steps.store(state.steps, Ordering::Relaxed);
-        self.session.touch(self.session.clock.now());
+        self.session.used.touch(self.session.clock.now());
         answered
     }
 }

@@ -3,7 +3,7 @@ use std::sync::Mutex;
 use super::*;
 use crate::invalid::Invalid;
 use crate::policy::{Needs, Policy};
-use crate::serving::{Fleet, Kind, Outcome, Timings};
+use crate::serving::{Clock, Fleet, Kind, Limits, Outcome, Timings};
 
 struct Nothing;
 
@@ -51,7 +51,7 @@ fn sessions(max: usize) -> (Sessions, impl Fn(u64)) {
         let mut now = now.lock().unwrap();
         *now = now.checked_add(Duration::from_secs(seconds)).unwrap();
     };
-    (Sessions::new(SessionsConfig { ttl: Duration::from_secs(600), max }, clock), pass)
+    (Sessions::new(Limits { ttl: Duration::from_secs(600), max }, clock), pass)
 }
 
 fn named(id: &str) -> Opened {
@@ -61,7 +61,7 @@ fn named(id: &str) -> Opened {
 fn code(error: &Error) -> &'static str {
     match error {
         Error::Precondition { code, .. } => code,
-        Error::UnknownSession(_) => "unknown",
+        Error::Unknown { .. } => "unknown",
         Error::Exists(_) => "exists",
         Error::Busy(_) => "busy",
         Error::Invalid(_) => "invalid",

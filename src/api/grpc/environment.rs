@@ -1,0 +1,49 @@
+//! `EnvironmentService`: decode, call one use case, encode.
+
+use std::sync::Arc;
+
+use tonic::{Request, Response, Status};
+
+use crate::api::convert::environments::{create, state};
+use crate::service::{App, Error, environments};
+use crate::wire::v1;
+use crate::wire::v1::environment_service_server::{EnvironmentService, EnvironmentServiceServer};
+
+/// The service.
+pub fn service(app: Arc<App>) -> EnvironmentServiceServer<impl EnvironmentService> {
+    EnvironmentServiceServer::new(Service(app))
+}
+
+struct Service(Arc<App>);
+
+type Answer<T> = Result<Response<T>, Status>;
+
+#[tonic::async_trait]
+impl EnvironmentService for Service {
+    async fn create_environment(&self, request: Request<v1::CreateEnvironmentRequest>) -> Answer<v1::Environment> {
+        let create = create(request.into_inner()).map_err(Error::from)?;
+        Ok(Response::new(environments::create(&self.0, create).await?.into()))
+    }
+
+    async fn reset(&self, request: Request<v1::ResetRequest>) -> Answer<v1::EnvironmentState> {
+        let mut request = request.into_inner();
+        let id = std::mem::take(&mut request.environment_id);
+        let reset = environments::reset(&self.0, &id, request.into()).await?;
+        Ok(Response::new(state(id, reset).await?))
+    }
+
+    async fn step(&self, request: Request<v1::StepRequest>) -> Answer<v1::EnvironmentState> {
+        let mut request = request.into_inner();
+        let id = std::mem::take(&mut request.environment_id);
+        let flown = environments::step(&self.0, &id, request.into()).await?;
+        Ok(Response::new(state(id, flown).await?))
+    }
+
+    async fn get_environment(&self, request: Request<v1::GetEnvironmentRequest>) -> Answer<v1::Environment> {
+        Ok(Response::new(environments::get(&self.0, &request.into_inner().environment_id)?.into()))
+    }
+
+    async fn delete_environment(&self, request: Request<v1::DeleteEnvironmentRequest>) -> Answer<v1::Environment> {
+        Ok(Response::new(environments::delete(&self.0, &request.into_inner().environment_id).await?.into()))
+    }
+}

@@ -1,0 +1,441 @@
+//! Hosted environments over gRPC and REST: the bits of `BatchEnv`, safe retries, automatic resets, limits.
+
+use bytes::Bytes;
+use futures::future::join_all;
+use qedgix::api::convert::structs::to_struct;
+use qedgix::env::{BatchEnv, EnvConfig, EpisodeMetrics};
+use qedgix::recipe;
+use qedgix::wire::v1;
+use qedgix::wire::v1::environment_service_client::EnvironmentServiceClient;
+use rand::RngExt;
+use reqwest::{Method, StatusCode};
+use serde_json::{Value, json};
+use tonic::Code;
+use tonic::transport::Channel;
+
+use super::harness::*;
+use super::rest::Rest;
+
+type Client = EnvironmentServiceClient<Channel>;
+
+async fn client(server: &Server) -> Client {
+    EnvironmentServiceClient::new(server.channel().await)
+}
+
+fn create(id: &str, count: u32, environment: &Value) -> v1::CreateEnvironmentRequest {
+    let (environment, environment_id) = (to_struct(environment), id.into());
+    v1::CreateEnvironmentRequest { environment, count: Some(count), environment_id, seed: 7, auto_reset: false }
+}
+
+/// The first observation of a new environment.
+async fn made(client: &mut Client, request: v1::CreateEnvironmentRequest) -> v1::EnvironmentState {
+    let id = client.create_environment(request).await.unwrap().into_inner().environment_id;
+    client.reset(reset(&id)).await.unwrap().into_inner()
+}
+
+fn reset(id: &str) -> v1::ResetRequest {
+    v1::ResetRequest { environment_id: id.into(), ..Default::default() }
+}
+
+/// Random headings of step `step`, from a seed.
+fn headings(count: usize, uavs: usize, of: u32, step: u64) -> Vec<v1::Headings> {
+    let mut rng = qedgix::rng::stream(3, "test-headings", step);
+    let mut copy = || (0..uavs).map(|_| rng.random_range(0..of)).collect();
+    (0..count).map(|_| v1::Headings { headings: copy() }).collect()
+}
+
+fn step(id: &str, step: u64, actions: Vec<v1::Headings>) -> v1::StepRequest {
+    v1::StepRequest { environment_id: id.into(), actions, step: Some(step), return_graph: false }
+}
+
+async fn fly(client: &mut Client, request: v1::StepRequest) -> v1::EnvironmentState {
+    client.step(request).await.unwrap().into_inner()
+}
+
+fn flat(actions: &[v1::Headings]) -> Vec<u8> {
+    actions.iter().flat_map(|copy| &copy.headings).map(|&heading| heading as u8).collect()
+}
+
+fn figures(m: EpisodeMetrics) -> v1::EpisodeMetrics {
+    m.into()
+}
+
+/// Every number that the copies show is the one that `env` holds, to the bit.
+fn assert_same(state: &v1::EnvironmentState, env: &BatchEnv) {
+    let scenes = || state.copies.iter().map(|copy| copy.scene.as_ref().unwrap());
+    let bits = |xs: &[f32]| xs.iter().map(|&x| f64::from(x).to_bits()).collect::<Vec<_>>();
+    let uavs: Vec<u64> = scenes().flat_map(|s| &s.uavs).flat_map(|u| [u.x.to_bits(), u.y.to_bits()]).collect();
+    let users: Vec<u64> = scenes().flat_map(|s| &s.users).flat_map(|u| [u.x.to_bits(), u.y.to_bits()]).collect();
+    let aoi: Vec<u64> = scenes().flat_map(|s| &s.users).map(|u| u.aoi.to_bits()).collect();
+    let rewards: Vec<u32> = state.copies.iter().map(|copy| copy.reward.to_bits()).collect();
+    assert_eq!((uavs, users), (bits(env.uav_xy()), bits(env.user_xy())));
+    assert_eq!(aoi, bits(env.aoi()));
+    assert_eq!(rewards, env.reward().iter().map(|r| r.to_bits()).collect::<Vec<_>>());
+}
+
+#[tokio::test]
+async fn an_environment_is_a_batch_env() {
+    let server = Server::start().await;
+    let mut client = client(&server).await;
+    let cases = [
+        ("default", 1, json!({})),
+        ("letters", 3, json!({"M": 2, "N": 4, "K": 11, "v": 0.1, "t": 0.2, "d": 0.3})),
+        (
+            "options",
+            4,
+            json!({"slots": 9, "hover": true, "boundary": "free", "start": "random", "user_speed": 0.05, "reward_scale": 5,
+                   "weights": [1, 2, 3, 4, 0.5]}),
+        ),
+        ("large, stepped elsewhere", 2, json!({"uavs": 40, "users": 700, "slots": 3})),
+    ];
+    for (id, count, environment) in cases {
+        let config: EnvConfig = recipe::environment(environment.clone()).unwrap();
+        let mut env = BatchEnv::new(&config, count).unwrap();
+        env.reset(&(0..count as u64).map(|b| 7 + b).collect::<Vec<_>>());
+        let state = made(&mut client, create(id, count as u32, &environment)).await;
+        assert_eq!((state.step, state.episode, state.slot, state.copies.len()), (0, 0, 0, count));
+        assert_same(&state, &env);
+        for k in 0..config.slots as u64 {
+            let actions = headings(count, config.uavs, config.headings() as u32, k);
+            env.step(&flat(&actions));
+            let state = fly(&mut client, step(id, k, actions)).await;
+            assert_eq!((state.step, state.slot), (k + 1, env.slot() as u32));
+            assert_same(&state, &env);
+            for (b, copy) in state.copies.into_iter().enumerate() {
+                assert_eq!((copy.truncated, copy.seed), (env.done(), 7 + b as u64), "{id}, copy {b}");
+                let metrics = copy.finished.map(|finished| finished.metrics.unwrap());
+                assert_eq!(metrics, env.done().then(|| figures(env.metrics(b))), "{id}, copy {b}");
+            }
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_repeated_step_is_flown_once() {
+    let server = Server::start().await;
+    let mut client = client(&server).await;
+    let environment = json!({"slots": 4, "start": "random"});
+    made(&mut client, v1::CreateEnvironmentRequest { auto_reset: true, ..create("e", 2, &environment) }).await;
+    let actions = |k| headings(2, 3, 8, k);
+    assert_eq!(refused(client.step(step("e", 1, actions(1))).await).1, "wrong_step");
+    for k in 0..6 {
+        let attempts = (0..4).map(|_| {
+            let mut client = client.clone();
+            async move { fly(&mut client, step("e", k, actions(k))).await }
+        });
+        let answers = soon(join_all(attempts)).await;
+        assert!(answers.iter().all(|answer| *answer == answers[0]), "step {k}");
+        let other = fly(&mut client, step("e", k, actions(k + 100))).await;
+        assert_eq!(other, answers[0], "the slot has been flown, whatever the retry flies");
+        assert_eq!((other.step, other.slot, other.episode), (k + 1, (k as u32 + 1) % 4, (k + 1) / 4));
+        assert_eq!(other.copies[0].finished.is_some(), k == 3);
+        for wrong in [k + 2, k.wrapping_sub(1), u64::MAX] {
+            let (code, reason, message) = refused(client.step(step("e", wrong, actions(0))).await);
+            assert_eq!((code, reason.as_str()), (Code::FailedPrecondition, "wrong_step"), "{message}");
+        }
+    }
+    let uncounted = v1::StepRequest { step: None, ..step("e", 0, actions(6)) };
+    assert_eq!(fly(&mut client, uncounted).await.step, 7);
+    let shown = v1::GetEnvironmentRequest { environment_id: "e".into() };
+    let shown = client.get_environment(shown).await.unwrap().into_inner();
+    assert_eq!((shown.step, shown.episode, shown.slot), (7, 1, 3));
+}
+
+#[tokio::test]
+async fn an_automatic_reset_is_the_reset_that_a_caller_would_send() {
+    let server = Server::start().await;
+    let mut client = client(&server).await;
+    let environment = json!({"slots": 5, "user_speed": 0.02});
+    made(&mut client, v1::CreateEnvironmentRequest { auto_reset: true, ..create("auto", 3, &environment) }).await;
+    made(&mut client, create("by hand", 3, &environment)).await;
+    let graph = |request: v1::StepRequest| v1::StepRequest { return_graph: true, ..request };
+    for episode in 0..3 {
+        for slot in 0..5 {
+            let k = episode * 5 + slot;
+            let auto = fly(&mut client, graph(step("auto", k, headings(3, 3, 8, k)))).await;
+            let by_hand = fly(&mut client, graph(step("by hand", slot, headings(3, 3, 8, k)))).await;
+            if slot < 4 {
+                assert_eq!(auto.copies, by_hand.copies);
+                continue;
+            }
+            let (code, reason, message) = refused(client.step(step("by hand", 5, headings(3, 3, 8, 0))).await);
+            assert_eq!((code, reason.as_str()), (Code::FailedPrecondition, "episode_over"), "{message}");
+            let next = v1::ResetRequest { return_graph: true, ..reset("by hand") };
+            let next = client.reset(next).await.unwrap().into_inner();
+            assert_eq!((auto.episode, auto.slot), (next.episode, next.slot));
+            for ((auto, ended), next) in auto.copies.into_iter().zip(by_hand.copies).zip(next.copies) {
+                assert!(auto.truncated && ended.truncated && !next.truncated);
+                assert_eq!((auto.scene, auto.graph, auto.seed), (next.scene, next.graph, next.seed), "what is seen is the next");
+                assert_eq!((auto.reward, next.reward), (ended.reward, 0.0), "what is earned was the last");
+                let (finished, plain) = (auto.finished.unwrap(), ended.finished.unwrap());
+                assert_eq!((finished.scene, finished.graph), (ended.scene, ended.graph), "the end is not lost");
+                assert_eq!((finished.metrics, finished.seed), (plain.metrics, plain.seed));
+                assert_eq!(plain.scene, None, "it is in the observation already");
+            }
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_reset_says_which_episode_and_may_be_repeated() {
+    let server = Server::start().await;
+    let mut client = client(&server).await;
+    let first = made(&mut client, create("e", 2, &json!({"slots": 3}))).await;
+    assert_eq!(client.reset(reset("e")).await.unwrap().into_inner(), first, "nothing was flown");
+    fly(&mut client, step("e", 0, headings(2, 3, 8, 0))).await;
+    let second = client.reset(reset("e")).await.unwrap().into_inner();
+    assert_eq!((second.episode, second.step, second.slot), (1, 0, 0));
+    assert_eq!(client.reset(reset("e")).await.unwrap().into_inner(), second, "a retry");
+    assert_eq!(refused(client.step(step("e", 1, headings(2, 3, 8, 0))).await).1, "wrong_step", "steps count from a reset");
+    let at = |seed, episode| v1::ResetRequest { seed, episode, ..reset("e") };
+    let ask = async |request| client.clone().reset(request).await.unwrap().into_inner();
+    assert_eq!(ask(at(None, Some(0))).await, first);
+    assert_eq!(ask(at(None, Some(1))).await, second);
+    assert_eq!(ask(at(Some(7), None)).await, first);
+    assert_eq!(ask(at(Some(7), Some(1))).await, second);
+    let other = ask(at(Some(8), None)).await;
+    assert_eq!(other.copies[0], first.copies[1], "copies are seeded one after another");
+    assert_eq!(ask(at(Some(8), Some(1))).await.copies[0], second.copies[1], "in later episodes too");
+    // A seed that was told is the seed of the same episode.
+    let told = second.copies[1].seed;
+    assert!(told < 1 << 53, "JSON holds it");
+    assert_eq!(ask(at(Some(told), None)).await.copies[0].scene, second.copies[1].scene);
+    let (code, _, message) = refused(client.reset(at(Some(1 << 53), None)).await);
+    assert_eq!(code, Code::InvalidArgument);
+    assert!(message.starts_with("seed: 9007199254740992"), "{message}");
+}
+
+#[tokio::test]
+async fn creating_twice_is_a_retry_only_if_nothing_differs() {
+    let server = Server::start().await;
+    let mut client = client(&server).await;
+    let good = || create("e", 2, &json!({"users": 4}));
+    let first = client.create_environment(good()).await.unwrap().into_inner();
+    assert_eq!((first.headings, first.count, first.seed), (8, 2, 7));
+    let config = first.environment.as_ref().unwrap();
+    assert_eq!(config.fields["reward_scale"].kind, Some(prost_types::value::Kind::NumberValue(1.0 / 80.0)), "all is said");
+    assert_eq!(client.create_environment(good()).await.unwrap().into_inner(), first);
+    let different = [
+        v1::CreateEnvironmentRequest { count: Some(3), ..good() },
+        v1::CreateEnvironmentRequest { seed: 8, ..good() },
+        v1::CreateEnvironmentRequest { auto_reset: true, ..good() },
+        v1::CreateEnvironmentRequest { environment: None, ..good() },
+    ];
+    for different in different {
+        let (code, reason, _) = refused(client.create_environment(different).await);
+        assert_eq!((code, reason.as_str()), (Code::AlreadyExists, "already_exists"));
+    }
+    fly(&mut client, step("e", 0, headings(2, 3, 8, 0))).await;
+    assert_eq!(refused(client.create_environment(good()).await).0, Code::AlreadyExists);
+    let unnamed = || v1::CreateEnvironmentRequest { environment_id: String::new(), ..good() };
+    let one = client.create_environment(unnamed()).await.unwrap().into_inner().environment_id;
+    assert_ne!(client.create_environment(unnamed()).await.unwrap().into_inner().environment_id, one);
+}
+
+#[tokio::test]
+async fn what_is_seen_can_be_sent_to_act() {
+    let server = Server::start().await;
+    let (mut client, mut pilot) = (client(&server).await, server.grpc().await);
+    for policy in ["sweep", "qedgix"] {
+        let made = v1::CreateEnvironmentRequest { environment_id: policy.into(), ..create("", 2, &json!({"slots": 40})) };
+        client.create_environment(made).await.unwrap();
+        let see = v1::ResetRequest { return_graph: true, ..reset(policy) };
+        let mut state = client.reset(see).await.unwrap().into_inner();
+        let mut memory = [Bytes::new(), Bytes::new()];
+        for k in 0..40 {
+            let mut actions = Vec::new();
+            for (copy, memory) in state.copies.iter().zip(&mut memory) {
+                let by_scene = held(policy, memory.clone(), copy.scene.clone().unwrap());
+                let observation = v1::act_request::Observation::Graph(copy.graph.clone().unwrap());
+                let by_graph = v1::ActRequest { observation: Some(observation), ..by_scene.clone() };
+                let by_scene = v1::ActRequest { step: Some(u64::from(state.slot)), ..by_scene };
+                let answer = pilot.act(by_scene).await.unwrap().into_inner();
+                assert_eq!(pilot.act(by_graph).await.unwrap().into_inner().actions, answer.actions, "{policy}, slot {k}");
+                *memory = answer.recurrent_state;
+                actions.push(v1::Headings { headings: answer.actions.iter().map(|a| a.heading_index).collect() });
+            }
+            let request = v1::StepRequest { return_graph: true, ..step(policy, k, actions) };
+            state = fly(&mut client, request).await;
+        }
+        let metrics = state.copies[0].finished.as_ref().unwrap().metrics.unwrap();
+        assert!(metrics.coverage > 0.0 && metrics.mean_aoi < 40.0, "{metrics:?}");
+    }
+}
+
+#[tokio::test]
+async fn input_that_cannot_be_used_names_its_field() {
+    let server = Server::start().await;
+    let mut client = client(&server).await;
+    let cases = [
+        (json!({"uvas": 3}), "environment.uvas: an unknown field"),
+        (json!({"uavs": "three"}), "environment.uavs: \"three\""),
+        (json!({"uavs": 2.5}), "environment.uavs: 2.5"),
+        (json!({"M": 0}), "environment.uavs: 0"),
+        (json!({"N": 3, "users": 3}), "environment.N: a second value"),
+        (json!({"lr": 3}), "environment.lr: an unknown field"),
+        (json!({"d": 0.1}), "environment.detection_range: 0.1"),
+        (json!({"start": {"given": [[0.1, 0.2]]}}), "environment.start.given: 1 positions"),
+        (json!({"weights": [1, 2]}), "environment.weights: 2 values"),
+        (json!({"users": 60_000}), "count: 1 with 60003"),
+    ];
+    for (environment, begins) in cases {
+        let (code, _, message) = refused(client.create_environment(create("wrong", 1, &environment)).await);
+        assert_eq!(code, Code::InvalidArgument, "{message}");
+        assert!(message.starts_with(begins), "{begins}, but: {message}");
+    }
+    let good = || create("e", 2, &json!({}));
+    let wrong = [
+        (v1::CreateEnvironmentRequest { count: Some(0), ..good() }, "count: 0"),
+        (v1::CreateEnvironmentRequest { count: Some(1025), ..good() }, "count: 1025"),
+        (v1::CreateEnvironmentRequest { seed: u64::MAX, ..good() }, "seed: 18446744073709551615"),
+        (v1::CreateEnvironmentRequest { environment_id: "x".repeat(129), ..good() }, "environment_id: \"xxx"),
+    ];
+    for (request, begins) in wrong {
+        let (code, _, message) = refused(client.create_environment(request).await);
+        assert_eq!(code, Code::InvalidArgument, "{message}");
+        assert!(message.starts_with(begins), "{begins}, but: {message}");
+    }
+    client.create_environment(good()).await.unwrap();
+    let copy = |headings: &[u32]| v1::Headings { headings: headings.to_vec() };
+    let wrong = [
+        (vec![], "actions: 0 copies"),
+        (vec![copy(&[0, 0, 0]); 3], "actions: 3 copies"),
+        (vec![copy(&[0, 0, 0]), copy(&[0, 0])], "actions[1].headings: 2 heading indices"),
+        (vec![copy(&[0, 0, 0]), copy(&[0, 8, 0])], "actions[1].headings[1]: 8"),
+        (vec![copy(&[256, 0, 0]), copy(&[0, 0, 0])], "actions[0].headings[0]: 256"),
+    ];
+    for (actions, begins) in wrong {
+        let (code, _, message) = refused(client.step(step("e", 0, actions)).await);
+        assert_eq!(code, Code::InvalidArgument, "{message}");
+        assert!(message.starts_with(begins), "{begins}, but: {message}");
+    }
+    assert_eq!(fly(&mut client, step("e", 0, headings(2, 3, 8, 0))).await.step, 1, "nothing refused was flown");
+}
+
+#[tokio::test]
+async fn idle_environments_expire_and_say_so() {
+    let server = Server::with(|config| config.environment_ttl = std::time::Duration::from_secs(60)).await;
+    let mut client = client(&server).await;
+    client.create_environment(create("e", 1, &json!({}))).await.unwrap();
+    server.pass(59);
+    fly(&mut client, step("e", 0, headings(1, 3, 8, 0))).await;
+    server.pass(61);
+    let named = v1::DeleteEnvironmentRequest { environment_id: "e".into() };
+    for (code, reason, message) in [
+        refused(client.step(step("e", 1, headings(1, 3, 8, 1))).await),
+        refused(client.reset(reset("e")).await),
+        refused(client.get_environment(v1::GetEnvironmentRequest { environment_id: "e".into() }).await),
+        refused(client.delete_environment(named.clone()).await),
+    ] {
+        assert_eq!((code, reason.as_str()), (Code::FailedPrecondition, "environment_expired"));
+        assert!(message.contains("60 s"), "{message}");
+    }
+    assert_eq!(refused(client.reset(reset("never")).await).0, Code::NotFound);
+    client.create_environment(create("e", 1, &json!({}))).await.unwrap();
+    fly(&mut client, step("e", 0, headings(1, 3, 8, 0))).await;
+    assert_eq!(client.delete_environment(named).await.unwrap().into_inner().step, 1);
+    assert_eq!(refused(client.reset(reset("e")).await).0, Code::NotFound);
+    server.app.draining.begin();
+    for refusal in [
+        refused(client.create_environment(create("f", 1, &json!({}))).await),
+        refused(client.reset(reset("e")).await),
+        refused(client.step(step("e", 0, vec![])).await),
+    ] {
+        assert_eq!((refusal.0, refusal.1.as_str()), (Code::Unavailable, "draining"));
+    }
+}
+
+#[tokio::test]
+async fn their_number_and_their_memory_are_bounded() {
+    let server = Server::with(|config| (config.max_environments, config.environment_memory) = (2, 2 << 20)).await;
+    let mut client = client(&server).await;
+    let mut ask = async |id: &str, count| client.create_environment(create(id, count, &json!({}))).await;
+    for id in ["a", "b"] {
+        ask(id, 1).await.unwrap();
+    }
+    let (code, reason, message) = refused(ask("c", 1).await);
+    assert_eq!((code, reason.as_str()), (Code::ResourceExhausted, "resource_exhausted"));
+    assert!(message.starts_with("2 environments"), "{message}");
+    server.pass(601);
+    ask("c", 1000).await.unwrap();
+    let (code, _, message) = refused(ask("d", 1000).await);
+    assert_eq!(code, Code::ResourceExhausted);
+    assert!(message.contains("2048 KiB"), "{message}");
+    ask("c", 1000).await.expect("a retry takes no memory");
+    server.pass(601);
+    ask("d", 1000).await.expect("what expired made room");
+
+    let crowd = Server::start().await;
+    let mut client = self::client(&crowd).await;
+    client.create_environment(create("e", 1, &json!({"uavs": 10, "users": 1000}))).await.unwrap();
+    let (code, _, message) = refused(client.reset(v1::ResetRequest { return_graph: true, ..reset("e") }).await);
+    assert_eq!(code, Code::InvalidArgument);
+    assert!(message.starts_with("return_graph: true"), "{message}");
+    assert_eq!(client.reset(reset("e")).await.unwrap().into_inner().copies[0].scene.as_ref().unwrap().users.len(), 1000);
+}
+
+#[tokio::test]
+async fn rest_says_the_same() {
+    let server = Server::start().await;
+    let (rest, mut client) = (Rest::new(&server), client(&server).await);
+    let environment = json!({"K": 3, "uavs": 2.0});
+    let body = json!({"environment": environment, "seed": 7, "count": 2, "auto_reset": true, "environment_id": "r/1"});
+    let (status, shown) = rest.post("/v1/environments", &body).await;
+    assert_eq!(
+        (status, &shown["environment"]["slots"], &shown["headings"]),
+        (StatusCode::CREATED, &json!(3), &json!(8)),
+        "{shown}"
+    );
+    made(&mut client, v1::CreateEnvironmentRequest { auto_reset: true, ..create("g", 2, &environment) }).await;
+    for k in 0..4 {
+        let actions = headings(2, 2, 8, k);
+        let sent: Vec<Value> = actions.iter().map(|copy| json!({"headings": copy.headings})).collect();
+        let body = json!({"actions": sent, "step": k, "return_graph": true});
+        let (status, state) = rest.post("/v1/environments/r%2F1/step", &body).await;
+        assert_eq!(status, StatusCode::OK, "{state}");
+        let expected = fly(&mut client, step("g", k, actions)).await;
+        assert_eq!(
+            (&state["step"], &state["slot"], &state["episode"]),
+            (&json!(k + 1), &json!(expected.slot), &json!((k + 1) / 3))
+        );
+        for (a, b) in state["copies"].as_array().unwrap().iter().zip(&expected.copies) {
+            assert_eq!((&a["truncated"], &a["seed"]), (&json!(b.truncated), &json!(b.seed)));
+            assert_eq!(a["reward"].as_f64().unwrap() as f32, b.reward);
+            for (user, expected) in a["scene"]["users"].as_array().unwrap().iter().zip(&b.scene.as_ref().unwrap().users) {
+                assert_eq!(*user, json!({"id": expected.id, "x": expected.x, "y": expected.y, "aoi": expected.aoi}));
+            }
+            let mean = b.finished.as_ref().map(|finished| finished.metrics.unwrap().mean_aoi);
+            assert_eq!(a["finished"]["metrics"]["mean_aoi"].as_f64(), mean);
+            // What is seen goes to Act as it is.
+            let by_scene = rest.post("/v1/act", &json!({"policy": "sweep", "scene": a["scene"]})).await.1;
+            let by_graph = rest.post("/v1/act", &json!({"policy": "sweep", "graph": a["graph"]})).await.1;
+            assert_eq!(by_scene["actions"].as_array().unwrap().len(), 2, "{by_scene}");
+            assert_eq!(by_scene["actions"], by_graph["actions"]);
+        }
+    }
+    let first = rest.post("/v1/environments/r%2F1/reset", &json!({"seed": 7})).await.1;
+    assert_eq!((&first["episode"], &first["step"]), (&json!(0), &json!(0)));
+    let listed = rest.get("/v1/environments?page_size=1").await.1;
+    assert_eq!((&listed["environments"][0]["environment_id"], &listed["next_page_token"]), (&json!("g"), &json!("g")));
+    assert_eq!(rest.get("/v1/environments?page_token=g").await.1["environments"][0]["count"], 2);
+    let cases = [
+        ("/v1/environments", json!({"environment": {"uvas": 1}}), 422, "invalid_schema"),
+        ("/v1/environments", json!({"environment": {"uavs": 0}}), 400, "invalid_argument"),
+        ("/v1/environments", json!({"environment": 3}), 422, "invalid_schema"),
+        ("/v1/environments", json!({"environments": {}}), 422, "invalid_schema"),
+        ("/v1/environments", json!({"count": 0}), 400, "invalid_argument"),
+        ("/v1/environments", json!({"environment_id": "g"}), 409, "already_exists"),
+        ("/v1/environments/g/reset", json!({"seeds": 3}), 422, "invalid_schema"),
+        ("/v1/environments/g/step", json!({}), 422, "invalid_schema"),
+        ("/v1/environments/g/step", json!({"actions": []}), 400, "invalid_argument"),
+        ("/v1/environments/never/reset", json!({}), 404, "not_found"),
+    ];
+    for (path, body, status, code) in cases {
+        let refused = rest.refused(path, &body.to_string()).await;
+        assert_eq!((refused.0, refused.1.as_str()), (status, code), "{path} {body}: {}", refused.2);
+    }
+    assert_eq!(rest.send(Method::DELETE, "/v1/environments/g", "").await.0, StatusCode::OK);
+    assert_eq!(rest.get("/v1/environments/g").await.0, StatusCode::NOT_FOUND);
+    server.pass(601);
+    assert_eq!(rest.refused("/v1/environments/r%2F1/reset", "{}").await.1, "environment_expired");
+}
