@@ -11,6 +11,10 @@ use crate::recipe::{Algorithm, Preset, TrainConfig};
 pub struct Overrides {
     /// Seeds instead of the document's.
     pub seeds: Option<Vec<u64>>,
+    /// Names of the only series to run; empty: all.
+    pub series: Vec<String>,
+    /// Names of the only points to run; empty: all.
+    pub points: Vec<String>,
     /// Fields of `environment`.
     pub environment: Map<String, Value>,
     /// Fields of `training`.

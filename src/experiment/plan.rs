@@ -106,11 +106,11 @@ impl Experiment {
         let run = top
             .optional("run")?
             .map_or(Ok(Section::default()), |value| Section::read(&mut Table::new("run", value, &Section::FIELDS)?))?;
-        let series = rows(&mut top, "series", &[])?;
+        let series = only("series", rows(&mut top, "series", &[])?, &overrides.series)?;
         if series.is_empty() {
             return Err(Invalid::new("series", "no table", "at least one [[series]]"));
         }
-        let mut points = rows(&mut top, "points", &["x"])?;
+        let mut points = only("points", rows(&mut top, "points", &["x"])?, &overrides.points)?;
         if points.is_empty() {
             points.push(Row { name: String::new(), x: Some(0.0), section: Section::default() });
         }
@@ -175,6 +175,15 @@ fn rows(top: &mut Table, field: &str, more: &[&str]) -> Result<Vec<Row>, Invalid
         rows.push(row);
     }
     Ok(rows)
+}
+
+/// The rows with these names, in the document's order; all where no name is given.
+fn only(field: &str, rows: Vec<Row>, names: &[String]) -> Result<Vec<Row>, Invalid> {
+    if let Some(unknown) = names.iter().find(|name| !rows.iter().any(|row| &row.name == *name)) {
+        let known: Vec<_> = rows.iter().map(|row| row.name.as_str()).collect();
+        return Err(Invalid::new(field, format!("{unknown:?}"), format!("one of {}", known.join("; "))));
+    }
+    Ok(rows.into_iter().filter(|row| names.is_empty() || names.contains(&row.name)).collect())
 }
 
 fn distinct(field: &str, seeds: &[u64]) -> Result<(), Invalid> {

@@ -29,7 +29,7 @@ use crate::policy::baselines;
 #[command(after_help = "Examples:
   qedgix experiment experiments/convergence.toml --dry-run      # which runs, and how far they have come
   qedgix experiment experiments/convergence.toml                # stop with ctrl-c; the same command goes on
-  qedgix experiment experiments/range.toml --seeds 1 --steps 50000 --out /tmp/range")]
+  qedgix experiment experiments/range.toml --seeds 1 --steps 50000 --point '4 xi' --point '9 xi' --out quick")]
 pub struct ExperimentArgs {
     /// The experiment, as TOML
     #[arg(env = "QEDGIX_EXPERIMENT")]
@@ -46,6 +46,12 @@ pub struct ExperimentArgs {
     /// Seeds, instead of the file's
     #[arg(long, env = "QEDGIX_SEEDS", value_delimiter = ',')]
     seeds: Option<Vec<u64>>,
+    /// Runs only this series; may be repeated
+    #[arg(long, env = "QEDGIX_SERIES", value_name = "NAME", value_delimiter = ';')]
+    series: Vec<String>,
+    /// Runs only this point; may be repeated
+    #[arg(long, env = "QEDGIX_POINT", value_name = "NAME", value_delimiter = ';')]
+    point: Vec<String>,
     /// Overrides one field of every run; may be repeated
     #[arg(long = "set", value_name = "SECTION.FIELD=VALUE")]
     set: Vec<String>,
@@ -94,7 +100,8 @@ fn read(args: &ExperimentArgs) -> anyhow::Result<Experiment> {
     let name = args.file.display().to_string();
     let text = fs::read_to_string(&args.file).with_context(|| name.clone())?;
     let document: Value = toml::from_str(&text).with_context(|| name.clone())?;
-    let mut overrides = Overrides { seeds: args.seeds.clone(), ..Overrides::default() };
+    let mut overrides =
+        Overrides { seeds: args.seeds.clone(), series: args.series.clone(), points: args.point.clone(), ..Overrides::default() };
     run_args::set(&args.set, &mut overrides.environment, &mut overrides.training)?;
     if let Some(steps) = args.steps {
         overrides.training.insert("steps".into(), steps.into());
@@ -113,6 +120,8 @@ fn command(args: &ExperimentArgs) -> String {
     if let Some(seeds) = &args.seeds {
         words.push(format!("--seeds {}", seeds.iter().map(u64::to_string).collect::<Vec<_>>().join(",")));
     }
+    words.extend(args.series.iter().map(|name| format!("--series '{name}'")));
+    words.extend(args.point.iter().map(|name| format!("--point '{name}'")));
     words.extend(args.set.iter().map(|item| format!("--set '{item}'")));
     words.join(" ")
 }
