@@ -208,12 +208,10 @@ pub async fn run(
     let stop = CancellationToken::new();
 
     let health_server = tonic_health::pb::health_server::HealthServer::new(HealthService::from_health_reporter(health.clone()));
-    let serve_grpc = tonic::transport::Server::builder()
-        .http2_keepalive_interval(Some(Duration::from_secs(30)))
-        .max_concurrent_streams(1024)
+    let serve_grpc = transport()
         .layer(tower::util::MapRequestLayer::new(grpc::stamp))
         .add_routes(grpc::routes(&app, health_server, config.max_message_size))
-        .serve_with_incoming_shutdown(TcpIncoming::from(listeners.grpc).with_nodelay(Some(true)), stop.clone().cancelled_owned());
+        .serve_with_incoming_shutdown(incoming(listeners.grpc), stop.clone().cancelled_owned());
     let http = listeners.http.tap_io(|stream| {
         // Only latency is lost where it cannot be set.
         let _ = stream.set_nodelay(true);
@@ -249,6 +247,16 @@ pub async fn run(
     data.withdraw();
     tracing::info!("stopped");
     served
+}
+
+/// gRPC's transport with this server's settings.
+pub fn transport() -> tonic::transport::Server {
+    tonic::transport::Server::builder().http2_keepalive_interval(Some(Duration::from_secs(30))).max_concurrent_streams(1024)
+}
+
+/// Connections of gRPC: nothing waits for a packet to fill.
+pub fn incoming(listener: TcpListener) -> TcpIncoming {
+    TcpIncoming::from(listener).with_nodelay(Some(true))
 }
 
 /// How a process on this machine reaches a listener: one on all addresses is reached on the loopback.

@@ -269,7 +269,10 @@ fn compute(batch: &mut Vec<Queued>) {
         policy.policy.act(&mut turns);
         drop(turns);
         let compute = begun.elapsed();
-        tasks.into_iter().map(move |(_, _, outcome)| Outcome { timings: Timings { compute, ..outcome.timings }, ..outcome }).collect::<Vec<_>>()
+        tasks
+            .into_iter()
+            .map(move |(_, _, outcome)| Outcome { timings: Timings { compute, ..outcome.timings }, ..outcome })
+            .collect::<Vec<_>>()
     }));
     metrics::histogram!("qedgix_act_batch_size").record(f64::from(batch_size));
     match outcomes {

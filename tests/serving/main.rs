@@ -6,6 +6,7 @@ mod batch;
 mod conversion;
 mod harness;
 mod limits;
+mod load;
 mod published;
 mod rest;
 mod server;
