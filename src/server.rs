@@ -160,6 +160,8 @@ impl DataDir {
 /// The database or a policy in it cannot be read.
 pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<App>, Error> {
     config.validate()?;
+    // Before anything keeps a handle of a metric.
+    telemetry::metrics();
     let sessions = SessionsConfig { ttl: config.session_ttl, max: config.max_sessions };
     let store = Store::open(&data.path).await?;
     let executor = match &config.worker {
@@ -249,9 +251,16 @@ pub async fn run(
     served
 }
 
+/// What a connection may send before the server has read it, in bytes: a large fleet's observation.
+const WINDOW: u32 = 4 << 20;
+
 /// gRPC's transport with this server's settings.
 pub fn transport() -> tonic::transport::Server {
-    tonic::transport::Server::builder().http2_keepalive_interval(Some(Duration::from_secs(30))).max_concurrent_streams(1024)
+    tonic::transport::Server::builder()
+        .http2_keepalive_interval(Some(Duration::from_secs(30)))
+        .max_concurrent_streams(1024)
+        .initial_stream_window_size(WINDOW)
+        .initial_connection_window_size(WINDOW)
 }
 
 /// Connections of gRPC: nothing waits for a packet to fill.

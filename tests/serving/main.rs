@@ -5,6 +5,7 @@ mod act;
 mod batch;
 mod conversion;
 mod harness;
+mod large;
 mod limits;
 mod load;
 mod published;
