@@ -160,6 +160,8 @@ impl DataDir {
 /// The database or a policy in it cannot be read.
 pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<App>, Error> {
     config.validate()?;
+    // Before anything keeps a handle of a metric.
+    telemetry::metrics();
     let sessions = Limits { ttl: config.session_ttl, max: config.max_sessions };
     let limits = Limits { ttl: config.environment_ttl, max: config.max_environments };
     let environments = EnvironmentsConfig { limits, memory: config.environment_memory };
@@ -211,12 +213,10 @@ pub async fn run(
     let stop = CancellationToken::new();
 
     let health_server = tonic_health::pb::health_server::HealthServer::new(HealthService::from_health_reporter(health.clone()));
-    let serve_grpc = tonic::transport::Server::builder()
-        .http2_keepalive_interval(Some(Duration::from_secs(30)))
-        .max_concurrent_streams(1024)
+    let serve_grpc = transport()
         .layer(tower::util::MapRequestLayer::new(grpc::stamp))
         .add_routes(grpc::routes(&app, health_server, config.max_message_size))
-        .serve_with_incoming_shutdown(TcpIncoming::from(listeners.grpc).with_nodelay(Some(true)), stop.clone().cancelled_owned());
+        .serve_with_incoming_shutdown(incoming(listeners.grpc), stop.clone().cancelled_owned());
     let http = listeners.http.tap_io(|stream| {
         // Only latency is lost where it cannot be set.
         let _ = stream.set_nodelay(true);
@@ -252,6 +252,23 @@ pub async fn run(
     data.withdraw();
     tracing::info!("stopped");
     served
+}
+
+/// What a connection may send before the server has read it, in bytes: a large fleet's observation.
+const WINDOW: u32 = 4 << 20;
+
+/// gRPC's transport with this server's settings.
+pub fn transport() -> tonic::transport::Server {
+    tonic::transport::Server::builder()
+        .http2_keepalive_interval(Some(Duration::from_secs(30)))
+        .max_concurrent_streams(1024)
+        .initial_stream_window_size(WINDOW)
+        .initial_connection_window_size(WINDOW)
+}
+
+/// Connections of gRPC: nothing waits for a packet to fill.
+pub fn incoming(listener: TcpListener) -> TcpIncoming {
+    TcpIncoming::from(listener).with_nodelay(Some(true))
 }
 
 /// How a process on this machine reaches a listener: one on all addresses is reached on the loopback.

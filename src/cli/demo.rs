@@ -1,25 +1,21 @@
 //! `qedgix demo`: the whole story on an empty machine. A server on an empty data directory; a trained policy and the baselines
 //! flown through gRPC `Act`; a training job over REST; its checkpoint, served by the same `Act`; one table.
 
-use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Instant;
 
 use anyhow::Context;
 use clap::Args;
 use serde_json::{Value, json};
-use tokio::sync::oneshot;
-use tokio::task::JoinHandle;
 
 use super::client::Client;
+use super::local::LocalServer;
 use super::run_args::all_cores;
 use super::{fly, progress, table, train};
-use crate::config::Config;
 use crate::env::EnvConfig;
 use crate::learner::{Algorithm, Summary, difference, layouts, summarize};
 use crate::policy::baselines;
-use crate::server::{self, DataDir, Listeners};
-use crate::serving::{Clock, bundled};
+use crate::serving::bundled;
 
 /// Flags of `demo`; none is needed.
 #[derive(Args, Debug)]
@@ -59,7 +55,7 @@ pub async fn run(args: DemoArgs) -> anyhow::Result<()> {
 
 async fn story(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
     let begin = Instant::now();
-    let server = Server::start(&data_dir).await?;
+    let server = LocalServer::start(&data_dir).await?;
     println!(
         "A server on an empty data directory\n  gRPC  {}\n  REST  http://{}\n  data  {}\n",
         server.grpc,
@@ -152,35 +148,4 @@ async fn tell_curve(client: &Client, id: &str) -> anyhow::Result<()> {
     let (first, last) = values.first().zip(values.last()).context("the job reported no evaluation")?;
     println!("   job {id} succeeded; validation mean AoI {first:.1} {} {last:.1}", table::sparkline(&values));
     Ok(())
-}
-
-/// A server on free ports of this process.
-struct Server {
-    grpc: SocketAddr,
-    http: SocketAddr,
-    stop: oneshot::Sender<()>,
-    done: JoinHandle<anyhow::Result<()>>,
-}
-
-impl Server {
-    async fn start(data_dir: &Path) -> anyhow::Result<Self> {
-        let free: SocketAddr = ([127, 0, 0, 1], 0).into();
-        let config = Config { grpc_addr: free, http_addr: free, ..Config::new(data_dir) };
-        let data = DataDir::take(&config.data_dir)?;
-        let listeners = Listeners::bind(&config).await?;
-        let endpoints = listeners.endpoints()?;
-        let app = server::open(&config, &data, Clock::system()).await?;
-        let (stop, stopped) = oneshot::channel();
-        let done = tokio::spawn(async move {
-            let shutdown = async move { stopped.await.unwrap_or(()) };
-            Ok(server::run(&config, &data, app, listeners, shutdown).await?)
-        });
-        Ok(Self { grpc: endpoints.grpc, http: endpoints.http, stop, done })
-    }
-
-    async fn stop(self) -> anyhow::Result<()> {
-        // It is gone already if nobody listens any more; then `done` says why.
-        let _ = self.stop.send(());
-        self.done.await?
-    }
 }

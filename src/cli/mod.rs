@@ -8,6 +8,7 @@ mod evaluate;
 mod experiment;
 mod files;
 mod fly;
+mod local;
 mod progress;
 mod report;
 mod run_args;
@@ -54,7 +55,7 @@ pub fn run() -> ExitCode {
         Command::Train(args) => block_on(train::run(args)),
         Command::Evaluate(args) => block_on(evaluate::run(args)),
         Command::Experiment(args) => block_on(experiment::run(args)),
-        Command::Bench(args) => block_on(async { bench::run(args) }),
+        Command::Bench(args) => block_on(bench::run(args)),
         // It begins without threads and without a runtime.
         Command::Worker(args) => worker::run(&args),
     }

@@ -144,7 +144,11 @@ fn address(text: &str) -> Result<SocketAddr, String> {
     found.next().ok_or_else(|| "the host has no address".to_owned())
 }
 
-fn duration(text: &str) -> Result<Duration, String> {
+/// A time as people write it: seconds, or a number with a unit.
+///
+/// # Errors
+/// What would be one.
+pub(super) fn duration(text: &str) -> Result<Duration, String> {
     let seconds = text.parse::<f64>().ok().and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
     let friendly = || text.parse::<jiff::SignedDuration>().ok().and_then(|duration| Duration::try_from(duration).ok());
     seconds.or_else(friendly).ok_or_else(|| "expected seconds, or a number with a unit: 500ms, 90s, 10m, 2h".to_owned())

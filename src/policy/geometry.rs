@@ -119,7 +119,7 @@ impl Geometry {
         let all = uav_xy.chunks_exact(2).chain(user_xy.chunks_exact(2));
         self.points.extend(all.map(|p| [f64::from(p[0]), f64::from(p[1])]));
         let observers = config.observers(uavs, users);
-        self.vision.look(&self.points, observers, config.range, &mut self.offsets, &mut self.detections);
+        self.vision.look(&self.points, observers, config.range, (&mut self.offsets, &mut self.detections), usize::MAX);
         self.offsets.resize(self.row_of.len() + 1, self.detections.len() as u32);
         self.aoi.extend(aoi.iter().map(|a| a / config.slots as f32));
     }

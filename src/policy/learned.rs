@@ -103,6 +103,10 @@ impl Policy for Learned {
         }
     }
 
+    fn is_linear(&self) -> bool {
+        self.agent.config().hops <= 1
+    }
+
     fn act(&self, turns: &mut [Turn<'_>]) {
         let pool = || self.buffers.lock().unwrap_or_else(PoisonError::into_inner);
         let taken = pool().pop();

@@ -69,6 +69,12 @@ pub trait Policy: Send + Sync {
     /// Writes the memory of a fleet at slot 0. `seed` fixes everything random about the episode.
     fn start(&self, uavs: usize, users: usize, seed: u64, memory: &mut [f32]);
 
+    /// Whether a slot costs little more than a constant per node and detection, so that a small one need not be computed away
+    /// from where it arrives.
+    fn is_linear(&self) -> bool {
+        false
+    }
+
     /// Advances every fleet by one slot. Fleets may differ in size. Each answer is the same as if its fleet came alone.
     /// The caller has checked sizes with `check_fleet` and the slots with `needs`.
     fn act(&self, turns: &mut [Turn<'_>]);

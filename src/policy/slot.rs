@@ -59,8 +59,6 @@ impl Slot {
     /// # Panics
     /// When the lengths do not fit together.
     pub fn from_detections(uav_positions: Option<Vec<Point>>, uavs: usize, aoi: Vec<f32>, detections: &[Vec<Detection>]) -> Self {
-        let users = aoi.len();
-        assert_eq!(detections.len(), uavs + users, "one list of detections per node");
         let mut offsets = Vec::with_capacity(detections.len() + 1);
         offsets.push(0);
         let mut flat = Vec::with_capacity(detections.iter().map(Vec::len).sum());
@@ -68,7 +66,35 @@ impl Slot {
             flat.extend_from_slice(list);
             offsets.push(flat.len() as u32);
         }
-        Self { uavs, users, offsets, detections: flat, aoi, uav_positions, ..Self::default() }
+        Self::from_flat_detections(uav_positions, uavs, aoi, offsets, flat)
+    }
+
+    /// The slot of a scene (see [`Slot::from_scene`]) if it has at most `most` detections. Work and memory are bounded by the
+    /// nodes and by `most`.
+    ///
+    /// # Panics
+    /// When `aoi` does not have one entry per user.
+    pub fn from_scene_within(uavs: &[Point], users: &[Point], aoi: &[f32], range: f64, most: usize) -> Option<Self> {
+        let mut slot = Self::default();
+        slot.look_at(uavs, users, aoi, range, most).then_some(slot)
+    }
+
+    /// The slot of a detection graph, as [`Slot::from_detections`] has it, from all lists one after another: node i's are
+    /// `detections[offsets[i]..offsets[i + 1]]`.
+    ///
+    /// # Panics
+    /// When the lengths do not fit together.
+    pub fn from_flat_detections(
+        uav_positions: Option<Vec<Point>>,
+        uavs: usize,
+        aoi: Vec<f32>,
+        offsets: Vec<u32>,
+        detections: Vec<Detection>,
+    ) -> Self {
+        let users = aoi.len();
+        assert_eq!(offsets.len(), uavs + users + 1, "one list of detections per node");
+        assert_eq!(offsets.last().map(|&end| end as usize), Some(detections.len()), "the last list ends at the end");
+        Self { uavs, users, offsets, detections, aoi, uav_positions, ..Self::default() }
     }
 
     /// Rebuilds this slot from a scene, keeping its allocations (see [`Slot::from_scene`]).
@@ -76,6 +102,11 @@ impl Slot {
     /// # Panics
     /// When `aoi` does not have one entry per user.
     pub fn set_scene(&mut self, uavs: &[Point], users: &[Point], aoi: &[f32], range: f64) {
+        self.look_at(uavs, users, aoi, range, usize::MAX);
+    }
+
+    /// False, and the slot incomplete, if there are more than `most` detections.
+    fn look_at(&mut self, uavs: &[Point], users: &[Point], aoi: &[f32], range: f64, most: usize) -> bool {
         assert_eq!(aoi.len(), users.len(), "one AoI per user");
         self.uavs = uavs.len();
         self.users = users.len();
@@ -93,7 +124,7 @@ impl Slot {
         self.points.clear();
         self.points.extend_from_slice(uavs);
         self.points.extend_from_slice(users);
-        self.vision.look(&self.points, self.points.len(), range, &mut self.offsets, &mut self.detections);
+        self.vision.look(&self.points, self.points.len(), range, (&mut self.offsets, &mut self.detections), most)
     }
 
     /// M.
@@ -109,6 +140,11 @@ impl Slot {
     /// What node `i` detects, in ascending order of target (UAVs before users).
     pub fn detections(&self, i: usize) -> &[Detection] {
         &self.detections[self.offsets[i] as usize..self.offsets[i + 1] as usize]
+    }
+
+    /// How many detections all nodes have together.
+    pub fn all_detections(&self) -> usize {
+        self.detections.len()
     }
 
     /// AoI of each user, in slots.

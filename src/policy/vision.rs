@@ -44,21 +44,21 @@ impl Grid {
 
 impl Vision {
     /// Appends what nodes 0..`observers` detect among all `points`, each in ascending order of target, without itself, and
-    /// the end of each list to `offsets`.
+    /// the end of each list to `offsets`. False, and not everything appended, if `detections` grew longer than `most`.
     pub(super) fn look(
         &mut self,
         points: &[Point],
         observers: usize,
         range: f64,
-        offsets: &mut Vec<u32>,
-        detections: &mut Vec<Detection>,
-    ) {
+        (offsets, detections): (&mut Vec<u32>, &mut Vec<Detection>),
+        most: usize,
+    ) -> bool {
         if points.len() <= FEW {
             for (i, &from) in points[..observers].iter().enumerate() {
                 detections.extend(points.iter().enumerate().filter_map(|(j, &to)| detect(i, from, j, to, range)));
                 offsets.push(detections.len() as u32);
             }
-            return;
+            return detections.len() <= most;
         }
         let grid = Grid::over(points, range);
         self.sort(points, &grid);
@@ -73,7 +73,11 @@ impl Vision {
             }
             detections[first..].sort_unstable_by_key(|d| d.target);
             offsets.push(detections.len() as u32);
+            if detections.len() > most {
+                return false;
+            }
         }
+        true
     }
 
     /// Sorts nodes by cell.
@@ -135,7 +139,7 @@ mod tests {
             };
             let points: Vec<Point> = (0..n).map(|i| [coordinate(i), coordinate(i)]).collect();
             let (mut offsets, mut detections) = (vec![0], Vec::new());
-            Vision::default().look(&points, points.len(), range, &mut offsets, &mut detections);
+            assert!(Vision::default().look(&points, points.len(), range, (&mut offsets, &mut detections), usize::MAX));
             assert_eq!((offsets, detections), pairs(&points, range), "{n} nodes, range {range}");
         }
     }

@@ -9,11 +9,11 @@ use super::{App, Error};
 use crate::invalid::Invalid;
 use crate::policy::Slot;
 use crate::serving::{
-    Answered, Fleet, HeldState, LoadedPolicy, Observation, Outcome, PolicySpec, Session, Task, Timings, Turn, Which,
+    Answered, Fleet, HeldState, LoadedPolicy, Observation, Outcome, PolicySpec, Seen, Session, Task, Timings, Turn, Which,
 };
 
 /// Observations of more nodes are prepared away from the threads that serve connections.
-const LARGE: usize = 256;
+pub const LARGE: usize = 256;
 
 /// What is asked.
 #[derive(Clone, Debug)]
@@ -96,11 +96,9 @@ async fn in_session(app: &App, session: &Session, request: Request, deadline: Op
     if let Some(seed) = request.seed {
         return Err(Invalid::new("seed", seed, "nothing: a session is given its seed when it is opened").into());
     }
-    let Observation { fleet, uav_order: order, .. } = &request.observation;
-    let (fleet, order) = (fleet.clone(), order.clone());
-    let slot = slot_of(request.observation, &policy).await?;
-    let uavs = fleet.uavs.clone();
-    let answered = match session.turn(fleet, request.step, request.run_id.as_deref()).await? {
+    let Observation { fleet, uav_order: order, seen } = request.observation;
+    let slot = slot_of(&fleet, seen, &policy).await?;
+    let answered = match session.turn(&fleet, request.step, request.run_id.as_deref()).await? {
         Turn::Repeat(answered) => answered,
         Turn::Next(mut turn) => {
             let memory = std::mem::take(&mut turn.memory);
@@ -109,7 +107,7 @@ async fn in_session(app: &App, session: &Session, request: Request, deadline: Op
         }
     };
     let Answered { step, headings, q_values, timings } = answered;
-    Ok(Answer { policy, uavs, order, step, headings, q_values, state: None, timings })
+    Ok(Answer { policy, uavs: fleet.uavs, order, step, headings, q_values, state: None, timings })
 }
 
 async fn with_held_state(app: &App, state: &[u8], request: Request, deadline: Option<Instant>) -> Result<Answer, Error> {
@@ -121,9 +119,8 @@ async fn with_held_state(app: &App, state: &[u8], request: Request, deadline: Op
     if let Some(held) = &held {
         policy = version_of(app, policy, spec, held)?;
     }
-    let Observation { fleet, uav_order: order, .. } = &request.observation;
-    let (fleet, order) = (fleet.clone(), order.clone());
-    let slot = slot_of(request.observation, &policy).await?;
+    let Observation { fleet, uav_order: order, seen } = request.observation;
+    let slot = slot_of(&fleet, seen, &policy).await?;
     let step = held.as_ref().map_or(0, |held| held.step);
     if let Some(sent) = request.step.filter(|&sent| sent != step) {
         let message = format!("step {sent} does not go with this recurrent_state, which is of step {step}");
@@ -181,18 +178,16 @@ fn memory_of(held: HeldState, fleet: &Fleet, policy: &LoadedPolicy) -> Result<Ve
     Ok(held.memory)
 }
 
-async fn slot_of(observation: Observation, policy: &Arc<LoadedPolicy>) -> Result<Slot, Error> {
-    if observation.uavs() + observation.users() < LARGE {
-        return Ok(observation.into_slot(&*policy.policy)?);
+async fn slot_of(fleet: &Fleet, seen: Seen, policy: &Arc<LoadedPolicy>) -> Result<Slot, Error> {
+    let (uavs, users) = (fleet.uavs.len(), fleet.users.len());
+    if uavs + users < LARGE {
+        return Ok(seen.into_slot((uavs, users), &*policy.policy)?);
     }
     let policy = policy.clone();
-    let prepared = tokio::task::spawn_blocking(move || observation.into_slot(&*policy.policy));
+    let prepared = tokio::task::spawn_blocking(move || seen.into_slot((uavs, users), &*policy.policy));
     Ok(prepared.await.map_err(Error::internal)??)
 }
 
 async fn compute(app: &App, task: Task, deadline: Option<Instant>) -> Result<Outcome, Error> {
-    let outcome = app.engine.run(task, deadline).await?;
-    metrics::histogram!("qedgix_act_queue_seconds").record(outcome.timings.queue.as_secs_f64());
-    metrics::histogram!("qedgix_act_compute_seconds").record(outcome.timings.compute.as_secs_f64());
-    Ok(outcome)
+    Ok(app.engine.run(task, deadline).await?)
 }

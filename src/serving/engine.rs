@@ -2,21 +2,29 @@
 //!
 //! A thread takes the fleet that waits longest and, with it, whatever waits for the same policy version, into one forward
 //! pass; answers are the same bits as alone. By default nobody waits for company: a batch is what has gathered while the
-//! threads were busy. A caller that gave up (its future was dropped, or its deadline passed) is not computed for. A policy
-//! that panics is a fault of the server, told to the callers of the batch; the thread goes on.
+//! threads were busy. Handing a fleet over and its answer back wakes two threads, which takes longer than a small fleet's
+//! forward pass: small fleets are computed by the first caller among them, if no more than `threads` compute then.
+//!
+//! A caller that gave up (its future was dropped, or its deadline passed) is not computed for. A policy that panics is a
+//! fault of the server, told to the callers of the batch; the thread goes on.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use tokio::sync::oneshot;
+use metrics::Histogram;
+use tokio::sync::oneshot::{self, error::TryRecvError};
 
 use super::{Error, LoadedPolicy};
 use crate::policy::{Slot, Turn};
 
-/// Nodes of a batch beyond which no further fleet joins it: company must not make a small fleet wait for large ones.
-const NODES: usize = 4096;
+/// Work of a batch beyond which no further fleet joins it: company must not make a small fleet wait for large ones.
+const WORK: usize = 1 << 17;
+/// Most work of a batch that a caller computes: well below a millisecond, for its thread serves connections, too.
+const SMALL: usize = 1 << 13;
+/// What a UAV costs, in units of what a detection does.
+const UAV: usize = 32;
 
 /// Limits of an engine.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -42,6 +50,17 @@ pub struct Task {
     pub step: u64,
     /// The fleet's memory.
     pub memory: Vec<f32>,
+}
+
+impl Task {
+    fn work(&self) -> usize {
+        UAV * self.slot.uavs() + self.slot.users() + self.slot.all_detections()
+    }
+
+    /// Whether a caller may compute it.
+    fn is_small(&self) -> bool {
+        self.policy.policy.is_linear() && self.work() <= SMALL
+    }
 }
 
 /// What came out.
@@ -76,8 +95,9 @@ struct Queued {
 }
 
 impl Queued {
-    fn nodes(&self) -> usize {
-        self.task.slot.uavs() + self.task.slot.users()
+    /// About what it costs, in units of what a detection does.
+    fn work(&self) -> usize {
+        self.task.work()
     }
 
     /// Whether somebody still waits for the answer; who waited too long is told.
@@ -96,6 +116,8 @@ impl Queued {
 #[derive(Default)]
 struct Queue {
     waiting: VecDeque<Queued>,
+    /// Batches that are being computed.
+    running: usize,
     closed: bool,
 }
 
@@ -103,6 +125,14 @@ struct Shared {
     queue: Mutex<Queue>,
     filled: Condvar,
     config: EngineConfig,
+    meters: Meters,
+}
+
+/// Kept, because making a handle takes as long as some fleets.
+struct Meters {
+    queue: Histogram,
+    compute: Histogram,
+    batch_size: Histogram,
 }
 
 impl Shared {
@@ -130,30 +160,52 @@ impl Shared {
                 queue = self.filled.wait_timeout(queue, rest).unwrap_or_else(PoisonError::into_inner).0;
                 continue;
             }
-            self.gather(&mut queue, batch);
+            self.gather(&mut queue, batch, WORK);
+            // Notices may have been meant for what is left.
+            if !queue.waiting.is_empty() {
+                self.filled.notify_one();
+            }
             return true;
         }
     }
 
-    /// Takes the oldest and what joins it, each at its first chance; the others keep their order.
-    fn gather(&self, queue: &mut Queue, batch: &mut Vec<Queued>) {
+    /// Computes a batch for the caller and others if the oldest fleet is small and not too many compute; whether it did.
+    fn lead(&self) -> bool {
+        let mut batch = Vec::new();
+        {
+            let mut queue = self.lock();
+            let small = queue.waiting.front().is_some_and(|oldest| oldest.task.is_small());
+            if !small || queue.running >= self.config.threads {
+                return false;
+            }
+            self.gather(&mut queue, &mut batch, SMALL);
+        }
+        self.compute(batch);
+        true
+    }
+
+    /// Takes the oldest and what joins it up to `most` work, each at its first chance; the others keep their order.
+    fn gather(&self, queue: &mut Queue, batch: &mut Vec<Queued>, most: usize) {
         let Some(oldest) = queue.waiting.pop_front() else { return };
-        let mut nodes = oldest.nodes();
+        queue.running += 1;
+        let mut work = oldest.work();
         batch.push(oldest);
         let mut i = 0;
         while i < queue.waiting.len() && batch.len() < self.config.max_batch {
             let next = &queue.waiting[i];
-            if Arc::ptr_eq(&next.task.policy, &batch[0].task.policy) && nodes + next.nodes() <= NODES {
-                nodes += next.nodes();
+            if Arc::ptr_eq(&next.task.policy, &batch[0].task.policy) && work + next.work() <= most {
+                work += next.work();
                 batch.extend(queue.waiting.remove(i));
             } else {
                 i += 1;
             }
         }
-        // Notices may have been meant for what is left.
-        if !queue.waiting.is_empty() {
-            self.filled.notify_one();
-        }
+    }
+
+    /// One forward pass over a batch.
+    fn compute(&self, batch: Vec<Queued>) {
+        compute(batch, &self.meters);
+        self.lock().running -= 1;
     }
 }
 
@@ -168,14 +220,19 @@ impl Engine {
     /// # Errors
     /// The system refuses a thread.
     pub fn start(config: EngineConfig) -> std::io::Result<Self> {
-        let shared = Arc::new(Shared { queue: Mutex::default(), filled: Condvar::new(), config });
+        let meters = Meters {
+            queue: metrics::histogram!("qedgix_act_queue_seconds"),
+            compute: metrics::histogram!("qedgix_act_compute_seconds"),
+            batch_size: metrics::histogram!("qedgix_act_batch_size"),
+        };
+        let shared = Arc::new(Shared { queue: Mutex::default(), filled: Condvar::new(), config, meters });
         let engine = Self { shared: shared.clone() };
         for i in 0..config.threads {
             let shared = shared.clone();
             let work = move || {
                 let mut batch = Vec::new();
                 while shared.next(&mut batch) {
-                    compute(&mut batch);
+                    shared.compute(std::mem::take(&mut batch));
                 }
             };
             std::thread::Builder::new().name(format!("engine-{i}")).spawn(work)?;
@@ -193,7 +250,8 @@ impl Engine {
     /// # Errors
     /// The queue is full, the deadline passed, or the policy panicked.
     pub async fn run(&self, task: Task, deadline: Option<Instant>) -> Result<Outcome, Error> {
-        let (reply, answer) = oneshot::channel();
+        let small = task.is_small() && self.shared.config.max_batch_delay.is_zero();
+        let (reply, mut answer) = oneshot::channel();
         {
             let mut queue = self.shared.lock();
             let capacity = self.shared.config.queue;
@@ -206,8 +264,21 @@ impl Engine {
             }
             queue.waiting.push_back(Queued { task, since: Instant::now(), deadline, reply });
         }
-        self.shared.filled.notify_one();
         let gone = || Error::Fault("the engine stopped".into());
+        if small {
+            // Callers that are ready to ask do so before the first of them computes for all.
+            tokio::task::yield_now().await;
+            loop {
+                match answer.try_recv() {
+                    Ok(answer) => return answer,
+                    Err(TryRecvError::Closed) => return Err(gone()),
+                    Err(TryRecvError::Empty) if self.shared.lead() => {}
+                    // A thread will; it is told only now, because until now it was not needed.
+                    Err(TryRecvError::Empty) => break,
+                }
+            }
+        }
+        self.shared.filled.notify_one();
         match deadline {
             None => answer.await.map_err(|_| gone())?,
             Some(deadline) => match tokio::time::timeout_at(deadline.into(), answer).await {
@@ -232,13 +303,11 @@ impl std::fmt::Debug for Engine {
     }
 }
 
-/// One forward pass over a batch, which is empty afterwards.
-fn compute(batch: &mut Vec<Queued>) {
+fn compute(batch: Vec<Queued>, meters: &Meters) {
     let begun = Instant::now();
-    let batch: Vec<Queued> = batch.drain(..).filter_map(|queued| queued.wanted(begun)).collect();
+    let batch: Vec<Queued> = batch.into_iter().filter_map(|queued| queued.wanted(begun)).collect();
     let Some(first) = batch.first() else { return };
     let policy = first.task.policy.clone();
-    let name = policy.reference.to_string();
     let actions = policy.policy.actions();
     let batch_size = batch.len() as u32;
     let mut replies = Vec::with_capacity(batch.len());
@@ -254,6 +323,7 @@ fn compute(batch: &mut Vec<Queued>) {
         replies.push(reply);
     }
     // The tasks are owned by the closure: nothing half-written is seen after a panic.
+    let deciding = policy.clone();
     let outcomes = catch_unwind(AssertUnwindSafe(move || {
         let mut turns: Vec<Turn<'_>> = tasks
             .iter_mut()
@@ -265,7 +335,7 @@ fn compute(batch: &mut Vec<Queued>) {
                 q_values: Some(&mut outcome.q_values),
             })
             .collect();
-        policy.policy.act(&mut turns);
+        deciding.policy.act(&mut turns);
         drop(turns);
         let compute = begun.elapsed();
         tasks
@@ -273,10 +343,15 @@ fn compute(batch: &mut Vec<Queued>) {
             .map(move |(_, _, outcome)| Outcome { timings: Timings { compute, ..outcome.timings }, ..outcome })
             .collect::<Vec<_>>()
     }));
-    metrics::histogram!("qedgix_act_batch_size").record(f64::from(batch_size));
-    match outcomes {
+    meters.batch_size.record(f64::from(batch_size));
+    let Ok(outcomes) = outcomes else {
+        let fault = || Error::Fault(format!("policy {} panicked", policy.reference));
+        return replies.into_iter().for_each(|reply| drop(reply.send(Err(fault()))));
+    };
+    for (reply, outcome) in replies.into_iter().zip(outcomes) {
+        meters.queue.record(outcome.timings.queue.as_secs_f64());
+        meters.compute.record(outcome.timings.compute.as_secs_f64());
         // A caller that left meanwhile needs no answer.
-        Ok(outcomes) => replies.into_iter().zip(outcomes).for_each(|(reply, outcome)| drop(reply.send(Ok(outcome)))),
-        Err(_) => replies.into_iter().for_each(|reply| drop(reply.send(Err(Error::Fault(format!("policy {name} panicked")))))),
+        drop(reply.send(Ok(outcome)));
     }
 }

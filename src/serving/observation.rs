@@ -10,7 +10,7 @@ use crate::invalid::Invalid;
 use crate::policy::{Detection, Needs, Policy, Slot};
 
 /// Most nodes of one observation.
-pub const MAX_NODES: usize = 4096;
+pub const MAX_NODES: usize = 20_000;
 /// Most detections of one observation, mirrored and derived ones included.
 pub const MAX_DETECTIONS: usize = 1 << 22;
 
@@ -72,6 +72,12 @@ pub struct Sighting {
     pub mirrored: bool,
 }
 
+impl Sighting {
+    fn detection(&self) -> Detection {
+        Detection { target: self.target, rel: self.rel.map(|x| x as f32) }
+    }
+}
+
 impl Observation {
     /// M.
     pub fn uavs(&self) -> usize {
@@ -89,33 +95,26 @@ impl Observation {
     /// The fleet does not fit the policy, something it needs is missing, a detection lies beyond its range, or there are
     /// too many detections.
     pub fn into_slot(self, policy: &dyn Policy) -> Result<Slot, Invalid> {
-        policy.check_fleet(self.uavs(), self.users())?;
-        let range = policy.detection_range();
-        match self.seen {
-            Seen::Scene { uavs, users, aoi } => {
-                check_crowd(&uavs, &users, range)?;
-                Ok(Slot::from_scene(&uavs, &users, &aoi, range))
-            }
-            Seen::Graph(graph) => graph.into_slot(policy.needs(), range),
-        }
+        let size = (self.uavs(), self.users());
+        self.seen.into_slot(size, policy)
     }
 }
 
-/// Refuses scenes in which so many nodes see each other that a slot would fill the memory.
-fn check_crowd(uavs: &[Point], users: &[Point], range: f64) -> Result<(), Invalid> {
-    let nodes = uavs.len() + users.len();
-    if nodes * nodes <= MAX_DETECTIONS {
-        return Ok(());
-    }
-    let points: Vec<Point> = uavs.iter().chain(users).copied().collect();
-    let mut detections = 0;
-    for (i, a) in points.iter().enumerate() {
-        detections += 2 * points[i + 1..].iter().filter(|b| within(&[b[0] - a[0], b[1] - a[1]], range)).count();
-        if detections > MAX_DETECTIONS {
-            return Err(crowded("scene"));
+impl Seen {
+    /// As [`Observation::into_slot`], for a fleet of `(uavs, users)`.
+    ///
+    /// # Errors
+    /// As [`Observation::into_slot`].
+    pub fn into_slot(self, (uavs, users): (usize, usize), policy: &dyn Policy) -> Result<Slot, Invalid> {
+        policy.check_fleet(uavs, users)?;
+        let range = policy.detection_range();
+        match self {
+            Self::Scene { uavs, users, aoi } => {
+                Slot::from_scene_within(&uavs, &users, &aoi, range, MAX_DETECTIONS).ok_or_else(|| crowded("scene"))
+            }
+            Self::Graph(graph) => graph.into_slot(policy.needs(), range),
         }
     }
-    Ok(())
 }
 
 fn crowded(field: &str) -> Invalid {
@@ -127,7 +126,7 @@ fn within(rel: &Point, range: f64) -> bool {
 }
 
 impl Graph {
-    fn into_slot(mut self, needs: Needs, range: f64) -> Result<Slot, Invalid> {
+    fn into_slot(self, needs: Needs, range: f64) -> Result<Slot, Invalid> {
         if needs == Needs::FullScene {
             return Err(Invalid::new("graph", "a graph", "a scene: this policy needs the positions of all UAVs and users"));
         }
@@ -139,15 +138,25 @@ impl Graph {
             return Err(Invalid::new(field, "nothing", "the UAV's own position, which this policy needs"));
         }
         self.check_range(range)?;
-        self.derive(range)?;
+        let derived = self.derive(range)?;
+        let mut offsets = Vec::with_capacity(self.detections.len() + 1);
+        offsets.push(0);
+        let mut detections = Vec::with_capacity(self.detections.iter().map(Vec::len).chain(derived.iter().map(Vec::len)).sum());
+        for (node, list) in self.detections.iter().enumerate() {
+            let begin = detections.len();
+            detections.extend(list.iter().map(Sighting::detection));
+            if let Some(user) = node.checked_sub(uavs) {
+                detections.extend_from_slice(&derived[user]);
+                // Most users said nothing and detect UAVs, then what was derived: that is in order already.
+                if !detections[begin..].is_sorted_by_key(|d| d.target) {
+                    detections[begin..].sort_unstable_by_key(|d| d.target);
+                }
+            }
+            offsets.push(detections.len() as u32);
+        }
         // All or none: a policy that can use positions reads them of every UAV.
         let positions = self.positions.into_iter().collect::<Option<Vec<Point>>>();
-        let lists: Vec<Vec<Detection>> = self
-            .detections
-            .iter()
-            .map(|list| list.iter().map(|s| Detection { target: s.target, rel: [s.rel[0] as f32, s.rel[1] as f32] }).collect())
-            .collect();
-        Ok(Slot::from_detections(positions, uavs, self.aoi, &lists))
+        Ok(Slot::from_flat_detections(positions, uavs, self.aoi, offsets, detections))
     }
 
     /// A detection beyond the range is a mistake in units, or a sensor that the policy was not trained with.
@@ -165,66 +174,92 @@ impl Graph {
         Ok(())
     }
 
-    /// Gives users whose detections were left out the other users that some UAV sees together with them: where UAV i sees
-    /// both, user j sees user k at `rel_ik - rel_ij`. The first UAV in canonical order tells.
-    fn derive(&mut self, range: f64) -> Result<(), Invalid> {
+    /// What users whose detections were left out detect beside what is mirrored: the other users that some UAV sees together
+    /// with them. Where UAV i sees both, user j sees user k at `rel_ik - rel_ij`; the first UAV in canonical order tells.
+    /// One list per user, in no order.
+    fn derive(&self, range: f64) -> Result<Vec<Vec<Detection>>, Invalid> {
         let (uavs, users) = (self.positions.len(), self.aoi.len());
+        let mut total: usize = self.detections.iter().map(Vec::len).sum();
+        if total > MAX_DETECTIONS {
+            return Err(crowded("graph"));
+        }
+        let mut derived = vec![Vec::new(); users];
         if !self.left_out.contains(&true) {
-            return Ok(());
+            return Ok(derived);
         }
-        // One bit per user and UAV: a pair of users seen by many UAVs is looked at once.
-        let words = users.div_ceil(64);
-        let mut seen_by = vec![0_u64; uavs * words];
-        let mut total = 0;
-        for (i, list) in self.detections.iter().enumerate() {
-            total += list.len();
-            for user in list.iter().filter_map(|s| (s.target as usize).checked_sub(uavs)).filter(|_| i < uavs) {
-                seen_by[i * words + user / 64] |= 1 << (user % 64);
-            }
-        }
-        let mut known = vec![0_u64; words];
-        let mut found: Vec<(usize, Sighting)> = Vec::new();
+        let views: Vec<View> = self.detections[..uavs].iter().map(|list| View::of(list, uavs, users)).collect();
+        let mut known = vec![0_u64; users.div_ceil(64)];
+        let mut found = vec![0_u64; known.len()];
+        let mut rels = vec![[0.0_f32; 2]; users];
         for j in (0..users).filter(|&j| self.left_out[j]) {
+            let seen = &self.detections[uavs + j];
             known.fill(0);
-            known[j / 64] |= 1 << (j % 64);
-            for user in self.detections[uavs + j].iter().filter_map(|s| (s.target as usize).checked_sub(uavs)) {
+            found.fill(0);
+            let others = seen.iter().filter_map(|s| (s.target as usize).checked_sub(uavs));
+            for user in others.chain([j]) {
                 known[user / 64] |= 1 << (user % 64);
             }
-            for to_uav in self.detections[uavs + j].iter().filter(|s| (s.target as usize) < uavs) {
-                let i = to_uav.target as usize;
-                for word in 0..words {
-                    let mut fresh = seen_by[i * words + word] & !known[word];
-                    known[word] |= fresh;
+            for to_uav in seen.iter().take_while(|s| (s.target as usize) < uavs) {
+                let View { bits, first, rel: list } = &views[to_uav.target as usize];
+                for (word, (known, &bits)) in known.iter_mut().zip(bits).enumerate() {
+                    // A pair of users seen by many UAVs is looked at once.
+                    let mut fresh = bits & !*known;
+                    *known |= bits;
                     while fresh != 0 {
-                        let k = word * 64 + fresh.trailing_zeros() as usize;
+                        let bit = fresh.trailing_zeros();
                         fresh &= fresh - 1;
-                        let list = &self.detections[i];
-                        let target = (uavs + k) as u32;
-                        let at = list.binary_search_by_key(&target, |s| s.target).expect("the bit was set from this list");
-                        let rel = [list[at].rel[0] + to_uav.rel[0], list[at].rel[1] + to_uav.rel[1]];
-                        if !within(&rel, range) {
-                            continue;
-                        }
-                        found.push((j, Sighting { target, rel, place: 0, mirrored: true }));
-                        // k derives j by itself if its list was left out too.
-                        if !self.left_out[k] {
-                            let back = [-rel[0], -rel[1]];
-                            found.push((k, Sighting { target: (uavs + j) as u32, rel: back, place: 0, mirrored: true }));
-                        }
-                        if total + found.len() > MAX_DETECTIONS {
-                            return Err(crowded("graph"));
-                        }
+                        let place = first[word] as usize + (bits & ((1 << bit) - 1)).count_ones() as usize;
+                        let rel = [list[place][0] + to_uav.rel[0], list[place][1] + to_uav.rel[1]];
+                        found[word] |= u64::from(within(&rel, range)) << bit;
+                        rels[word * 64 + bit as usize] = rel.map(|x| x as f32);
                     }
                 }
             }
+            for (word, &found) in found.iter().enumerate() {
+                let mut rest = found;
+                while rest != 0 {
+                    let k = word * 64 + rest.trailing_zeros() as usize;
+                    rest &= rest - 1;
+                    derived[j].push(Detection { target: (uavs + k) as u32, rel: rels[k] });
+                    // k derives j by itself if its list was left out too.
+                    if !self.left_out[k] {
+                        derived[k].push(Detection { target: (uavs + j) as u32, rel: rels[k].map(|x| -x) });
+                        total += 1;
+                    }
+                }
+            }
+            total += derived[j].len();
+            if total > MAX_DETECTIONS {
+                return Err(crowded("graph"));
+            }
         }
-        for (user, sighting) in found {
-            self.detections[uavs + user].push(sighting);
+        Ok(derived)
+    }
+}
+
+/// The users that a UAV detects.
+struct View {
+    /// A bit for each.
+    bits: Vec<u64>,
+    /// Place in `rel` of the first of each word.
+    first: Vec<u32>,
+    /// Where they are, in ascending order.
+    rel: Vec<Point>,
+}
+
+impl View {
+    fn of(list: &[Sighting], uavs: usize, users: usize) -> Self {
+        let words = users.div_ceil(64);
+        let mut view = Self { bits: vec![0; words], first: vec![0; words], rel: Vec::new() };
+        for sighting in list {
+            let Some(user) = (sighting.target as usize).checked_sub(uavs) else { continue };
+            let bits = &mut view.bits[user / 64];
+            if *bits == 0 {
+                view.first[user / 64] = view.rel.len() as u32;
+            }
+            *bits |= 1 << (user % 64);
+            view.rel.push(sighting.rel);
         }
-        for list in &mut self.detections[uavs..] {
-            list.sort_by_key(|s| s.target);
-            list.dedup_by_key(|s| s.target);
-        }
-        Ok(())
+        view
     }
 }

@@ -88,12 +88,8 @@ pub struct PolicyRef {
 impl PolicyRef {
     /// The digest in hexadecimal.
     pub fn digest_hex(&self) -> String {
-        use fmt::Write;
-        self.digest.iter().fold(String::with_capacity(64), |mut text, byte| {
-            // Writing to a String cannot fail.
-            let _ = write!(text, "{byte:02x}");
-            text
-        })
+        let digit = |value: u8| char::from(b"0123456789abcdef"[usize::from(value)]);
+        self.digest.iter().flat_map(|byte| [digit(byte >> 4), digit(byte & 15)]).collect()
     }
 }
 

@@ -88,7 +88,7 @@ async fn scenes_that_cannot_be_used_name_their_field() {
     let cases: &[(&str, Change)] = &[
         ("observation: nothing", |r| r.observation = None),
         ("scene: no UAV", |r| in_scene(r).uavs.clear()),
-        ("scene: 9000 nodes", |r| in_scene(r).users = scene(1, 8997, 0).users),
+        ("scene: 20001 nodes", |r| in_scene(r).users = scene(1, 19_998, 0).users),
         ("users: 0", |r| in_scene(r).users.clear()),
         ("scene.uavs[1].x: NaN", |r| in_scene(r).uavs[1].x = f64::NAN),
         ("scene.uavs[0].y: inf", |r| in_scene(r).uavs[0].y = f64::INFINITY),

@@ -49,25 +49,35 @@ pub(super) fn check_nodes(field: &str, nodes: usize) -> Result<(), Invalid> {
     Ok(())
 }
 
-/// Node index (UAVs first) of each id.
+/// Checks that no id of either list, each in canonical order with places in the request, occurs twice.
 ///
 /// # Errors
-/// An id that occurs twice; `field(uav, place)` names its second place.
-pub(super) fn index<'a>(
-    uavs: (&'a [String], &[u32]),
-    users: (&'a [String], &[u32]),
+/// An id that does; `field(uav, place)` names its second place.
+pub(super) fn distinct(
+    uavs: (&[String], &[u32]),
+    users: (&[String], &[u32]),
     field: impl Fn(bool, u32) -> String,
-) -> Result<HashMap<&'a str, u32>, Invalid> {
-    let mut index = HashMap::with_capacity(uavs.0.len() + users.0.len());
+) -> Result<(), Invalid> {
+    let again =
+        |is_uav, id: &String, place| Err(Invalid::new(field(is_uav, place), format!("{id:?}"), "an id that no other node has"));
     for (is_uav, (ids, places)) in [(true, uavs), (false, users)] {
-        for (id, &place) in ids.iter().zip(places) {
-            let node = index.len() as u32;
-            if index.insert(id.as_str(), node).is_some() {
-                return Err(Invalid::new(field(is_uav, place), format!("{id:?}"), "an id that no other node has"));
-            }
+        if let Some(at) = ids.windows(2).position(|pair| pair[0] == pair[1]) {
+            return again(is_uav, &ids[at + 1], places[at + 1]);
         }
     }
-    Ok(index)
+    let mut first = uavs.0.iter().peekable();
+    for (id, &place) in users.0.iter().zip(users.1) {
+        while first.next_if(|uav| Fleet::order(uav, id).is_lt()).is_some() {}
+        if first.peek() == Some(&id) {
+            return again(false, id, place);
+        }
+    }
+    Ok(())
+}
+
+/// Node index (UAVs first) of each id; the ids are distinct.
+pub(super) fn index<'a>(uavs: &'a [String], users: &'a [String]) -> HashMap<&'a str, u32> {
+    uavs.iter().chain(users).map(String::as_str).zip(0..).collect()
 }
 
 /// For each place of the request, the canonical index: the inverse of `places`, which are places among `of_kind` nodes.

@@ -5,7 +5,7 @@
 
 use std::collections::HashMap;
 
-use super::fleet::{check_counts, check_nodes, index, request_order};
+use super::fleet::{check_counts, check_nodes, distinct, index, request_order};
 use super::{Ids, aoi, finite, point};
 use crate::invalid::Invalid;
 use crate::serving::{Fleet, Graph, Observation, Seen, Sighting};
@@ -34,7 +34,8 @@ impl TryFrom<v1::Graph> for Observation {
         }
         let [(uavs, uav_places), (users, user_places)] = ids.map(Ids::sorted);
         check_counts("graph.nodes", uavs.len(), users.len())?;
-        let by_id = index((&uavs, &uav_places), (&users, &user_places), |_, place| format!("graph.nodes[{place}].id"))?;
+        distinct((&uavs, &uav_places), (&users, &user_places), |_, place| format!("graph.nodes[{place}].id"))?;
+        let by_id = index(&uavs, &users);
         let mut builder = Builder::new(uavs.len(), users.len());
         for (node, &place) in uav_places.iter().chain(&user_places).enumerate() {
             builder.node(node, place as usize, std::mem::take(&mut nodes[place as usize]), &by_id)?;

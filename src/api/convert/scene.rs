@@ -1,6 +1,6 @@
 //! `Scene` to [`Observation`].
 
-use super::fleet::{check_counts, index, request_order};
+use super::fleet::{check_counts, distinct, request_order};
 use super::{Ids, aoi, point};
 use crate::invalid::Invalid;
 use crate::serving::{Fleet, Observation, Seen};
@@ -26,7 +26,7 @@ impl TryFrom<v1::Scene> for Observation {
             ids.push(|| format!("scene.users[{i}].id"), user.id, i)?;
         }
         let (user_ids, user_places) = ids.sorted();
-        index((&uav_ids, &uav_places), (&user_ids, &user_places), |is_uav, place| {
+        distinct((&uav_ids, &uav_places), (&user_ids, &user_places), |is_uav, place| {
             format!("scene.{}[{place}].id", if is_uav { "uavs" } else { "users" })
         })?;
         Ok(Self {

@@ -2,6 +2,7 @@
 //! errors, and its count.
 
 use std::panic::AssertUnwindSafe;
+use std::sync::Arc;
 use std::time::Instant;
 
 use axum::extract::Request;
@@ -12,13 +13,14 @@ use tonic::{Code, Status};
 use tracing::Instrument;
 
 use super::Deadline;
-use crate::api::observe::{Observed, REQUEST_ID, request_id};
+use crate::api::observe::{Meters, REQUEST_ID, request_id};
 use crate::invalid::Invalid;
 use crate::service::Error;
 
-pub(super) async fn around(request: Request, next: Next) -> Response {
-    let observed = Observed::begin("grpc");
-    let method = request.uri().path().trim_start_matches('/').to_owned();
+pub(super) async fn around(meters: Arc<Meters>, request: Request, next: Next) -> Response {
+    let begun = Instant::now();
+    let uri = request.uri().clone();
+    let method = uri.path().trim_start_matches('/');
     let id = request_id(request.headers());
     let deadline = request.extensions().get::<Deadline>().map(|deadline| deadline.0);
     let span = tracing::info_span!("grpc", method, request_id = ?id);
@@ -33,8 +35,8 @@ pub(super) async fn around(request: Request, next: Next) -> Response {
     let (mut response, code) = in_line(response);
     response.headers_mut().insert(REQUEST_ID, id);
     // Paths are the caller's; only those that exist become labels.
-    let method = if code == Code::Unimplemented { "unknown".to_owned() } else { method };
-    observed.end(method, name(code).to_owned());
+    let method = if code == Code::Unimplemented { "unknown" } else { method };
+    meters.end(begun, method, name(code));
     response
 }
 

@@ -15,6 +15,7 @@ use tonic_health::pb::health_server::{Health, HealthServer};
 pub use deadline::stamp;
 use deadline::{Deadline, deadline};
 
+use crate::api::observe::Meters;
 use crate::service::App;
 use crate::wire::{DESCRIPTORS, v1};
 
@@ -46,6 +47,8 @@ pub fn routes<H: Health>(app: &Arc<App>, health: HealthServer<H>, max_message: u
         .add_service(health)
         .add_service(reflection().build_v1().expect(BUILT_IN))
         .add_service(reflection().build_v1alpha().expect(BUILT_IN));
-    let router = routes.routes().into_axum_router().layer(axum::middleware::from_fn(envelope::around));
+    let meters = Arc::new(Meters::new("grpc"));
+    let around = move |request, next| envelope::around(meters.clone(), request, next);
+    let router = routes.routes().into_axum_router().layer(axum::middleware::from_fn(around));
     Routes::from(router)
 }

@@ -31,8 +31,22 @@ struct Handlers(Arc<App>);
 /// Answers one slot, however it came.
 async fn answer(app: &App, request: v1::ActRequest, deadline: Option<Instant>) -> Result<v1::ActResponse, Error> {
     let values = request.return_q_values;
-    let request = act::Request::try_from(request)?;
+    let request = if nodes(&request) < act::LARGE {
+        act::Request::try_from(request)?
+    } else {
+        tokio::task::spawn_blocking(|| act::Request::try_from(request)).await.map_err(Error::internal)??
+    };
     Ok(act_response(act::act(app, request, deadline).await?, values))
+}
+
+/// How many nodes a request tells about.
+fn nodes(request: &v1::ActRequest) -> usize {
+    use v1::act_request::Observation;
+    match &request.observation {
+        Some(Observation::Graph(graph)) => graph.nodes.len(),
+        Some(Observation::Scene(scene)) => scene.uavs.len() + scene.users.len(),
+        None => 0,
+    }
 }
 
 /// One slot of several: answered or refused.

@@ -12,6 +12,7 @@ mod wording;
 
 use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
+use std::time::Instant;
 
 use axum::Router;
 use axum::extract::{MatchedPath, Request, State};
@@ -24,11 +25,12 @@ use metrics_exporter_prometheus::PrometheusHandle;
 use tracing::Instrument;
 
 use super::errors::problem;
-use super::observe::{Observed, REQUEST_ID, request_id};
+use super::observe::{Meters, REQUEST_ID, request_id};
 use crate::service::{App, Error};
 
 /// All of REST. A body larger than `max_body` bytes is refused.
 pub fn router(app: Arc<App>, metrics: PrometheusHandle, max_body: usize) -> Router {
+    let meters = Arc::new(Meters::new("http"));
     Router::new()
         .route("/", get(ops::index))
         .route("/livez", get(ops::live))
@@ -47,13 +49,13 @@ pub fn router(app: Arc<App>, metrics: PrometheusHandle, max_body: usize) -> Rout
             problem(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", detail)
         })
         .layer(axum::Extension(extract::MaxBody(max_body)))
-        .layer(axum::middleware::from_fn(around))
+        .layer(axum::middleware::from_fn(move |request, next| around(meters.clone(), request, next)))
         .with_state(app)
 }
 
 /// What happens around every request: its id, panics caught, and its count.
-async fn around(request: Request, next: Next) -> Response {
-    let observed = Observed::begin("http");
+async fn around(meters: Arc<Meters>, request: Request, next: Next) -> Response {
+    let begun = Instant::now();
     let verb = request.method().clone();
     let path = request.extensions().get::<MatchedPath>().map_or("unknown", MatchedPath::as_str).to_owned();
     let id = request_id(request.headers());
@@ -65,6 +67,6 @@ async fn around(request: Request, next: Next) -> Response {
     response.headers_mut().insert(REQUEST_ID, id);
     // Made-up verbs are the caller's; they do not become labels.
     let verb = if response.status() == StatusCode::METHOD_NOT_ALLOWED { "other" } else { verb.as_str() };
-    observed.end(format!("{verb} {path}"), response.status().as_u16().to_string());
+    meters.end(begun, &format!("{verb} {path}"), response.status().as_str());
     response
 }

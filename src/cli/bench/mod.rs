@@ -1,5 +1,6 @@
 //! `qedgix bench`: how fast the parts are on this machine.
 
+mod act;
 mod floor;
 
 use std::time::Instant;
@@ -26,6 +27,14 @@ enum What {
     /// What --set leaves open is as in the specification's figures: flat observation without own position, one-hot identity,
     /// mean aggregation, qmix mixer, a batch of 128 episodes, one update per rollout of 8.
     Learner(LearnerArgs),
+    /// Load for gRPC Act: throughput and latencies, beside those of a bare gRPC echo in the same run
+    ///
+    /// Sessions fly real episodes. Rounds of Act and of an echo that answers messages of the same size alternate, so that what
+    /// else the machine does slows both alike; read the ratios first.
+    Act(act::ActArgs),
+    /// The echo beside a server in another process; `bench act --server` starts it itself
+    #[command(hide = true)]
+    Echo,
 }
 
 /// Flags of `bench learner`.
@@ -60,10 +69,12 @@ const FIGURES: [&str; 6] = [
 /// Runs the command.
 ///
 /// # Errors
-/// A configuration that is wrong.
-pub fn run(args: BenchArgs) -> anyhow::Result<()> {
+/// A configuration that is wrong, a server that cannot be reached, an Act that was refused.
+pub async fn run(args: BenchArgs) -> anyhow::Result<()> {
     match args.what {
         What::Learner(args) => learner(args),
+        What::Act(args) => act::run(args).await,
+        What::Echo => act::echo().await,
     }
 }
 

@@ -110,7 +110,7 @@ impl Session {
     /// # Errors
     /// A step that is neither the last nor the next, a former run, other ids than in the run's first slot, or the session
     /// has ended.
-    pub async fn turn(&self, fleet: Fleet, step: Option<u64>, run_id: Option<&str>) -> Result<Turn<'_>, Error> {
+    pub async fn turn<'a>(&'a self, fleet: &Fleet, step: Option<u64>, run_id: Option<&str>) -> Result<Turn<'a>, Error> {
         let state = self.state.lock().await;
         if state.ended {
             return Err(Error::unknown(Self::WHAT, &self.id));
@@ -121,7 +121,7 @@ impl Session {
         let step = step.unwrap_or(steps);
         if new_run.is_none() {
             if let Some(known) = &state.fleet {
-                known.check_same(&fleet)?;
+                known.check_same(fleet)?;
             }
             if let Some(last) = state.last.as_ref().filter(|last| last.step == step) {
                 return Ok(Turn::Repeat(last.clone()));
@@ -141,7 +141,7 @@ impl Session {
         } else {
             state.memory.clone()
         };
-        Ok(Turn::Next(NextTurn { session: self, state, new_run, fleet: first.then_some(fleet), step, memory }))
+        Ok(Turn::Next(NextTurn { session: self, state, new_run, fleet: first.then(|| fleet.clone()), step, memory }))
     }
 
     /// What `OpenSession` with the name of this session does.

@@ -74,7 +74,7 @@ fn fleet(ids: [&str; 2]) -> Fleet {
 }
 
 async fn fly(session: &Session, step: Option<u64>, run: Option<&str>) -> Result<(u64, Vec<f32>), &'static str> {
-    match session.turn(fleet(["a", "b"]), step, run).await {
+    match session.turn(&fleet(["a", "b"]), step, run).await {
         Err(error) => Err(code(&error)),
         Ok(Turn::Repeat(answer)) => Ok((answer.step, answer.q_values)),
         Ok(Turn::Next(next)) => {
@@ -109,8 +109,8 @@ async fn a_turn_that_is_dropped_changes_nothing() {
     sessions.open(policy("p"), Opened { seed: Some(0), run_id: Some("r1".into()), ..named("s") }).await.unwrap();
     let s = sessions.get("s").unwrap();
     fly(&s, Some(0), None).await.unwrap();
-    drop(s.turn(fleet(["a", "b"]), Some(1), None).await.unwrap());
-    drop(s.turn(fleet(["c", "d"]), Some(0), Some("r2")).await.unwrap());
+    drop(s.turn(&fleet(["a", "b"]), Some(1), None).await.unwrap());
+    drop(s.turn(&fleet(["c", "d"]), Some(0), Some("r2")).await.unwrap());
     assert_eq!(fly(&s, Some(0), Some("r1")).await, Ok((0, vec![1.0; 2])));
     assert_eq!(fly(&s, Some(1), Some("r1")).await, Ok((1, vec![2.0; 2])));
 }
@@ -141,9 +141,9 @@ async fn ids_are_fixed_by_the_first_slot_of_a_run() {
     sessions.open(policy("p"), named("s")).await.unwrap();
     let s = sessions.get("s").unwrap();
     fly(&s, None, None).await.unwrap();
-    let other = s.turn(fleet(["a", "c"]), None, None).await.map(|_| ()).unwrap_err();
+    let other = s.turn(&fleet(["a", "c"]), None, None).await.map(|_| ()).unwrap_err();
     assert!(matches!(&other, Error::Invalid(e) if e.value.contains("\"c\" is new") && e.value.contains("\"b\" is missing")));
-    assert!(s.turn(fleet(["a", "c"]), None, Some("another run")).await.is_ok());
+    assert!(s.turn(&fleet(["a", "c"]), None, Some("another run")).await.is_ok());
 }
 
 #[tokio::test]

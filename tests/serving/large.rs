@@ -1,0 +1,59 @@
+//! A fleet of 1 000 UAVs among 10 000 users is an ordinary one.
+
+use bytes::Bytes;
+use qedgix::policy::Turn;
+use qedgix::serving::Observation;
+use qedgix::wire::v1;
+
+use super::harness::*;
+
+/// The detection range, in sides of the square.
+const RANGE: f64 = 0.05;
+
+/// A scene whose coordinates are multiples of 2^-17, so that sums and differences are exact, in lengths that make
+/// `range` a bit more than [`RANGE`] sides.
+fn wide_scene(uavs: usize, users: usize, range: f64) -> v1::Scene {
+    let mut scene = scene(uavs, users, 5);
+    let side = (2.0 * range / RANGE).floor() / 2.0;
+    let place = |x: &mut f64| *x = (*x * 65536.0).round() / 65536.0 * side;
+    scene.uavs.iter_mut().for_each(|u| [&mut u.x, &mut u.y].into_iter().for_each(place));
+    scene.users.iter_mut().for_each(|u| [&mut u.x, &mut u.y].into_iter().for_each(place));
+    scene
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_thousand_uavs_among_ten_thousand_users_are_answered() {
+    let server = Server::start().await;
+    let loaded = server.app.registry.resolve(&"qedgix".parse().unwrap()).unwrap();
+    let policy = &loaded.policy;
+    let (uavs, users) = (1000, 10_000);
+    let scene = wide_scene(uavs, users, policy.detection_range());
+    let graph = graph(&scene, policy.detection_range(), false);
+    let slot = Observation::try_from(graph.clone()).unwrap().into_slot(&**policy).unwrap();
+    let whole = Observation::try_from(scene.clone()).unwrap().into_slot(&**policy).unwrap();
+    // UAVs detect the same either way; users, told nothing, detect whom they see together with a UAV.
+    for uav in 0..uavs {
+        assert_eq!(slot.detections(uav), whole.detections(uav), "UAV {uav}");
+    }
+    for user in (uavs..uavs + users).step_by(61) {
+        let sees = |i: usize, k: u32| slot.detections(i).binary_search_by_key(&k, |d| d.target).is_ok();
+        let shared = |k: u32| (0..uavs).any(|i| sees(i, user as u32) && sees(i, k));
+        let expected: Vec<_> =
+            whole.detections(user).iter().copied().filter(|d| (d.target as usize) < uavs || shared(d.target)).collect();
+        assert_eq!(slot.detections(user), expected, "node {user}");
+    }
+
+    let mut memory = vec![0.0; policy.memory_len(uavs, users)];
+    policy.start(uavs, users, 0, &mut memory);
+    let mut expected = vec![0; uavs];
+    policy.act(&mut [Turn { slot: &slot, step: 0, memory: &mut memory, headings: &mut expected, q_values: None }]);
+    let mut request = held("qedgix", Bytes::new(), v1::Scene::default());
+    request.observation = Some(v1::act_request::Observation::Graph(graph));
+    let answer = server.grpc().await.act(request).await.unwrap().into_inner();
+    // The harness numbers ids, and canonical order is that of numbers.
+    let told: Vec<u8> = answer.actions.iter().map(|a| a.heading_index as u8).collect();
+    assert_eq!(told, expected);
+    assert!(told.iter().any(|heading| *heading != told[0]), "fleets of this size do not all fly alike");
+    let by_scene = server.grpc().await.act(held("qedgix", Bytes::new(), scene)).await.unwrap().into_inner();
+    assert_eq!(by_scene.actions.len(), uavs);
+}
