@@ -206,6 +206,8 @@ fn mistakes_name_the_file_the_table_and_the_field() {
         (vec!["tiny.toml", "--set", "training.bach=3"], "command line, training.bach"),
         (vec!["tiny.toml", "--set", "bach=3"], "environment.FIELD"),
         (vec!["tiny.toml", "--steps", "0"], "command line, training.steps"),
+        (vec!["tiny.toml", "--series", "nobody"], "series: \"nobody\""),
+        (vec!["tiny.toml", "--point", "nowhere"], "points: \"nowhere\""),
         (vec!["absent.toml"], "absent.toml"),
     ] {
         let message = String::from_utf8(run(dir.path(), &words).stderr).unwrap();
@@ -223,7 +225,10 @@ fn the_experiments_of_the_repository_are_sound() {
         found.push(name);
     }
     found.sort();
-    assert_eq!(found, ["convergence.toml", "range.toml", "scale.toml", "trajectories.toml"]);
+    let expected = ["convergence", "information", "practical", "range", "scale", "trajectories"];
+    assert_eq!(found, expected.map(|name| format!("{name}.toml")));
+    let part = done(dir, &["range.toml", "--dry-run", "--series", "QMIX", "--point", "9 xi", "--point", "4 xi"]);
+    assert!(part.contains(": 6 runs") && !part.contains("Qedgix") && !part.contains("5 xi"), "{part}");
 }
 
 #[cfg(unix)]
