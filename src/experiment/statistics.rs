@@ -8,8 +8,6 @@ use rand::RngExt;
 use crate::learner::Interval;
 use crate::rng;
 
-const RESAMPLES: usize = 2000;
-
 /// Mean of all values with its 95 % interval. Rows are seeds, and equally long.
 pub(super) fn interval(values: &[Vec<f64>]) -> Interval {
     let (seeds, layouts) = (values.len(), values.first().map_or(0, Vec::len));
@@ -18,18 +16,14 @@ pub(super) fn interval(values: &[Vec<f64>]) -> Interval {
     }
     let mut rng = rng::stream(0, "bootstrap-seeds", 0);
     let mut counts = vec![0.0; layouts];
-    let mut means: Vec<f64> = (0..RESAMPLES)
-        .map(|_| {
-            counts.fill(0.0);
-            (0..layouts).for_each(|_| counts[rng.random_range(0..layouts)] += 1.0);
-            let row = |row: &Vec<f64>| row.iter().zip(&counts).map(|(value, count)| value * count).sum::<f64>();
-            let sum: f64 = (0..seeds).map(|_| row(&values[rng.random_range(0..seeds)])).sum();
-            sum / (seeds * layouts) as f64
-        })
-        .collect();
-    means.sort_by(f64::total_cmp);
     let mean = values.iter().flatten().sum::<f64>() / (seeds * layouts) as f64;
-    Interval { mean, low: means[RESAMPLES / 40 - 1], high: means[RESAMPLES - RESAMPLES / 40] }
+    Interval::of_resamples(mean, || {
+        counts.fill(0.0);
+        (0..layouts).for_each(|_| counts[rng.random_range(0..layouts)] += 1.0);
+        let row = |row: &Vec<f64>| row.iter().zip(&counts).map(|(value, count)| value * count).sum::<f64>();
+        let sum: f64 = (0..seeds).map(|_| row(&values[rng.random_range(0..seeds)])).sum();
+        sum / (seeds * layouts) as f64
+    })
 }
 
 /// First minus second, value by value; the shorter one's seeds.

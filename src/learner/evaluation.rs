@@ -51,6 +51,16 @@ pub struct Interval {
     pub high: f64,
 }
 
+impl Interval {
+    /// The percentile bootstrap: `mean` between the percentiles of what `resample` returns, call after call.
+    pub fn of_resamples(mean: f64, mut resample: impl FnMut() -> f64) -> Self {
+        const RESAMPLES: usize = 2000;
+        let mut means: Vec<f64> = (0..RESAMPLES).map(|_| resample()).collect();
+        means.sort_by(f64::total_cmp);
+        Self { mean, low: means[RESAMPLES / 40 - 1], high: means[RESAMPLES - RESAMPLES / 40] }
+    }
+}
+
 /// What a report says about a policy on a list of layouts.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
@@ -95,15 +105,11 @@ pub fn difference(first: &[EpisodeMetrics], second: &[EpisodeMetrics]) -> Result
 
 /// Percentile bootstrap of the mean.
 fn bootstrap(values: &[f64]) -> Result<Interval, Invalid> {
-    const RESAMPLES: usize = 2000;
     if values.is_empty() {
         return Err(Invalid::new("episodes", 0, "at least 1"));
     }
     let n = values.len();
     let mut rng = rng::stream(0, "bootstrap", 0);
-    let mut means: Vec<f64> =
-        (0..RESAMPLES).map(|_| (0..n).map(|_| values[rng.random_range(0..n)]).sum::<f64>() / n as f64).collect();
-    means.sort_by(f64::total_cmp);
     let mean = values.iter().sum::<f64>() / n as f64;
-    Ok(Interval { mean, low: means[RESAMPLES / 40 - 1], high: means[RESAMPLES - RESAMPLES / 40] })
+    Ok(Interval::of_resamples(mean, || (0..n).map(|_| values[rng.random_range(0..n)]).sum::<f64>() / n as f64))
 }

@@ -194,22 +194,24 @@ impl Geometry {
                 further.reached.clear();
                 further.reached.resize(nodes, false);
                 further.reached[node] = true;
-                // A breadth-first walk; what is found is its own queue.
-                let mut hop = vec![Detection { target: node as u32, rel: [0.0; 2] }];
+                // A breadth-first walk; what is found is its own queue, in which the UAV itself stands first for a while.
+                further.detections.push(Detection { target: node as u32, rel: [0.0; 2] });
+                let mut next = from;
                 for _ in 0..hops {
-                    let mut next = Vec::new();
-                    for via in hop {
+                    let end = further.detections.len();
+                    for i in next..end {
+                        let via = further.detections[i];
                         let at = fleet.first_node + via.target as usize;
                         for d in &detections[offsets[at] as usize..offsets[at + 1] as usize] {
                             if !std::mem::replace(&mut further.reached[d.target as usize], true) {
                                 let rel = [via.rel[0] + d.rel[0], via.rel[1] + d.rel[1]];
-                                next.push(Detection { target: d.target, rel });
+                                further.detections.push(Detection { target: d.target, rel });
                             }
                         }
                     }
-                    further.detections.extend_from_slice(&next);
-                    hop = next;
+                    next = end;
                 }
+                further.detections.swap_remove(from);
                 further.detections[from..].sort_unstable_by_key(|d| d.target);
                 further.offsets.push(further.detections.len() as u32);
             }

@@ -71,7 +71,9 @@ impl Echo {
             .kill_on_drop(true)
             .spawn()?;
         let to = child.stdin.as_mut().context("it has no standard input")?;
-        to.write_all(&answer.encode_length_delimited_to_vec()).await?;
+        let answer = answer.encode_to_vec();
+        to.write_u64(answer.len() as u64).await?;
+        to.write_all(&answer).await?;
         to.flush().await?;
         let from = child.stdout.take().context("it has no standard output")?;
         let mut line = String::new();
@@ -87,16 +89,9 @@ impl Echo {
 /// The input is no answer, or the system refuses a port.
 pub(in super::super) async fn serve() -> anyhow::Result<()> {
     let mut input = BufReader::new(tokio::io::stdin());
-    let mut size = 0;
-    for shift in (0..).step_by(7).take(5) {
-        let byte = input.read_u8().await?;
-        size |= usize::from(byte & 0x7f) << shift;
-        if byte < 0x80 {
-            break;
-        }
-    }
+    let size = input.read_u64().await?;
     let mut answer = Vec::new();
-    (&mut input).take(size.min(LARGEST) as u64).read_to_end(&mut answer).await?;
+    (&mut input).take(size.min(LARGEST as u64)).read_to_end(&mut answer).await?;
     let answer = v1::ActResponse::decode(&answer[..])?;
     let listener = listen().await?;
     println!("{}", listener.local_addr()?);
