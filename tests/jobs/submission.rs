@@ -170,8 +170,10 @@ async fn only_what_has_ended_can_be_deleted() {
     let path = format!("/v1/jobs/{id}");
     let problem = expect(server.request(Method::DELETE, &path), StatusCode::CONFLICT).await;
     assert_eq!(problem["code"], "wrong_state");
+    // Cancelled while it waits, it would end without a worker.
+    let worker = server.worker().await;
     server.post(&format!("{path}/cancel")).await;
-    server.worker().await.killed().await;
+    worker.killed().await;
     server.reaches(&id, "cancelled").await;
     expect(server.request(Method::DELETE, &path), StatusCode::NO_CONTENT).await;
     expect(server.request(Method::GET, &path), StatusCode::NOT_FOUND).await;
