@@ -138,7 +138,7 @@ impl Store {
     /// # Errors
     /// The database.
     pub async fn begin_attempt(&self, id: JobId, token: [u8; 32], now: Timestamp) -> Result<Option<Lease>> {
-        let mut tx = self.write.begin().await?;
+        let mut tx = self.begin().await?;
         let Some(job) = find(&mut tx, id).await?.filter(|job| job.state == JobState::Queued) else { return Ok(None) };
         let lease = Lease { id, job: job.number, attempt: job.attempts + 1 };
         let sql = "INSERT INTO attempts (job, number, token, started_at) VALUES (?, ?, ?, ?)";
@@ -162,7 +162,7 @@ impl Store {
     /// # Errors
     /// The database.
     pub async fn end_attempt(&self, lease: Lease, ending: &Ending, now: Timestamp) -> Result<Option<Job>> {
-        let mut tx = self.write.begin().await?;
+        let mut tx = self.begin().await?;
         let job = end(&mut tx, lease, ending, now).await?;
         tx.commit().await?;
         Ok(job)
@@ -183,7 +183,7 @@ impl Store {
     /// # Errors
     /// The database.
     pub async fn recover_jobs(&self, now: Timestamp) -> Result<Vec<Job>> {
-        let mut tx = self.write.begin().await?;
+        let mut tx = self.begin().await?;
         let sql = "SELECT id, number, attempts FROM jobs WHERE state = 'running'";
         let rows: Vec<(String, i64, i64)> = sqlx::query_as(sql).fetch_all(&mut *tx).await?;
         let mut jobs = Vec::with_capacity(rows.len());

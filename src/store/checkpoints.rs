@@ -106,7 +106,7 @@ impl Store {
     /// The database.
     pub async fn keep_checkpoint(&self, lease: Lease, new: NewCheckpoint, now: Timestamp) -> Result<Option<Uuid>> {
         let metrics = serde_json::to_string(&new.metrics).map_err(|e| corrupt("checkpoint", new.kind, e))?;
-        let mut tx = self.write.begin().await?;
+        let mut tx = self.begin().await?;
         if !live(&mut tx, lease).await? {
             return Ok(None);
         }

@@ -292,7 +292,7 @@ impl Store {
     /// # Errors
     /// The database.
     pub async fn submit_job(&self, new: NewJob) -> Result<Submitted> {
-        let mut tx = self.write.begin().await?;
+        let mut tx = self.begin().await?;
         if let Some((key, body)) = &new.idempotency {
             let sql = "SELECT k.body, j.id FROM idempotency_keys k JOIN jobs j ON j.number = k.job WHERE k.key = ?";
             let first: Option<(Vec<u8>, String)> = sqlx::query_as(sql).bind(key).fetch_optional(&mut *tx).await?;
@@ -345,7 +345,7 @@ impl Store {
     /// The database.
     pub async fn change_job(&self, id: JobId, verb: Verb, now: Timestamp) -> Result<Changed> {
         use JobState::{Cancelled, Paused, Queued, Running};
-        let mut tx = self.write.begin().await?;
+        let mut tx = self.begin().await?;
         let Some(job) = find(&mut tx, id).await? else { return Ok(Changed::Missing) };
         match (verb, job.state, job.wanted) {
             (Verb::Cancel, Cancelled, _)

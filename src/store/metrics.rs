@@ -45,7 +45,7 @@ impl Store {
     /// # Errors
     /// The database.
     pub async fn report(&self, lease: Lease, metrics: &[Metric], step: u64, now: Timestamp) -> Result<bool> {
-        let mut tx = self.write.begin().await?;
+        let mut tx = self.begin().await?;
         if !live(&mut tx, lease).await? {
             return Ok(false);
         }

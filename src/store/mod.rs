@@ -3,6 +3,7 @@
 mod attempts;
 mod checkpoints;
 mod jobs;
+mod keys;
 mod metrics;
 mod policies;
 mod snapshots;
@@ -10,6 +11,7 @@ mod snapshots;
 pub use attempts::{Attempt, Ending, Lease, LeaseRecord, Outcome};
 pub use checkpoints::{Checkpoint, CheckpointKind, NewCheckpoint};
 pub use jobs::{Changed, Job, JobId, JobKind, JobSpec, JobState, NewJob, Submitted, Verb, Wanted};
+pub use keys::KeyRecord;
 pub use metrics::{Metric, MetricCursor, MetricRow};
 pub use policies::{NewPolicyVersion, PolicyAlias, PolicyVersion};
 pub use snapshots::{OpenSnapshot, Snapshot};
@@ -18,8 +20,8 @@ use std::path::Path;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use sqlx::SqlitePool;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
+use sqlx::{Sqlite, SqlitePool, Transaction};
 
 static MIGRATIONS: sqlx::migrate::Migrator = sqlx::migrate!("./migrations");
 
@@ -72,6 +74,12 @@ impl Store {
         MIGRATIONS.run(&write).await?;
         let read = SqlitePoolOptions::new().max_connections(4).connect_with(options.read_only(true)).await?;
         Ok(Self { read, write })
+    }
+
+    /// A transaction that writes. It takes the lock at once: one that reads first and finds that another process (`qedgix keys`)
+    /// wrote meanwhile could not go on.
+    async fn begin(&self) -> Result<Transaction<'static, Sqlite>> {
+        Ok(self.write.begin_with("BEGIN IMMEDIATE").await?)
     }
 }
 

@@ -60,7 +60,7 @@ impl Store {
     /// # Errors
     /// The database fails.
     pub async fn publish_policy(&self, new: NewPolicyVersion<'_>) -> Result<(u64, i64), Error> {
-        let mut tx = self.write.begin().await?;
+        let mut tx = self.begin().await?;
         let known = sqlx::query("SELECT version, created_at FROM policy_versions WHERE name = ? AND digest = ?")
             .bind(new.name)
             .bind(new.digest)

@@ -47,7 +47,7 @@ impl Store {
     /// # Errors
     /// The database.
     pub async fn open_snapshot(&self, lease: Lease, step: u64, now: Timestamp) -> Result<Option<OpenSnapshot>> {
-        let mut tx = self.write.begin().await?;
+        let mut tx = self.begin().await?;
         if !live(&mut tx, lease).await? {
             return Ok(None);
         }
@@ -70,7 +70,7 @@ impl Store {
     /// # Errors
     /// The database.
     pub async fn extend_snapshot(&self, open: &mut OpenSnapshot, bytes: &[u8]) -> Result<bool> {
-        let mut tx = self.write.begin().await?;
+        let mut tx = self.begin().await?;
         if !live(&mut tx, open.lease).await? {
             return Ok(false);
         }
@@ -87,7 +87,7 @@ impl Store {
     /// # Errors
     /// The database.
     pub async fn complete_snapshot(&self, open: OpenSnapshot, sha256: &str) -> Result<bool> {
-        let mut tx = self.write.begin().await?;
+        let mut tx = self.begin().await?;
         if !live(&mut tx, open.lease).await? {
             return Ok(false);
         }
