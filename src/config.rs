@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use crate::invalid::{Invalid, in_range};
+use crate::service::keys::Rate;
 use crate::serving::EngineConfig;
 
 /// Everything that a server is told when it starts.
@@ -42,6 +43,29 @@ pub struct Config {
     pub drain_timeout: Duration,
     /// Whether it may listen where others can reach it, although nobody has to say who they are.
     pub insecure: bool,
+    /// Both addresses speak TLS with these files; absent: plain text.
+    pub tls: Option<TlsFiles>,
+    /// Most connections of both addresses together.
+    pub max_connections: usize,
+    /// Most streams that an HTTP/2 connection may have open.
+    pub max_streams: u32,
+    /// Time that a caller may let the server wait: for a handshake, the head of an HTTP/1 request, the next part of a REST body.
+    pub read_timeout: Duration,
+    /// Requests per second of an API key that has no rate of its own; absent: as many as it likes.
+    pub key_rate: Option<f64>,
+    /// How many of them at once; absent: as many as one second allows.
+    pub key_burst: Option<f64>,
+}
+
+/// PEM files of TLS. They are read again when the server is told to.
+#[derive(Clone, Debug)]
+pub struct TlsFiles {
+    /// The server's certificate, then those that lead to its authority.
+    pub cert: PathBuf,
+    /// The certificate's private key.
+    pub key: PathBuf,
+    /// Authorities of which callers must show a certificate; absent: callers need none.
+    pub client_ca: Option<PathBuf>,
 }
 
 impl Config {
@@ -61,10 +85,16 @@ impl Config {
             environment_ttl: Duration::from_secs(600),
             max_environments: 1024,
             environment_memory: 1 << 30,
-            max_message_size: 4 << 20,
+            max_message_size: 16 << 20,
             engine: EngineConfig { threads: cores.min(4), queue: 4096, max_batch: 64, max_batch_delay: Duration::ZERO },
             drain_timeout: Duration::from_secs(20),
             insecure: false,
+            tls: None,
+            max_connections: 10_000,
+            max_streams: 1024,
+            read_timeout: Duration::from_secs(30),
+            key_rate: None,
+            key_burst: None,
         }
     }
 
@@ -86,9 +116,27 @@ impl Config {
         in_range("--engine-queue", self.engine.queue, 1..=10_000_000)?;
         in_range("--max-batch", self.engine.max_batch, 1..=65_536)?;
         in_range("--max-batch-delay (seconds)", self.engine.max_batch_delay.as_secs_f64(), 0.0..=10.0)?;
+        in_range("--max-connections", self.max_connections, 1..=1_000_000)?;
+        in_range("--max-streams", self.max_streams, 1..=1_000_000)?;
+        in_range("--read-timeout (seconds)", self.read_timeout.as_secs_f64(), 0.001..=3600.0)?;
+        if let Some(rate) = self.key_rate {
+            in_range("--key-rate", rate, Rate::PER_SECOND)?;
+        }
+        if let Some(burst) = self.key_burst {
+            in_range("--key-burst", burst, Rate::BURST)?;
+        }
+        Ok(())
+    }
+
+    /// Checks that nobody can reach the server who has not been let in: `keys` says whether callers need an API key.
+    ///
+    /// # Errors
+    /// The first address that is open to everybody.
+    pub fn validate_reach(&self, keys: bool) -> Result<(), Invalid> {
         for (flag, addr) in [("--grpc-addr", self.grpc_addr), ("--http-addr", self.http_addr)] {
-            if !addr.ip().is_loopback() && !self.insecure {
-                let expected = "a loopback address such as 127.0.0.1, or --insecure: whoever reaches this server may use it";
+            if !addr.ip().is_loopback() && !keys && !self.insecure {
+                let expected = "a loopback address such as 127.0.0.1, an API key in the data directory (qedgix keys create), or \
+                                --insecure: whoever reaches this server may use it";
                 return Err(Invalid::new(flag, addr, expected));
             }
         }

@@ -4,24 +4,32 @@
 //! flight are answered; then the listeners are
 //! gone and the data directory is free for another server.
 
+mod connections;
+mod keys;
+mod prompt;
+mod tls;
+
 use std::fs::{File, TryLockError};
 use std::future::Future;
-use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::serve::ListenerExt;
 use tokio::net::TcpListener;
+use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
-use tonic::transport::server::TcpIncoming;
 use tonic_health::ServingStatus;
 use tonic_health::server::{HealthReporter, HealthService};
 
+use self::connections::{Connections, Protocol};
+pub use self::connections::{KEEPALIVE, WINDOW};
+pub use self::tls::Tls;
 use crate::api::{grpc, rest};
 use crate::config::Config;
 use crate::invalid::Invalid;
 use crate::jobs::{Jobs, LocalProcess, Settings};
+use crate::service::keys::{Keyring, Rate};
 use crate::service::{App, Draining, policies};
 use crate::serving::{Clock, Engine, Environments, EnvironmentsConfig, Limits, Registry, Sessions};
 use crate::store::{self, Store};
@@ -58,6 +66,9 @@ pub enum Error {
     /// The database.
     #[error(transparent)]
     Store(#[from] store::Error),
+    /// API keys could not be read.
+    #[error("reading API keys: {0}")]
+    Keys(#[source] crate::service::Error),
     /// Policies could not be loaded.
     #[error("loading policies: {0}")]
     Policies(#[source] crate::service::Error),
@@ -67,12 +78,9 @@ pub enum Error {
     /// The system refuses a thread.
     #[error("starting the engine: {0}")]
     Engine(#[source] std::io::Error),
-    /// The HTTP listener failed.
-    #[error("REST: {0}")]
-    Rest(#[source] std::io::Error),
-    /// The gRPC listener failed.
-    #[error("gRPC: {0}")]
-    Grpc(#[from] tonic::transport::Error),
+    /// The system does not know where a listener listens.
+    #[error("listening: {0}")]
+    Listener(#[source] std::io::Error),
 }
 
 /// Where a server listens.
@@ -82,6 +90,10 @@ pub struct Listeners {
     pub grpc: TcpListener,
     /// REST.
     pub http: TcpListener,
+    /// `WorkerService` alone, for the workers of this machine: neither certificates nor the number of callers come between
+    /// them and the server. On the loopback, without TLS.
+    workers: TcpListener,
+    tls: Option<Arc<Tls>>,
 }
 
 /// The addresses of [`Listeners`], ports chosen.
@@ -97,10 +109,17 @@ impl Listeners {
     /// Listens where `config` says.
     ///
     /// # Errors
-    /// An address that is taken or not this machine's.
+    /// A file of TLS that cannot be used, an address that is taken or not this machine's.
     pub async fn bind(config: &Config) -> Result<Self, Error> {
         let bind = async |addr| TcpListener::bind(addr).await.map_err(|cause| Error::Bind { addr, cause });
-        Ok(Self { grpc: bind(config.grpc_addr).await?, http: bind(config.http_addr).await? })
+        let tls = config.tls.clone().map(Tls::open).transpose()?.map(Arc::new);
+        let workers = bind((Ipv4Addr::LOCALHOST, 0).into()).await?;
+        Ok(Self { grpc: bind(config.grpc_addr).await?, http: bind(config.http_addr).await?, workers, tls })
+    }
+
+    /// TLS, if they speak it.
+    pub fn tls(&self) -> Option<Arc<Tls>> {
+        self.tls.clone()
     }
 
     /// Where they listen.
@@ -176,7 +195,16 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         pause_grace: config.drain_timeout,
         ..Settings::new(config.cpu_budget)
     };
+    let keys = Keyring::new(config.key_rate.map(|rate| Rate::new(rate, config.key_burst)));
+    keys.refresh(&store).await.map_err(Error::Keys)?;
+    config.validate_reach(keys.required())?;
+    if config.tls.is_none() && config.validate_reach(false).is_err() {
+        tracing::warn!(
+            "others can reach this server, and nothing is encrypted: who listens on the way sees API keys (--tls-cert)"
+        );
+    }
     let app = App {
+        keys,
         jobs: Jobs::open(store.clone(), settings, Arc::new(executor)).await?,
         store,
         registry: Registry::default(),
@@ -201,7 +229,8 @@ pub async fn run(
     listeners: Listeners,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Error> {
-    let endpoints = listeners.endpoints().map_err(Error::Rest)?;
+    let endpoints = listeners.endpoints().map_err(Error::Listener)?;
+    let workers = listeners.workers.local_addr().map_err(Error::Listener)?;
     let metrics = telemetry::metrics();
     let health = HealthReporter::new();
     let report = async |status| {
@@ -213,19 +242,23 @@ pub async fn run(
     let stop = CancellationToken::new();
 
     let health_server = tonic_health::pb::health_server::HealthServer::new(HealthService::from_health_reporter(health.clone()));
-    let serve_grpc = transport()
-        .layer(tower::util::MapRequestLayer::new(grpc::stamp))
-        .add_routes(grpc::routes(&app, health_server, config.max_message_size))
-        .serve_with_incoming_shutdown(incoming(listeners.grpc), stop.clone().cancelled_owned());
-    let http = listeners.http.tap_io(|stream| {
-        // Only latency is lost where it cannot be set.
-        let _ = stream.set_nodelay(true);
-    });
+    let connections = Connections {
+        permits: Arc::new(Semaphore::new(config.max_connections)),
+        tls: listeners.tls,
+        patience: config.read_timeout,
+        max_streams: config.max_streams,
+        stop: stop.clone(),
+    };
+    let own = Connections { permits: Arc::new(Semaphore::new(WORKERS)), tls: None, ..connections.clone() };
+    let serve_workers = own.serve(listeners.workers, Protocol::Grpc, grpc::worker_routes(&app, config.max_message_size));
+    let routes = grpc::routes(&app, health_server, config.max_message_size);
+    let serve_grpc = connections.clone().serve(listeners.grpc, Protocol::Grpc, routes);
     let router = rest::router(app.clone(), metrics.clone(), config.max_message_size);
-    let serve_rest = axum::serve(http, router).with_graceful_shutdown(stop.clone().cancelled_owned());
+    let serve_rest = connections.serve(listeners.http, Protocol::Http, router);
 
-    let scheduling = tokio::spawn(app.jobs.clone().run(format!("http://{}", from_here(endpoints.grpc))));
+    let scheduling = tokio::spawn(app.jobs.clone().run(format!("http://{workers}")));
     let housekeeping = tokio::spawn(housekeeping(app.clone(), metrics, config.session_ttl.min(config.environment_ttl)));
+    let following = tokio::spawn(keys::follow(app.clone()));
     data.publish(endpoints)?;
     tracing::info!(grpc = %endpoints.grpc, http = %endpoints.http, policies = app.registry.len(), "serving");
 
@@ -240,44 +273,22 @@ pub async fn run(
         tokio::time::sleep(config.drain_timeout).await;
         tracing::warn!(after = ?config.drain_timeout, "gave up on requests in flight");
     };
-    let serve = async {
-        tokio::try_join!(async { serve_grpc.await.map_err(Error::from) }, async { serve_rest.await.map_err(Error::Rest) })
-    };
-    let served = tokio::select! {
-        served = serve => served.map(|_| ()),
-        () = drain => Ok(()),
-    };
+    let serve = async { tokio::join!(serve_grpc, serve_rest, serve_workers) };
+    tokio::select! {
+        _ = serve => {}
+        () = drain => {}
+    }
     scheduling.abort();
     housekeeping.abort();
+    following.abort();
+    keys::keep_last_uses(&app).await;
     data.withdraw();
     tracing::info!("stopped");
-    served
+    Ok(())
 }
 
-/// What a connection may send before the server has read it, in bytes: a large fleet's observation.
-const WINDOW: u32 = 4 << 20;
-
-/// gRPC's transport with this server's settings.
-pub fn transport() -> tonic::transport::Server {
-    tonic::transport::Server::builder()
-        .http2_keepalive_interval(Some(Duration::from_secs(30)))
-        .max_concurrent_streams(1024)
-        .initial_stream_window_size(WINDOW)
-        .initial_connection_window_size(WINDOW)
-}
-
-/// Connections of gRPC: nothing waits for a packet to fill.
-pub fn incoming(listener: TcpListener) -> TcpIncoming {
-    TcpIncoming::from(listener).with_nodelay(Some(true))
-}
-
-/// How a process on this machine reaches a listener: one on all addresses is reached on the loopback.
-fn from_here(mut addr: SocketAddr) -> SocketAddr {
-    if addr.ip().is_unspecified() {
-        addr.set_ip(if addr.is_ipv4() { Ipv4Addr::LOCALHOST.into() } else { Ipv6Addr::LOCALHOST.into() });
-    }
-    addr
-}
+/// Most connections of workers: far more than jobs that run at the same time.
+const WORKERS: usize = 4096;
 
 /// What has to be done now and then, however quiet it is.
 async fn housekeeping(app: Arc<App>, metrics: metrics_exporter_prometheus::PrometheusHandle, ttl: Duration) {

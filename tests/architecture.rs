@@ -22,7 +22,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("service", &["jobs", "serving", "store", "checkpoint", "recipe", "learner", "policy", "env", "invalid", "rng"]),
     ("api", &["service", "jobs", "serving", "store", "checkpoint", "recipe", "learner", "policy", "env", "invalid", "wire"]),
     ("telemetry", &[]),
-    ("config", &["jobs", "serving", "invalid"]),
+    ("config", &["service", "jobs", "serving", "invalid"]),
     ("server", &["api", "service", "jobs", "serving", "store", "config", "telemetry", "wire", "invalid"]),
     (
         "cli",
@@ -30,6 +30,7 @@ const LAYERS: &[(&str, &[&str])] = &[
             "server",
             "config",
             "telemetry",
+            "service",
             "jobs",
             "serving",
             "experiment",

@@ -29,7 +29,7 @@ fn row(error: &Error) -> (Code, StatusCode) {
 /// Seconds after which to try again, at least 1.
 pub fn retry_after_seconds(error: &Error) -> Option<u64> {
     match error {
-        Error::Busy { retry_after, .. } => Some(retry_after.as_secs().max(1)),
+        Error::Busy { retry_after, .. } => Some(retry_after.as_secs_f64().ceil().max(1.0) as u64),
         Error::Draining => Some(1),
         _ => None,
     }
@@ -110,6 +110,9 @@ impl IntoResponse for Error {
         let mut response = problem.into_response();
         if let Some(seconds) = retry_after_seconds(&self) {
             response.headers_mut().insert(header::RETRY_AFTER, seconds.into());
+        }
+        if let Self::Unauthenticated(_) = self {
+            response.headers_mut().insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer realm=\"qedgix\""));
         }
         response
     }

@@ -1,5 +1,6 @@
 //! The outside: gRPC, REST, conversions between wire and domain, one table of errors.
 
+pub mod access;
 pub mod convert;
 mod errors;
 pub mod grpc;

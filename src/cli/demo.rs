@@ -9,6 +9,7 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use super::client::Client;
+use super::connect::ConnectArgs;
 use super::local::LocalServer;
 use super::run_args::all_cores;
 use super::{fly, progress, table, train};
@@ -63,6 +64,7 @@ async fn story(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
         data_dir.display()
     );
 
+    let here = ConnectArgs::default();
     let env = EnvConfig::default();
     let seeds = layouts("eval-v1")?.seeds(args.episodes);
     println!(
@@ -73,7 +75,7 @@ async fn story(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
         seeds.len()
     );
     let mut flight =
-        Flight { server: fly::connect(&server.grpc.to_string()).await?, env, seeds, rows: Vec::new(), flown: Vec::new() };
+        Flight { server: fly::connect(&server.grpc.to_string(), &here).await?, env, seeds, rows: Vec::new(), flown: Vec::new() };
     for (name, _) in bundled::BUNDLED {
         flight.fly(name).await?;
     }
@@ -81,7 +83,7 @@ async fn story(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
         flight.fly(baseline.name).await?;
     }
 
-    let client = Client::new(&server.http.to_string())?;
+    let client = Client::new(&server.http.to_string(), &here)?;
     let job = json!({
         "name": JOB,
         "algorithm": Algorithm::Qmix,

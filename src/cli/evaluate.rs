@@ -7,6 +7,7 @@ use anyhow::{Context, ensure};
 use clap::Args;
 
 use super::comparison::{Comparison, Flown};
+use super::connect::ConnectArgs;
 use super::{fly, progress, report, run_args::all_cores, table};
 use crate::checkpoint::Checkpoint;
 use crate::env::EnvConfig;
@@ -66,6 +67,8 @@ pub struct EvaluateArgs {
     /// Fly through gRPC Act of the server at HOST:PORT
     #[arg(long, env = "QEDGIX_SERVER", value_name = "HOST:PORT")]
     server: Option<String>,
+    #[command(flatten)]
+    connect: ConnectArgs,
     /// Write a report with tables and figures into this directory: index.html, report.md, report.json, *.svg
     #[arg(long, env = "QEDGIX_REPORT", value_name = "DIR")]
     report: Option<PathBuf>,
@@ -92,7 +95,7 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
         args.policy.iter().map(|name| (name.as_str(), false)).chain(references.map(|name| (name, true))).collect();
 
     let mut server = match &args.server {
-        Some(address) => Some(fly::connect(address).await?),
+        Some(address) => Some(fly::connect(address, &args.connect).await?),
         None => None,
     };
     let bar = progress::bar(names.len() as u64, "policies");

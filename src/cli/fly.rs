@@ -1,25 +1,52 @@
 //! Flies a served policy through gRPC `Act`, as an external simulator does: one session per episode, one scene per slot.
 
 use anyhow::{Context, ensure};
-use tonic::transport::Channel;
+use axum::http::HeaderValue;
+use tonic::metadata::{Ascii, MetadataValue};
+use tonic::service::Interceptor;
+use tonic::service::interceptor::InterceptedService;
+use tonic::transport::{Channel, Endpoint};
+use tonic::{Request, Status};
 
+use super::connect::ConnectArgs;
 use crate::env::{EnvConfig, Episode, EpisodeMetrics};
 use crate::wire::v1;
 use crate::wire::v1::act_request::{Memory, Observation};
 use crate::wire::v1::policy_service_client::PolicyServiceClient;
 
 /// A policy server as a simulator sees it.
-pub type Server = PolicyServiceClient<Channel>;
+pub type Server = PolicyServiceClient<InterceptedService<Channel, Signature>>;
+
+/// What every call shows: the API key, if there is one.
+#[derive(Clone, Debug)]
+pub struct Signature(Option<MetadataValue<Ascii>>);
+
+impl Interceptor for Signature {
+    fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {
+        if let Some(authorization) = &self.0 {
+            request.metadata_mut().insert("authorization", authorization.clone());
+        }
+        Ok(request)
+    }
+}
 
 /// Connects to `address`, `HOST:PORT` or a URL.
 ///
 /// # Errors
-/// Nobody answers there.
-pub async fn connect(address: &str) -> anyhow::Result<Server> {
-    let url = if address.contains("://") { address.to_owned() } else { format!("http://{address}") };
-    let endpoint = Channel::from_shared(url).context("not an address")?.tcp_nodelay(true);
-    let channel = endpoint.connect().await.with_context(|| format!("cannot reach {address}"))?;
-    Ok(PolicyServiceClient::new(channel))
+/// It is no address, the API key or a certificate cannot be used, nobody answers there.
+pub async fn connect(address: &str, how: &ConnectArgs) -> anyhow::Result<Server> {
+    let url = how.url(address)?;
+    let sign = |value: HeaderValue| {
+        MetadataValue::try_from(value.as_bytes()).map(|mut value| {
+            value.set_sensitive(true);
+            value
+        })
+    };
+    let signature = how.authorization()?.map(sign).transpose()?;
+    let endpoint = Endpoint::from(url.clone());
+    let channel = endpoint.connect_with_connector(how.connector(&url, true)?).await;
+    let channel = channel.with_context(|| format!("cannot reach {address}"))?;
+    Ok(PolicyServiceClient::with_interceptor(channel, Signature(signature)))
 }
 
 /// Flies one episode per layout seed and returns the metrics of each.

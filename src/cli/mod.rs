@@ -3,11 +3,13 @@
 mod bench;
 mod client;
 mod comparison;
+mod connect;
 mod demo;
 mod evaluate;
 mod experiment;
 mod files;
 mod fly;
+mod keys;
 mod local;
 mod progress;
 mod report;
@@ -41,6 +43,8 @@ enum Command {
     Evaluate(evaluate::EvaluateArgs),
     /// Run, resume and draw an experiment: many training runs and what they say together
     Experiment(experiment::ExperimentArgs),
+    /// Make, list and revoke the API keys of a server
+    Keys(keys::KeysArgs),
     /// Measure how fast the parts are on this machine
     Bench(bench::BenchArgs),
     /// Run one job for a server; servers start their workers themselves
@@ -55,6 +59,7 @@ pub fn run() -> ExitCode {
         Command::Train(args) => block_on(train::run(args)),
         Command::Evaluate(args) => block_on(evaluate::run(args)),
         Command::Experiment(args) => block_on(experiment::run(args)),
+        Command::Keys(args) => block_on(keys::run(args)),
         Command::Bench(args) => block_on(bench::run(args)),
         // It begins without threads and without a runtime.
         Command::Worker(args) => worker::run(&args),

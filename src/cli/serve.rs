@@ -7,7 +7,7 @@ use std::time::Duration;
 use clap::{Args, ValueEnum};
 use tokio::signal::unix::{SignalKind, signal};
 
-use crate::config::Config;
+use crate::config::{Config, TlsFiles};
 use crate::server::{self, DataDir, Listeners};
 use crate::serving::{Clock, EngineConfig};
 use crate::telemetry;
@@ -17,7 +17,10 @@ use crate::telemetry;
 #[command(after_help = "Examples:
   qedgix serve
   qedgix serve --grpc-addr 127.0.0.1:0 --http-addr 127.0.0.1:0 --data-dir /var/lib/qedgix   # free ports, see endpoints.json
-  QEDGIX_CPU_BUDGET=2 QEDGIX_LOG=debug qedgix serve --log-format json")]
+  QEDGIX_CPU_BUDGET=2 QEDGIX_LOG=debug qedgix serve --log-format json
+  qedgix keys create --name fleet --scopes read,act   # from now on callers must show a key ...
+  qedgix serve --grpc-addr 0.0.0.0:50051 --http-addr 0.0.0.0:8080 --tls-cert cert.pem --tls-key key.pem   # ... so others may come
+  qedgix serve --tls-cert cert.pem --tls-key key.pem --tls-client-ca clients.pem --key-rate 500 --max-connections 2000")]
 pub struct ServeArgs {
     /// Where gRPC listens; port 0 picks a free one
     #[arg(long, env = "QEDGIX_GRPC_ADDR", default_value = "127.0.0.1:50051", value_parser = address, value_name = "HOST:PORT")]
@@ -53,7 +56,7 @@ pub struct ServeArgs {
     #[arg(long, env = "QEDGIX_ENVIRONMENT_MEMORY", default_value_t = 1 << 30, value_name = "BYTES")]
     environment_memory: usize,
     /// Largest gRPC message and HTTP body, in bytes
-    #[arg(long, env = "QEDGIX_MAX_MESSAGE_SIZE", default_value_t = 4 << 20, value_name = "BYTES")]
+    #[arg(long, env = "QEDGIX_MAX_MESSAGE_SIZE", default_value_t = 16 << 20, value_name = "BYTES")]
     max_message_size: usize,
     /// Threads that compute headings [default: all cores, at most 4]
     #[arg(long, env = "QEDGIX_ENGINE_THREADS", value_name = "THREADS")]
@@ -71,11 +74,45 @@ pub struct ServeArgs {
     #[arg(long, env = "QEDGIX_DRAIN_TIMEOUT", default_value = "20s", value_parser = duration)]
     drain_timeout: Duration,
     /// Listen on addresses that others can reach, although nobody has to say who they are
-    #[arg(long, env = "QEDGIX_INSECURE")]
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_INSECURE")]
     insecure: bool,
+    #[command(flatten)]
+    security: SecurityArgs,
     /// How logs are written to standard error
     #[arg(long, env = "QEDGIX_LOG_FORMAT", default_value = "text", value_enum)]
     log_format: LogFormat,
+}
+
+/// Where the help lists them.
+const SECURITY: &str = "Security";
+
+/// Flags of `serve` that say who gets in, and how far.
+#[derive(Args, Debug)]
+struct SecurityArgs {
+    /// Speak TLS with this certificate (PEM, with those that lead to its authority); read again on SIGHUP
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_TLS_CERT", value_name = "FILE", requires = "tls_key")]
+    tls_cert: Option<PathBuf>,
+    /// Private key of the certificate (PEM)
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_TLS_KEY", value_name = "FILE", requires = "tls_cert")]
+    tls_key: Option<PathBuf>,
+    /// Callers must show a certificate of one of these authorities (PEM)
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_TLS_CLIENT_CA", value_name = "FILE", requires = "tls_cert")]
+    tls_client_ca: Option<PathBuf>,
+    /// Most connections of both addresses together; further ones are closed at once
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_MAX_CONNECTIONS", default_value_t = 10_000)]
+    max_connections: usize,
+    /// Most streams (calls in flight) of an HTTP/2 connection
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_MAX_STREAMS", default_value_t = 1024)]
+    max_streams: u32,
+    /// Time that a caller may let the server wait: for a handshake, the head of an HTTP/1 request, the next part of a REST body
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_READ_TIMEOUT", default_value = "30s", value_parser = duration)]
+    read_timeout: Duration,
+    /// Requests per second of an API key that has no --rate of its own [default: as many as it likes]
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_KEY_RATE", value_name = "PER_SECOND")]
+    key_rate: Option<f64>,
+    /// How many of them at once [default: as many as one second allows]
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_KEY_BURST", value_name = "REQUESTS", requires = "key_rate")]
+    key_burst: Option<f64>,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -96,12 +133,21 @@ pub async fn run(args: ServeArgs) -> anyhow::Result<()> {
     let listeners = Listeners::bind(&config).await?;
     // Signals are caught before anybody is told that the server is there.
     let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    // Without TLS there is nothing to read again, and a terminal that closes ends the server as ever.
+    let hangup = config.tls.is_some().then(|| signal(SignalKind::hangup())).transpose()?;
     let app = server::open(&config, &data, Clock::system()).await?;
     let endpoints = listeners.endpoints()?;
     println!("qedgix {}", env!("CARGO_PKG_VERSION"));
     println!("gRPC  {}", endpoints.grpc);
-    println!("REST  http://{}", endpoints.http);
+    println!("REST  {}://{}", if config.tls.is_some() { "https" } else { "http" }, endpoints.http);
     println!("data  {}", config.data_dir.display());
+    if let (Some(tls), Some(mut hangup)) = (listeners.tls(), hangup) {
+        tokio::spawn(async move {
+            while hangup.recv().await.is_some() {
+                tls.reload();
+            }
+        });
+    }
     let shutdown = async move {
         tokio::select! {
             _ = interrupt.recv() => {}
@@ -134,8 +180,21 @@ impl ServeArgs {
             },
             drain_timeout: self.drain_timeout,
             insecure: self.insecure,
+            tls: self.security.tls_files(),
+            max_connections: self.security.max_connections,
+            max_streams: self.security.max_streams,
+            read_timeout: self.security.read_timeout,
+            key_rate: self.security.key_rate,
+            key_burst: self.security.key_burst,
             ..default
         }
+    }
+}
+
+impl SecurityArgs {
+    fn tls_files(&self) -> Option<TlsFiles> {
+        let (cert, key) = self.tls_cert.clone().zip(self.tls_key.clone())?;
+        Some(TlsFiles { cert, key, client_ca: self.tls_client_ca.clone() })
     }
 }
 

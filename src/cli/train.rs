@@ -10,6 +10,7 @@ use clap::Args;
 use serde_json::Value;
 
 use super::client::Client;
+use super::connect::ConnectArgs;
 use super::files::write_whole;
 use super::run_args::{RunArgs, all_cores};
 use super::{progress, table};
@@ -23,7 +24,8 @@ use crate::learner::{Event, Summary, TrainConfig, Trainer, evaluate, layouts, su
   qedgix train --uavs 4 --users 8 --set training.learning_rate=5e-4 --metrics curve.csv
   qedgix train --steps 250000 --snapshot run.snapshot           # stop with ctrl-c ...
   qedgix train --resume run.snapshot --snapshot run.snapshot    # ... and go on, to the same bits
-  qedgix train --algorithm qedgix --server 127.0.0.1:8080 --name my-policy")]
+  qedgix train --algorithm qedgix --server 127.0.0.1:8080 --name my-policy
+  QEDGIX_API_KEY=... qedgix train --server https://uavs.example:8080 --ca-cert ca.pem    # a key with the scopes read and jobs")]
 pub struct TrainArgs {
     #[command(flatten)]
     run: RunArgs,
@@ -48,6 +50,8 @@ pub struct TrainArgs {
     /// Name of the job, and of the policy that it becomes
     #[arg(long, env = "QEDGIX_NAME", requires = "server")]
     name: Option<String>,
+    #[command(flatten)]
+    connect: ConnectArgs,
 }
 
 /// Runs the command.
@@ -57,7 +61,7 @@ pub struct TrainArgs {
 pub async fn run(args: TrainArgs) -> anyhow::Result<()> {
     let threads = args.threads.unwrap_or_else(all_cores);
     if let Some(address) = &args.server {
-        let client = Client::new(address)?;
+        let client = Client::new(address, &args.connect)?;
         let job = submit(&client, &args.run.job(threads, args.name.as_deref())?).await?;
         println!("policy {}", job["policy"].as_str().unwrap_or("none"));
         return Ok(());

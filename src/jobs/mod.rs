@@ -15,6 +15,7 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use sha2::{Digest, Sha256};
+use subtle::ConstantTimeEq;
 use tokio::sync::Notify;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
@@ -185,7 +186,7 @@ pub fn token_digest(token: &str) -> [u8; 32] {
 
 /// Compares secrets in a time that does not depend on where they differ.
 pub fn equal_secrets(a: &[u8], b: &[u8]) -> bool {
-    a.len() == b.len() && a.iter().zip(b).fold(0, |difference, (x, y)| difference | (x ^ y)) == 0
+    a.ct_eq(b).into()
 }
 
 /// Lower-case hexadecimal.

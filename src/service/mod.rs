@@ -4,6 +4,7 @@ pub mod act;
 pub mod environments;
 mod error;
 pub mod jobs;
+pub mod keys;
 pub mod policies;
 pub mod sessions;
 pub mod worker;
@@ -29,6 +30,8 @@ pub struct App {
     pub environments: Environments,
     /// Where headings are computed.
     pub engine: Engine,
+    /// Who may ask.
+    pub keys: keys::Keyring,
     /// The time of day.
     pub clock: Clock,
     /// Whether the server is shutting down.

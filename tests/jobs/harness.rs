@@ -12,6 +12,7 @@ use futures::future::BoxFuture;
 use qedgix::config::Config;
 use qedgix::jobs::{Executor, Exit, Jobs, Launch, Settings};
 use qedgix::server::{self, DataDir, Listeners};
+use qedgix::service::keys::Keyring;
 use qedgix::service::{App, Draining};
 use qedgix::serving::{Clock, Engine, EngineConfig, Environments, EnvironmentsConfig, Limits, Registry, Sessions};
 use qedgix::store::Store;
@@ -160,6 +161,7 @@ impl Server {
             sessions: Sessions::new(limits, clock.clone()),
             environments: Environments::new(EnvironmentsConfig { limits, memory: 1 << 20 }, clock.clone()),
             engine: Engine::start(EngineConfig { threads: 1, queue: 1, max_batch: 1, max_batch_delay: Duration::ZERO }).unwrap(),
+            keys: Keyring::new(None),
             clock,
             draining: Draining::default(),
         });

@@ -57,7 +57,7 @@ async fn malformed_requests_get_the_error_of_the_table() {
         let problem = expect(post(body), StatusCode::from_u16(status).unwrap()).await;
         assert_eq!(problem["code"], code, "{body}: {problem}");
     }
-    let large = post(&format!("{{\"name\": \"{}\"}}", "x".repeat(10 << 20)));
+    let large = post(&format!("{{\"name\": \"{}\"}}", "x".repeat(20 << 20)));
     expect(large, StatusCode::PAYLOAD_TOO_LARGE).await;
     let problem = expect(post("{\"threads\": 3}"), StatusCode::BAD_REQUEST).await;
     assert_eq!(problem["field"], "threads");

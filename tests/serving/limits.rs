@@ -11,7 +11,7 @@ use super::harness::*;
 
 /// Sends and receives messages as they are.
 #[derive(Default)]
-struct Raw;
+pub struct Raw;
 
 impl Codec for Raw {
     type Encode = Bytes;
@@ -57,9 +57,9 @@ async fn messages_that_do_not_decode_or_are_too_large() {
         let (code, reason, message) = raw(&server, act, Bytes::from_static(garbage)).await;
         assert_eq!((code, reason.as_str()), (Code::InvalidArgument, "invalid_argument"), "{message}");
     }
-    let (code, reason, message) = raw(&server, act, vec![0; 10_000_000].into()).await;
+    let (code, reason, message) = raw(&server, act, vec![0; 17_000_000].into()).await;
     assert_eq!((code, reason.as_str()), (Code::ResourceExhausted, "too_large"), "{message}");
-    assert!(message.contains("4194304"), "{message}");
+    assert!(message.contains("16777216"), "{message}");
     for unknown in ["/qedgix.v1.PolicyService/Nothing", "/no.such.Service/Act"] {
         assert_eq!(raw(&server, unknown, Bytes::new()).await.0, Code::Unimplemented);
     }

@@ -103,16 +103,26 @@ fn settings_are_checked() {
         config.validate().unwrap_err().field
     };
     assert!(Config::new("unused").validate().is_ok());
-    assert_eq!(refused(|c| c.grpc_addr = "0.0.0.0:50051".parse().unwrap()), "--grpc-addr");
-    assert_eq!(refused(|c| c.http_addr = "192.0.2.1:80".parse().unwrap()), "--http-addr");
     assert_eq!(refused(|c| c.cpu_budget = 0), "--cpu-budget");
     assert_eq!(refused(|c| c.max_sessions = 0), "--max-sessions");
     assert_eq!(refused(|c| c.max_environments = 0), "--max-environments");
     assert_eq!(refused(|c| c.environment_memory = 1), "--environment-memory");
     assert_eq!(refused(|c| c.environment_ttl = std::time::Duration::ZERO), "--environment-ttl (seconds)");
-    let mut open = Config::new("unused");
-    (open.insecure, open.http_addr) = (true, "0.0.0.0:80".parse().unwrap());
-    assert!(open.validate().is_ok());
+    assert_eq!(refused(|c| c.max_connections = 0), "--max-connections");
+    assert_eq!(refused(|c| c.max_streams = 0), "--max-streams");
+    assert_eq!(refused(|c| c.read_timeout = std::time::Duration::ZERO), "--read-timeout (seconds)");
+    assert_eq!(refused(|c| c.key_rate = Some(0.0)), "--key-rate");
+    assert_eq!(refused(|c| c.key_burst = Some(f64::NAN)), "--key-burst");
+
+    let mut far = Config::new("unused");
+    assert!(far.validate_reach(false).is_ok());
+    far.grpc_addr = "0.0.0.0:50051".parse().unwrap();
+    assert_eq!(far.validate_reach(false).unwrap_err().field, "--grpc-addr");
+    (far.grpc_addr, far.http_addr) = ("[::1]:50051".parse().unwrap(), "192.0.2.1:80".parse().unwrap());
+    assert_eq!(far.validate_reach(false).unwrap_err().field, "--http-addr");
+    assert!(far.validate_reach(true).is_ok(), "callers need keys");
+    far.insecure = true;
+    assert!(far.validate_reach(false).is_ok());
 }
 
 /// Starts the binary; it is killed when dropped.
@@ -160,9 +170,10 @@ fn the_binary_says_where_it_listens_and_ends_well_on_sigterm() {
     let (code, text) = Process::start(dir.path(), &[]).ended();
     assert_eq!(code, Some(1));
     assert!(text.contains("in use by another qedgix server"), "{text}");
-    let (code, text) = Process::start(dir.path(), &["--http-addr=0.0.0.0:0"]).ended();
+    let other = tempfile::tempdir().unwrap();
+    let (code, text) = Process::start(other.path(), &["--http-addr=0.0.0.0:0"]).ended();
     assert_eq!(code, Some(1));
-    assert!(text.contains("--http-addr") && text.contains("--insecure"), "{text}");
+    assert!(text.contains("--http-addr") && text.contains("--insecure") && text.contains("qedgix keys create"), "{text}");
 
     let signalled = std::process::Command::new("kill").args(["-TERM", &first.0.id().to_string()]).status().unwrap();
     assert!(signalled.success());

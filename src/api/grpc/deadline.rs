@@ -5,19 +5,15 @@ use std::time::{Duration, Instant};
 use axum::http::Request;
 use tonic::Extensions;
 
-/// The transport keeps `grpc-timeout` too, and calls a timeout CANCELLED. Its timers tick in milliseconds: one tick earlier,
-/// the answer is the table's.
-const TICK: Duration = Duration::from_millis(1);
-
 /// The moment after which the caller no longer waits.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Deadline(pub(super) Instant);
 
 /// Notes the deadline of a request; to be called as soon as its head is there.
-pub fn stamp<B>(mut request: Request<B>) -> Request<B> {
+pub(super) fn stamp<B>(mut request: Request<B>) -> Request<B> {
     let timeout = request.headers().get("grpc-timeout").and_then(|value| timeout(value.to_str().ok()?));
     if let Some(timeout) = timeout {
-        request.extensions_mut().insert(Deadline(Instant::now() + timeout.saturating_sub(TICK)));
+        request.extensions_mut().insert(Deadline(Instant::now() + timeout));
     }
     request
 }

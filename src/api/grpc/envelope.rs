@@ -1,4 +1,4 @@
-//! What happens around every gRPC call: its deadline, its id, panics caught, statuses brought in line with the table of
+//! What happens around every gRPC call: its deadline, its id, whether it is let in, panics caught, statuses brought in line with the table of
 //! errors, and its count.
 
 use std::panic::AssertUnwindSafe;
@@ -12,19 +12,29 @@ use futures::FutureExt;
 use tonic::{Code, Status};
 use tracing::Instrument;
 
-use super::Deadline;
+use super::deadline::{Deadline, stamp};
+use crate::api::access;
 use crate::api::observe::{Meters, REQUEST_ID, request_id};
 use crate::invalid::Invalid;
-use crate::service::Error;
+use crate::service::{App, Error};
 
-pub(super) async fn around(meters: Arc<Meters>, request: Request, next: Next) -> Response {
+pub(super) async fn around(app: Arc<App>, meters: Arc<Meters>, request: Request, next: Next) -> Response {
     let begun = Instant::now();
+    let mut request = stamp(request);
     let uri = request.uri().clone();
     let method = uri.path().trim_start_matches('/');
     let id = request_id(request.headers());
     let deadline = request.extensions().get::<Deadline>().map(|deadline| deadline.0);
-    let span = tracing::info_span!("grpc", method, request_id = ?id);
-    let work = AssertUnwindSafe(next.run(request).instrument(span.clone())).catch_unwind();
+    let span = tracing::info_span!("grpc", method, request_id = ?id, key = tracing::field::Empty);
+    let admitted = span.in_scope(|| access::admit(&app, &mut request, || access::grpc(method)));
+    let made_up = admitted.as_ref().is_err_and(|refusal| !refusal.listed);
+    let work = async {
+        match admitted {
+            Ok(()) => next.run(request).await,
+            Err(refusal) => Status::from(refusal.error).into_http(),
+        }
+    };
+    let work = AssertUnwindSafe(work.instrument(span.clone())).catch_unwind();
     let answered = match deadline {
         None => work.await,
         Some(deadline) if deadline <= Instant::now() => Ok(too_late()),
@@ -35,7 +45,7 @@ pub(super) async fn around(meters: Arc<Meters>, request: Request, next: Next) ->
     let (mut response, code) = in_line(response);
     response.headers_mut().insert(REQUEST_ID, id);
     // Paths are the caller's; only those that exist become labels.
-    let method = if code == Code::Unimplemented { "unknown" } else { method };
+    let method = if made_up || code == Code::Unimplemented { "unknown" } else { method };
     meters.end(begun, method, name(code));
     response
 }
@@ -46,7 +56,11 @@ fn too_late() -> Response {
 
 /// The transport has its own statuses for messages that are too large or do not decode; the table of errors has others.
 fn in_line(response: Response) -> (Response, Code) {
-    let Some(status) = response.extensions().get::<Status>() else { return (response, Code::Ok) };
+    let Some(status) = response.extensions().get::<Status>() else {
+        // A service says of a method that it does not have in the head alone.
+        let code = response.headers().get("grpc-status").map_or(Code::Ok, |code| Code::from_bytes(code.as_bytes()));
+        return (response, code);
+    };
     let ours = status.metadata().contains_key("qedgix-code");
     let error = match status.code() {
         Code::OutOfRange if !ours => Error::TooLarge(status.message().to_owned()),

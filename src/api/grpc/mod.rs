@@ -9,14 +9,15 @@ mod worker;
 
 use std::sync::Arc;
 
+use axum::Router;
 use tonic::service::Routes;
 use tonic_health::pb::health_server::{Health, HealthServer};
 
-pub use deadline::stamp;
-use deadline::{Deadline, deadline};
+use deadline::deadline;
 
 use crate::api::observe::Meters;
 use crate::service::App;
+use crate::wire::v1::worker_service_server::{WorkerService, WorkerServiceServer};
 use crate::wire::{DESCRIPTORS, v1};
 
 /// Names of the services that health tells about.
@@ -33,7 +34,7 @@ const BUILT_IN: &str = "the descriptors are built into the program";
 ///
 /// # Panics
 /// When the descriptor set built into the program does not decode; a test would have failed before.
-pub fn routes<H: Health>(app: &Arc<App>, health: HealthServer<H>, max_message: usize) -> Routes {
+pub fn routes<H: Health>(app: &Arc<App>, health: HealthServer<H>, max_message: usize) -> Router {
     let reflection = || {
         let builder = tonic_reflection::server::Builder::configure().register_encoded_file_descriptor_set(DESCRIPTORS);
         builder.register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
@@ -43,12 +44,24 @@ pub fn routes<H: Health>(app: &Arc<App>, health: HealthServer<H>, max_message: u
         .add_service(policy::service(app.clone()).max_decoding_message_size(max_message))
         .add_service(environment::service(app.clone()).max_decoding_message_size(max_message))
         .add_service(job::service(app.clone()).max_decoding_message_size(max_message))
-        .add_service(worker::service(app.clone()).max_decoding_message_size(max_message.max(worker::LARGEST_MESSAGE)))
+        .add_service(workers(app, max_message))
         .add_service(health)
         .add_service(reflection().build_v1().expect(BUILT_IN))
         .add_service(reflection().build_v1alpha().expect(BUILT_IN));
-    let meters = Arc::new(Meters::new("grpc"));
-    let around = move |request, next| envelope::around(meters.clone(), request, next);
-    let router = routes.routes().into_axum_router().layer(axum::middleware::from_fn(around));
-    Routes::from(router)
+    within(app, routes.routes())
+}
+
+/// What workers need and nothing else, for an address of their own.
+pub fn worker_routes(app: &Arc<App>, max_message: usize) -> Router {
+    within(app, Routes::new(workers(app, max_message)))
+}
+
+fn workers(app: &Arc<App>, max_message: usize) -> WorkerServiceServer<impl WorkerService> {
+    worker::service(app.clone()).max_decoding_message_size(max_message.max(worker::LARGEST_MESSAGE))
+}
+
+fn within(app: &Arc<App>, routes: Routes) -> Router {
+    let (app, meters) = (app.clone(), Arc::new(Meters::new("grpc")));
+    let around = move |request, next| envelope::around(app.clone(), meters.clone(), request, next);
+    routes.into_axum_router().layer(axum::middleware::from_fn(around))
 }

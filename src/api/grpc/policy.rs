@@ -11,6 +11,7 @@ use super::deadline;
 use crate::api::convert::{request::open_session, response::act_response};
 use crate::api::errors::act_error;
 use crate::invalid::in_range;
+use crate::service::keys::Caller;
 use crate::service::{App, Error, act, policies, sessions};
 use crate::serving::PolicySpec;
 use crate::wire::v1;
@@ -65,8 +66,13 @@ impl PolicyService for Handlers {
 
     async fn act_batch(&self, request: Request<v1::ActBatchRequest>) -> Result<Response<v1::ActBatchResponse>, Status> {
         let deadline = deadline(request.extensions());
+        let caller = request.extensions().get::<Caller>().cloned();
         let requests = request.into_inner().requests;
         in_range("requests", requests.len(), 1..=LARGEST_BATCH).map_err(Error::from)?;
+        // One of them was counted as the call itself.
+        if let Some(caller) = caller {
+            caller.charge(requests.len() as u32 - 1, self.0.clock.now());
+        }
         let answers = requests.into_iter().map(|request| answer(&self.0, request, deadline));
         let results = join_all(answers).await.into_iter().map(act_result).collect();
         Ok(Response::new(v1::ActBatchResponse { results }))
@@ -76,16 +82,22 @@ impl PolicyService for Handlers {
 
     async fn act_stream(&self, request: Request<Streaming<v1::ActRequest>>) -> Result<Response<Self::ActStreamStream>, Status> {
         let deadline = deadline(request.extensions());
+        let caller = request.extensions().get::<Caller>().cloned();
         let app = self.0.clone();
         let draining = app.clone();
         // What was asked before the server drains is answered; then the stream ends, so that it does not hold up the end.
         let requests = request.into_inner().take_until(async move { draining.draining.wait().await });
         let answers = requests.map(move |request| {
             let app = app.clone();
+            let counted = caller.as_ref().map_or(Ok(()), |caller| caller.again(app.clock.now()));
             async move {
-                // A message that does not decode, or a caller that left: the stream is over.
+                // A message that does not decode, or a caller that left or whose key is over: the stream is over.
                 let request = request?;
-                Ok(act_result(answer(&app, request, deadline).await))
+                match counted {
+                    Ok(()) => Ok(act_result(answer(&app, request, deadline).await)),
+                    Err(error @ Error::Busy { .. }) => Ok(act_result(Err(error))),
+                    Err(error) => Err(error.into()),
+                }
             }
         });
         Ok(Response::new(answers.buffered(IN_FLIGHT).boxed()))

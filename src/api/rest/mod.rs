@@ -24,13 +24,14 @@ use futures::FutureExt;
 use metrics_exporter_prometheus::PrometheusHandle;
 use tracing::Instrument;
 
+use super::access;
 use super::errors::problem;
 use super::observe::{Meters, REQUEST_ID, request_id};
 use crate::service::{App, Error};
 
 /// All of REST. A body larger than `max_body` bytes is refused.
 pub fn router(app: Arc<App>, metrics: PrometheusHandle, max_body: usize) -> Router {
-    let meters = Arc::new(Meters::new("http"));
+    let (gate, meters) = (app.clone(), Arc::new(Meters::new("http")));
     Router::new()
         .route("/", get(ops::index))
         .route("/livez", get(ops::live))
@@ -49,24 +50,35 @@ pub fn router(app: Arc<App>, metrics: PrometheusHandle, max_body: usize) -> Rout
             problem(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", detail)
         })
         .layer(axum::Extension(extract::MaxBody(max_body)))
-        .layer(axum::middleware::from_fn(move |request, next| around(meters.clone(), request, next)))
+        .layer(axum::middleware::from_fn(move |request, next| around(gate.clone(), meters.clone(), request, next)))
         .with_state(app)
 }
 
-/// What happens around every request: its id, panics caught, and its count.
-async fn around(meters: Arc<Meters>, request: Request, next: Next) -> Response {
+/// What happens around every request: its id, whether it is let in, panics caught, and its count.
+async fn around(app: Arc<App>, meters: Arc<Meters>, mut request: Request, next: Next) -> Response {
     let begun = Instant::now();
     let verb = request.method().clone();
-    let path = request.extensions().get::<MatchedPath>().map_or("unknown", MatchedPath::as_str).to_owned();
+    let route = request.extensions().get::<MatchedPath>().cloned();
+    let route = route.as_ref().map(MatchedPath::as_str);
+    let path = route.unwrap_or("unknown");
     let id = request_id(request.headers());
-    let span = tracing::info_span!("http", %verb, path, request_id = ?id);
-    let work = AssertUnwindSafe(next.run(request).instrument(span.clone())).catch_unwind();
+    let span = tracing::info_span!("http", %verb, path, request_id = ?id, key = tracing::field::Empty);
+    let admitted = span.in_scope(|| access::admit(&app, &mut request, || access::rest(&verb, route)));
+    let made_up = admitted.as_ref().is_err_and(|refusal| !refusal.listed);
+    let work = async {
+        match admitted {
+            Ok(()) => next.run(request).await,
+            Err(refusal) => refusal.error.into_response(),
+        }
+    };
+    let work = AssertUnwindSafe(work.instrument(span.clone())).catch_unwind();
     let answered = work.await;
     let _inside = span.enter();
     let mut response = answered.unwrap_or_else(|_| Error::internal("a handler panicked").into_response());
     response.headers_mut().insert(REQUEST_ID, id);
     // Made-up verbs are the caller's; they do not become labels.
-    let verb = if response.status() == StatusCode::METHOD_NOT_ALLOWED { "other" } else { verb.as_str() };
+    let made_up = made_up || response.status() == StatusCode::METHOD_NOT_ALLOWED;
+    let verb = if made_up { "other" } else { verb.as_str() };
     meters.end(begun, &format!("{verb} {path}"), response.status().as_str());
     response
 }

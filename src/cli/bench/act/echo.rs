@@ -12,9 +12,11 @@ use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::TcpListener;
 use tokio::process::{Child, Command};
 use tokio::task::JoinHandle;
+use tonic::transport::Server as Transport;
+use tonic::transport::server::TcpIncoming;
 use tonic::{Request, Response, Status, Streaming};
 
-use crate::server::{incoming, transport};
+use crate::server::{KEEPALIVE, WINDOW};
 use crate::wire::v1;
 use crate::wire::v1::policy_service_server::{PolicyService, PolicyServiceServer};
 
@@ -103,6 +105,20 @@ pub(in super::super) async fn serve() -> anyhow::Result<()> {
         served = transport().add_service(service(answer)).serve_with_incoming(incoming(listener)) => Ok(served?),
         () = until => Ok(()),
     }
+}
+
+/// A bare transport with the server's settings.
+fn transport() -> Transport {
+    Transport::builder()
+        .http2_keepalive_interval(Some(KEEPALIVE))
+        .max_concurrent_streams(1024)
+        .initial_stream_window_size(WINDOW)
+        .initial_connection_window_size(WINDOW)
+}
+
+/// Connections on which nothing waits for a packet to fill.
+fn incoming(listener: TcpListener) -> TcpIncoming {
+    TcpIncoming::from(listener).with_nodelay(Some(true))
 }
 
 async fn listen() -> std::io::Result<TcpListener> {

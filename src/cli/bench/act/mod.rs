@@ -21,6 +21,7 @@ use self::echo::Echo;
 use self::figures::{Figures, Samples};
 use self::load::{Client, Pace, round};
 use self::world::{Setup, World};
+use crate::cli::connect::ConnectArgs;
 use crate::cli::fly;
 use crate::cli::local::LocalServer;
 use crate::cli::serve::duration;
@@ -40,6 +41,8 @@ pub struct ActArgs {
     /// Server to load [default: one in this process, on a free port with a temporary data directory]
     #[arg(long, env = "QEDGIX_SERVER", value_name = "HOST:PORT")]
     server: Option<String>,
+    #[command(flatten)]
+    connect: ConnectArgs,
     /// Policy to fly: NAME, NAME@ALIAS or NAME:VERSION
     #[arg(long, env = "QEDGIX_POLICY", default_value = "qedgix")]
     policy: String,
@@ -156,7 +159,7 @@ enum Side {
 }
 
 async fn measure(args: &ActArgs, address: &str) -> anyhow::Result<()> {
-    let mut server = fly::connect(address).await?;
+    let mut server = fly::connect(address, &args.connect).await?;
     let policy = server.get_policy(v1::GetPolicyRequest { policy: args.policy.clone() });
     let policy = policy.await.map_err(told).context("--policy")?.into_inner();
     let setup = Setup::new(args, &policy)?;
@@ -254,9 +257,11 @@ fn session_id() -> String {
 
 /// A client per session; `sessions` are opened where it is the server.
 async fn clients(args: &ActArgs, address: &str, setup: &Setup, sessions: bool) -> anyhow::Result<Vec<Client>> {
+    // The echo is on this machine and asks for nothing.
+    let how = if sessions { &args.connect } else { &ConnectArgs::default() };
     let mut connections = Vec::new();
     for _ in 0..args.connections.get() {
-        connections.push(fly::connect(address).await?);
+        connections.push(fly::connect(address, how).await?);
     }
     let mut clients = Vec::new();
     for i in 0..args.sessions.get() as usize {

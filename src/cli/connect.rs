@@ -1,0 +1,171 @@
+//! How commands reach a server: addresses, certificates, the API key.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::{Context, bail};
+use axum::http::{HeaderValue, Uri};
+use clap::Args;
+use hyper_rustls::{ConfigBuilderExt, HttpsConnector, HttpsConnectorBuilder};
+use hyper_util::client::legacy::connect::HttpConnector;
+use rustls::crypto::ring;
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use rustls::{ClientConfig, RootCertStore};
+
+/// Where the help lists these flags.
+const CONNECTION: &str = "Connection";
+
+/// Flags of commands that talk to a server.
+#[derive(Args, Clone, Debug, Default)]
+pub struct ConnectArgs {
+    /// API key that the server asks for; command lines are for everybody on this machine to see, the environment is not
+    #[arg(long, help_heading = CONNECTION, env = "QEDGIX_API_KEY", hide_env_values = true, value_name = "KEY")]
+    api_key: Option<Secret>,
+    /// Authorities (PEM) that the server's certificate may come from [default: those of this machine]
+    #[arg(long, help_heading = CONNECTION, env = "QEDGIX_CA_CERT", value_name = "FILE")]
+    ca_cert: Option<PathBuf>,
+    /// Certificate (PEM) that this caller shows
+    #[arg(long, help_heading = CONNECTION, env = "QEDGIX_CLIENT_CERT", value_name = "FILE", requires = "client_key")]
+    client_cert: Option<PathBuf>,
+    /// Private key of that certificate (PEM)
+    #[arg(long, help_heading = CONNECTION, env = "QEDGIX_CLIENT_KEY", value_name = "FILE", requires = "client_cert")]
+    client_key: Option<PathBuf>,
+}
+
+/// Text that is not to be shown.
+#[derive(Clone)]
+struct Secret(String);
+
+impl From<String> for Secret {
+    fn from(text: String) -> Self {
+        Self(text)
+    }
+}
+
+impl fmt::Debug for Secret {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("***")
+    }
+}
+
+/// Opens connections, in TLS where the address says `https`.
+pub type Connector = HttpsConnector<HttpConnector>;
+
+impl ConnectArgs {
+    /// `HOST:PORT` or a URL as a URL. Where certificates are told of, TLS is meant.
+    ///
+    /// # Errors
+    /// It is neither.
+    pub fn url(&self, address: &str) -> anyhow::Result<Uri> {
+        let tls = self.ca_cert.is_some() || self.client_cert.is_some();
+        let scheme = if tls { "https" } else { "http" };
+        let address = address.trim_end_matches('/');
+        let text = if address.contains("://") { address.to_owned() } else { format!("{scheme}://{address}") };
+        let url: Uri = text.parse().with_context(|| format!("{address}: not an address"))?;
+        if url.host().is_none() || !matches!(url.scheme_str(), Some("http" | "https")) || url.path() != "/" {
+            bail!("{address}: not an address; expected HOST:PORT, http://HOST:PORT or https://HOST:PORT");
+        }
+        Ok(url)
+    }
+
+    /// What shows the API key, if there is one.
+    ///
+    /// # Errors
+    /// It cannot be one.
+    pub fn authorization(&self) -> anyhow::Result<Option<HeaderValue>> {
+        let Some(Secret(key)) = &self.api_key else { return Ok(None) };
+        // The cause would repeat what must not be repeated.
+        let value = HeaderValue::try_from(format!("Bearer {}", key.trim()));
+        let Ok(mut value) = value else { bail!("--api-key: this is not an API key; expected what qedgix keys create printed") };
+        value.set_sensitive(true);
+        Ok(Some(value))
+    }
+
+    /// Opens connections to `url`, for HTTP/2 or HTTP/1.
+    ///
+    /// # Errors
+    /// A certificate or key that cannot be used.
+    pub fn connector(&self, url: &Uri, http2: bool) -> anyhow::Result<Connector> {
+        let mut tcp = HttpConnector::new();
+        tcp.set_nodelay(true);
+        tcp.enforce_http(false);
+        let https = url.scheme_str() == Some("https");
+        let builder = HttpsConnectorBuilder::new().with_tls_config(self.tls(https)?).https_or_http();
+        Ok(if http2 { builder.enable_http2().wrap_connector(tcp) } else { builder.enable_http1().wrap_connector(tcp) })
+    }
+
+    /// Whom to trust, and what to show. Without `needed` the system is not asked for its authorities: it may have none.
+    fn tls(&self, needed: bool) -> anyhow::Result<ClientConfig> {
+        let builder = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()));
+        let builder = builder.with_safe_default_protocol_versions()?;
+        let builder = match &self.ca_cert {
+            Some(path) => {
+                let mut roots = RootCertStore::empty();
+                for cert in certificates("--ca-cert", path)? {
+                    roots.add(cert).with_context(|| format!("--ca-cert {}", path.display()))?;
+                }
+                builder.with_root_certificates(roots)
+            }
+            None if needed => builder.with_native_roots().context("the authorities of this machine; or say --ca-cert")?,
+            None => builder.with_root_certificates(RootCertStore::empty()),
+        };
+        let Some((cert, key)) = self.client_cert.as_deref().zip(self.client_key.as_deref()) else {
+            return Ok(builder.with_no_client_auth());
+        };
+        let certs = certificates("--client-cert", cert)?;
+        let secret = PrivateKeyDer::from_pem_file(key).with_context(|| format!("--client-key {}", key.display()))?;
+        builder.with_client_auth_cert(certs, secret).with_context(|| format!("--client-key {}", key.display()))
+    }
+}
+
+/// The certificates of a PEM file, at least one.
+fn certificates(flag: &str, path: &Path) -> anyhow::Result<Vec<CertificateDer<'static>>> {
+    let read = CertificateDer::pem_file_iter(path).and_then(Iterator::collect::<Result<Vec<_>, _>>);
+    let certs = read.with_context(|| format!("{flag} {}", path.display()))?;
+    if certs.is_empty() {
+        bail!("{flag} {}: no certificate in PEM", path.display());
+    }
+    Ok(certs)
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::{CommandFactory, Parser};
+
+    use super::*;
+
+    #[derive(Debug, Parser)]
+    struct Line {
+        #[command(flatten)]
+        connect: ConnectArgs,
+    }
+
+    #[test]
+    fn the_key_is_shown_nowhere_but_to_the_server() {
+        let line = Line::try_parse_from(["x", "--api-key", "qdx_id_SECRET"]).unwrap();
+        assert!(!format!("{line:?}").contains("SECRET"));
+        let value = line.connect.authorization().unwrap().unwrap();
+        assert_eq!(value, "Bearer qdx_id_SECRET");
+        assert!(!format!("{value:?}").contains("SECRET"));
+        let broken = Line::try_parse_from(["x", "--api-key", "SECRET\n1"]).unwrap().connect.authorization().unwrap_err();
+        assert!(!format!("{broken:?}").contains("SECRET"), "{broken:?}");
+        let command = Line::command();
+        let key = command.get_arguments().find(|a| a.get_id() == "api_key").unwrap();
+        assert!(key.is_hide_env_values_set());
+    }
+
+    #[test]
+    fn addresses_become_urls() {
+        let plain = ConnectArgs::default();
+        let tls = ConnectArgs { ca_cert: Some("ca.pem".into()), ..ConnectArgs::default() };
+        assert_eq!(plain.url("127.0.0.1:8080").unwrap(), "http://127.0.0.1:8080/");
+        assert_eq!(tls.url("server:8080").unwrap(), "https://server:8080/");
+        assert_eq!(tls.url("http://server:8080/").unwrap(), "http://server:8080/");
+        assert_eq!(plain.url("https://server").unwrap(), "https://server/");
+        for wrong in ["", "a b", "ftp://server", "http://server/path", "/path"] {
+            assert!(plain.url(wrong).is_err(), "{wrong}");
+        }
+    }
+}
