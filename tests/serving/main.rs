@@ -11,4 +11,5 @@ mod limits;
 mod load;
 mod published;
 mod rest;
+mod security;
 mod server;

@@ -1,0 +1,199 @@
+//! The table of access covers everything that is served, and both transports go by it.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use bytes::Bytes;
+use prost::Message;
+use prost_types::FileDescriptorSet;
+use qedgix::api::access::{self, Need};
+use qedgix::service::keys::Scope;
+use reqwest::Method;
+use tonic::Code;
+use tonic::transport::Channel;
+
+use super::super::harness::*;
+use super::super::limits::Raw;
+use super::{key, make, signed};
+
+/// `SERVICE/METHOD` of everything in the descriptor sets that reflection serves.
+fn grpc_methods() -> Vec<String> {
+    let sets = [qedgix::wire::DESCRIPTORS, tonic_health::pb::FILE_DESCRIPTOR_SET];
+    let reflection = [tonic_reflection::pb::v1::FILE_DESCRIPTOR_SET, tonic_reflection::pb::v1alpha::FILE_DESCRIPTOR_SET];
+    let files = sets.into_iter().chain(reflection).flat_map(|set| FileDescriptorSet::decode(set).unwrap().file);
+    let mut methods = Vec::new();
+    for file in files {
+        for service in &file.service {
+            let name = |method: &str| format!("{}.{}/{method}", file.package(), service.name());
+            methods.extend(service.method.iter().map(|method| name(method.name())));
+        }
+    }
+    assert!(methods.len() > 25 && methods.contains(&"qedgix.v1.PolicyService/Act".to_owned()), "{methods:?}");
+    methods
+}
+
+/// Verb and route of everything that `src/api/rest` registers.
+fn rest_routes() -> Vec<(Method, String)> {
+    let mut routes = BTreeSet::new();
+    for file in std::fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("src/api/rest")).unwrap() {
+        let text = std::fs::read_to_string(file.unwrap().path()).unwrap();
+        for call in text.split(".route(").skip(1) {
+            let (_, rest) = call.split_once('"').unwrap();
+            let (route, rest) = rest.split_once('"').unwrap();
+            let mut depth = 1;
+            let end = rest.find(|c| {
+                depth += i32::from(c == '(') - i32::from(c == ')');
+                depth == 0
+            });
+            let handlers = &rest[..end.unwrap()];
+            let before = routes.len();
+            for verb in ["GET", "POST", "PUT", "PATCH", "DELETE"] {
+                let name = format!("{}(", verb.to_lowercase());
+                let called = handlers.match_indices(&name).any(|(at, _)| handlers[..at].ends_with([' ', '.', ':']));
+                if called {
+                    routes.insert((verb, route.to_owned()));
+                }
+            }
+            assert!(routes.len() > before, "no verb that this test knows in .route({route:?}, {handlers}");
+        }
+    }
+    assert!(routes.len() > 25 && routes.contains(&("POST", "/v1/act".to_owned())), "{routes:?}");
+    routes.into_iter().map(|(verb, route)| (verb.parse().unwrap(), route)).collect()
+}
+
+#[test]
+fn everything_that_is_served_is_in_the_table() {
+    let grpc = grpc_methods().into_iter().filter(|method| !access::grpc(method).listed);
+    let rest = rest_routes().into_iter().filter(|(verb, route)| !access::rest(verb, Some(route)).listed);
+    let missing: Vec<String> = grpc.chain(rest.map(|(verb, route)| format!("{verb} {route}"))).collect();
+    assert!(missing.is_empty(), "add them to src/api/access.rs: {missing:#?}");
+}
+
+/// A scope that opens what `need` asks for, and all those that do not.
+fn scopes(need: Need) -> Option<(Scope, Vec<Scope>)> {
+    let Need::Scope(scope) = need else { return None };
+    let others = Scope::ALL.into_iter().filter(|other| *other != scope && *other != Scope::Admin);
+    Some((scope, others.collect()))
+}
+
+/// A server of which jobs may be asked for, although none runs.
+async fn without_workers() -> Server {
+    Server::with(|config| config.worker = Some("/bin/false".into())).await
+}
+
+async fn grpc(channel: &Channel, method: &str, key: Option<&str>) -> (Code, String) {
+    let mut client = tonic::client::Grpc::new(channel.clone());
+    client.ready().await.unwrap();
+    let request = key.map_or_else(|| tonic::Request::new(Bytes::new()), |key| signed(key, Bytes::new()));
+    // Every kind of method answers a stream of one message with its head.
+    let answer = soon(client.server_streaming(request, format!("/{method}").parse().unwrap(), Raw)).await;
+    answer.map_or_else(|status| (status.code(), status.message().to_owned()), |_| (Code::Ok, String::new()))
+}
+
+#[tokio::test]
+async fn grpc_goes_by_the_table() {
+    let server = without_workers().await;
+    let channel = server.channel().await;
+    assert_ne!(grpc(&channel, "qedgix.v1.PolicyService/ListPolicies", None).await.0, Code::Unauthenticated, "no key, no gate");
+    let of = [key(&server, "read").await, key(&server, "act").await, key(&server, "jobs").await, key(&server, "admin").await];
+    for method in grpc_methods() {
+        let worker = method.starts_with("qedgix.v1.WorkerService/");
+        let (code, message) = grpc(&channel, &method, None).await;
+        let Some((scope, others)) = scopes(access::grpc(&method).need) else {
+            // Workers are asked for the token of their attempt.
+            assert!(!message.starts_with("an API key"), "{method}: {message}");
+            assert_eq!(code == Code::Unauthenticated, worker, "{method}: {message}");
+            continue;
+        };
+        assert_eq!(code, Code::Unauthenticated, "{method}");
+        for right in [scope, Scope::Admin] {
+            let (code, message) = grpc(&channel, &method, Some(&of[right as usize])).await;
+            assert!(!matches!(code, Code::Unauthenticated | Code::PermissionDenied), "{method} with {right:?}: {message}");
+        }
+        for wrong in others {
+            let (code, message) = grpc(&channel, &method, Some(&of[wrong as usize])).await;
+            assert_eq!(code, Code::PermissionDenied, "{method} with {wrong:?}");
+            assert!(message.contains(&format!("the scope {}", scope.name())), "{message}");
+        }
+    }
+    for nowhere in ["qedgix.v1.PolicyService/Forget", "no.such.Service/Method"] {
+        assert_eq!(grpc(&channel, nowhere, None).await.0, Code::Unauthenticated);
+        assert_eq!(grpc(&channel, nowhere, Some(&of[0])).await.0, Code::PermissionDenied);
+        assert_eq!(grpc(&channel, nowhere, Some(&of[3])).await.0, Code::Unimplemented);
+    }
+    // Only what exists becomes a label.
+    let metrics = reqwest::Client::new().get(server.url("/metrics")).bearer_auth(&of[0]).send().await.unwrap();
+    let metrics = metrics.text().await.unwrap();
+    assert!(metrics.contains("method=\"qedgix.v1.PolicyService/Act\",code=\"UNAUTHENTICATED\""), "{metrics}");
+    assert!(!metrics.contains("Forget") && !metrics.contains("no.such.Service"), "{metrics}");
+}
+
+async fn rest(server: &Server, verb: &Method, path: &str, key: Option<&str>) -> (u16, Option<String>, String) {
+    let request = reqwest::Client::new().request(verb.clone(), server.url(path));
+    let request = if let Some(key) = key { request.header("x-api-key", key) } else { request };
+    let answer = soon(request.send()).await.unwrap();
+    let asked = answer.headers().get("www-authenticate").map(|value| value.to_str().unwrap().to_owned());
+    (answer.status().as_u16(), asked, answer.text().await.unwrap())
+}
+
+#[tokio::test]
+async fn rest_goes_by_the_table() {
+    let server = without_workers().await;
+    assert_eq!(rest(&server, &Method::GET, "/v1/policies", None).await.0, 200, "no key, no gate");
+    let of = [key(&server, "read").await, key(&server, "act").await, key(&server, "jobs").await, key(&server, "admin").await];
+    let mut open = BTreeSet::new();
+    for (verb, route) in rest_routes() {
+        let path = route.split('/').map(|part| if part.starts_with('{') { "x" } else { part }).collect::<Vec<_>>().join("/");
+        let (status, asked, text) = rest(&server, &verb, &path, None).await;
+        let Some((scope, others)) = scopes(access::rest(&verb, Some(&route)).need) else {
+            assert!(!matches!(status, 401 | 403), "{verb} {route}: {text}");
+            open.insert(route);
+            continue;
+        };
+        assert_eq!((status, asked.as_deref()), (401, Some("Bearer realm=\"qedgix\"")), "{verb} {route}");
+        assert!(text.contains("\"code\":\"unauthenticated\""), "{text}");
+        for right in [scope, Scope::Admin] {
+            let (status, _, text) = rest(&server, &verb, &path, Some(&of[right as usize])).await;
+            assert!(!matches!(status, 401 | 403), "{verb} {route} with {right:?}: {text}");
+        }
+        for wrong in others {
+            let (status, _, text) = rest(&server, &verb, &path, Some(&of[wrong as usize])).await;
+            assert_eq!(status, 403, "{verb} {route} with {wrong:?}: {text}");
+            let named = format!("the scope {}", scope.name());
+            assert!(text.contains("\"code\":\"permission_denied\"") && text.contains(&named), "{text}");
+        }
+    }
+    assert!(open.contains("/livez") && open.contains("/readyz"), "{open:?}");
+    // A made-up path is only told to those who belong here; a verb that nothing answers, to admins.
+    for (verb, path, statuses) in [("GET", "/v1/nothing", [401, 404, 404]), ("PURGE", "/v1/act", [401, 403, 405])] {
+        let verb: Method = verb.parse().unwrap();
+        for (key, status) in [None, Some(&of[0]), Some(&of[3])].into_iter().zip(statuses) {
+            assert_eq!(rest(&server, &verb, path, key.map(String::as_str)).await.0, status, "{verb} {path}");
+        }
+    }
+    let metrics = rest(&server, &Method::GET, "/metrics", Some(&of[0])).await.2;
+    assert!(metrics.contains("code=\"401\"") && !metrics.contains("PURGE"), "{metrics}");
+    assert_eq!(rest(&server, &Method::HEAD, "/v1/policies", Some(&of[0])).await.0, 200);
+    assert_eq!(rest(&server, &Method::HEAD, "/v1/policies", Some(&of[1])).await.0, 403);
+}
+
+#[tokio::test]
+async fn a_key_may_have_several_scopes_and_is_shown_in_either_header() {
+    let server = Server::start().await;
+    let created = make(&server, "read,jobs", |_| {}).await;
+    let client = reqwest::Client::new();
+    let get = client.get(server.url("/v1/jobs"));
+    assert_eq!(get.try_clone().unwrap().bearer_auth(&created.key).send().await.unwrap().status(), 200);
+    assert_eq!(get.try_clone().unwrap().header("x-api-key", &created.key).send().await.unwrap().status(), 200);
+    assert_eq!(get.basic_auth("me", Some(&created.key)).send().await.unwrap().status(), 401);
+    let post = |path| client.post(server.url(path)).bearer_auth(&created.key).body("{}").send();
+    assert_ne!(post("/v1/jobs").await.unwrap().status(), 403);
+    assert_eq!(post("/v1/act").await.unwrap().status(), 403);
+    let channel = server.channel().await;
+    let mut request = tonic::Request::new(Bytes::new());
+    request.metadata_mut().insert("x-api-key", created.key.parse().unwrap());
+    let mut grpc = tonic::client::Grpc::new(channel);
+    grpc.ready().await.unwrap();
+    let path = "/qedgix.v1.PolicyService/ListPolicies".parse().unwrap();
+    assert!(grpc.server_streaming(request, path, Raw).await.is_ok());
+}

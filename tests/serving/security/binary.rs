@@ -1,0 +1,330 @@
+//! The program itself: `qedgix keys` beside a running server, commands that show keys and certificates, SIGHUP, and logs
+//! without secrets.
+
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::mpsc::{Receiver, channel};
+use std::time::Duration;
+
+use qedgix::wire::v1;
+use qedgix::wire::v1::policy_service_client::PolicyServiceClient;
+use serde_json::Value;
+
+use super::super::harness::*;
+use super::{signed, tls};
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_qedgix");
+
+/// A server on free ports that logs everything; killed when dropped.
+struct Process {
+    child: Child,
+    endpoints: Value,
+    dir: tempfile::TempDir,
+    lines: Receiver<String>,
+    log: Vec<String>,
+}
+
+impl Process {
+    fn start(dir: tempfile::TempDir, flags: &[&str]) -> Self {
+        let mut child = Command::new(PROGRAM)
+            .args(["serve", "--grpc-addr", "127.0.0.1:0", "--http-addr", "127.0.0.1:0", "--data-dir"])
+            .arg(dir.path())
+            .args(flags)
+            .env("QEDGIX_LOG", "trace")
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let (sender, lines) = channel();
+        let log = BufReader::new(child.stderr.take().unwrap());
+        std::thread::spawn(move || log.lines().map_while(Result::ok).try_for_each(|line| sender.send(line)));
+        let mut process = Self { child, endpoints: Value::Null, dir, lines, log: Vec::new() };
+        process.says("serving");
+        let text = std::fs::read_to_string(process.dir.path().join("endpoints.json")).unwrap();
+        process.endpoints = serde_json::from_str(&text).unwrap();
+        process
+    }
+
+    /// Waits until the log says this.
+    fn says(&mut self, words: &str) {
+        loop {
+            let line = self.lines.recv_timeout(Duration::from_secs(60)).unwrap_or_else(|_| panic!("{words}: {:#?}", self.log));
+            let found = line.contains(words);
+            self.log.push(line);
+            if found {
+                return;
+            }
+        }
+    }
+
+    fn address(&self, of: &str) -> &str {
+        self.endpoints[of].as_str().unwrap()
+    }
+
+    fn signal(&self, name: &str) {
+        assert!(Command::new("kill").args([&format!("-{name}"), &self.child.id().to_string()]).status().unwrap().success());
+    }
+
+    /// Ends it and returns all that it said.
+    fn end(mut self) -> String {
+        self.signal("TERM");
+        assert!(self.child.wait().unwrap().success());
+        let rest: Vec<String> = self.lines.iter().collect();
+        self.log.extend(rest);
+        self.log.join("\n")
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn run(words: &[&str], key: Option<&str>) -> Output {
+    let mut command = Command::new(PROGRAM);
+    command.args(words).env("QEDGIX_LOG", "trace");
+    if let Some(key) = key {
+        command.env("QEDGIX_API_KEY", key);
+    }
+    command.output().unwrap()
+}
+
+/// What a command that goes well prints.
+fn printed(words: &[&str], key: Option<&str>) -> String {
+    let output = run(words, key);
+    assert!(output.status.success(), "{words:?}: {}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).unwrap().trim_end().to_owned()
+}
+
+/// Both outputs of a command that fails.
+fn failed(words: &[&str], key: Option<&str>) -> String {
+    let output = run(words, key);
+    assert!(!output.status.success(), "{words:?}");
+    String::from_utf8([output.stdout, output.stderr].concat()).unwrap()
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+#[test]
+fn keys_are_made_listed_rotated_and_revoked() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = dir.path().join("new");
+    fn in_order<'a>(data: &'a Path, words: &[&'a str]) -> Vec<&'a str> {
+        [&["keys", "--data-dir", text(data)], words].concat()
+    }
+    let nothing = failed(&in_order(&data, &["list"]), None);
+    assert!(nothing.contains("--data-dir") && !data.exists(), "{nothing}");
+    let key = printed(
+        &in_order(&data, &["create", "--name", "my fleet", "--scopes", "read,act", "--expires", "90d", "--rate", "500"]),
+        None,
+    );
+    assert!(key.starts_with("qdx_") && key.len() == 58 && !key.contains('\n'), "{key}");
+    let table = printed(&in_order(&data, &["list"]), None);
+    let id = &key[4..14];
+    for word in [id, "my fleet", "read,act", "active", "500/s"] {
+        assert!(table.contains(word), "{word}: {table}");
+    }
+    let list = || -> Value { serde_json::from_str(&printed(&in_order(&data, &["list", "--json"]), None)).unwrap() };
+    assert_eq!(list()["keys"][0]["scopes"], serde_json::json!(["read", "act"]));
+    let rotated: Value = serde_json::from_str(&printed(&in_order(&data, &["rotate", id, "--json"]), None)).unwrap();
+    assert_eq!(rotated["name"], "my fleet");
+    assert_ne!(rotated["key"], key);
+    printed(&in_order(&data, &["revoke", rotated["key"].as_str().unwrap()]), None);
+    let states: Vec<Value> = list()["keys"].as_array().unwrap().iter().map(|key| key["state"].clone()).collect();
+    assert_eq!(states, ["expired", "revoked"]);
+    for (wrong, named) in [
+        (&["create", "--name", "k", "--scopes", "all"][..], "read, act, jobs and admin"),
+        (&["create", "--name", "k", "--scopes", "read", "--expires", "90"], "90d"),
+        (&["create", "--name", "k", "--scopes", "read", "--rate", "0"], "rate: 0"),
+        (&["create", "--name", "", "--scopes", "read"], "name"),
+        (&["revoke", "0000000000"], "no API key"),
+    ] {
+        let told = failed(&in_order(&data, wrong), None);
+        assert!(told.contains(named), "{told}");
+    }
+    let all = format!("{table}{}", list());
+    assert!(!all.contains(&key[15..]) && !all.contains(&rotated["key"].as_str().unwrap()[15..]), "{all}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn no_secret_is_logged_shown_or_repeated() {
+    let dir = tempfile::tempdir().unwrap();
+    let create = |scopes| printed(&["keys", "create", "--name", "k", "--scopes", scopes, "--data-dir", text(dir.path())], None);
+    let (admin, limited) = (create("admin"), create("jobs"));
+    let wrong = format!("{}x", &admin[..admin.len() - 1]);
+    let process = Process::start(dir, &[]);
+    let (http, grpc) = (process.address("http").to_owned(), process.address("grpc").to_owned());
+    let mut told = String::new();
+
+    let client = reqwest::Client::new();
+    for (key, status) in [(&admin, 200), (&limited, 403), (&wrong, 401)] {
+        let get = || client.get(format!("http://{http}/v1/policies"));
+        for request in [get().bearer_auth(key), get().header("x-api-key", key)] {
+            let answer = request.send().await.unwrap();
+            assert_eq!(answer.status(), status);
+            told += &[format!("{:?}", answer.headers()), answer.text().await.unwrap()].concat();
+        }
+        let mut client = PolicyServiceClient::connect(format!("http://{grpc}")).await.unwrap();
+        let answer = client.list_policies(signed(key, v1::ListPoliciesRequest::default())).await;
+        assert_eq!(answer.is_ok(), status == 200);
+        told.extend([format!("{answer:?}")]);
+    }
+
+    let evaluate = ["evaluate", "--policy", "sweep", "--episodes", "1", "--slots", "3", "--server", &grpc];
+    told += &printed(&evaluate, Some(&admin));
+    told += &failed(&evaluate, Some(&wrong));
+    assert!(told.contains("is not known here"), "{told}");
+    told += &failed(&evaluate, Some(&limited));
+    assert!(told.contains("the scope act"), "{told}");
+    let train = ["train", "--server", &http, "--steps", "100"];
+    told += &failed(&train, Some(&wrong));
+    told += &failed(&train, Some(&format!("{admin}\u{1}")));
+    assert!(told.contains("--api-key: this is not an API key"), "{told}");
+    for help in [["train", "--help"], ["evaluate", "--help"], ["keys", "--help"]] {
+        told += &printed(&help, Some(&admin));
+    }
+    told += &printed(&["bench", "act", "--help"], Some(&admin));
+    assert!(told.contains("QEDGIX_API_KEY"), "{told}");
+
+    let log = process.end();
+    let id = &admin[4..14];
+    assert!(log.contains("TRACE") && log.contains(id), "the log says everything, and who asked");
+    for key in [&admin, &limited, &wrong] {
+        let secret = &key[15..];
+        assert!(!told.contains(secret), "{told}");
+        assert!(!log.contains(secret), "{}", log.lines().find(|line| line.contains(secret)).unwrap());
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_job_is_trained_by_a_server_that_asks_for_keys_and_certificates() {
+    let dir = tempfile::tempdir().unwrap();
+    let (ours, clients) = (tls::Authority::new("ours"), tls::Authority::new("clients"));
+    let files = tls::write(dir.path(), &ours.issue(), Some(&clients));
+    let own = clients.issue();
+    let path = |name: &str, text: &str| -> PathBuf {
+        std::fs::write(dir.path().join(name), text).unwrap();
+        dir.path().join(name)
+    };
+    let (ca, cert, key) = (path("ca.pem", &ours.pem()), path("own.pem", &own.cert), path("own.key", &own.key));
+    let certificates = ["--ca-cert", text(&ca), "--client-cert", text(&cert), "--client-key", text(&key)];
+    let server = Server::with(|config| {
+        config.tls = Some(files);
+        config.max_connections = 4;
+        config.worker = Some(PROGRAM.into());
+    })
+    .await;
+    let trainer = super::key(&server, "read,jobs").await;
+    let pilot = super::key(&server, "act").await;
+    let rest = format!("https://localhost:{}", server.endpoints.http.port());
+    let run = move |words: Vec<String>, key: String| {
+        let words: Vec<&str> = words.iter().map(String::as_str).collect();
+        printed(&words, Some(&key))
+    };
+    let words = |first: &[&str]| -> Vec<String> { first.iter().chain(&certificates).map(|word| (*word).to_owned()).collect() };
+    let train = words(&[
+        "train",
+        "--algorithm",
+        "vdn",
+        "--uavs",
+        "2",
+        "--users",
+        "2",
+        "--slots",
+        "10",
+        "--steps",
+        "400",
+        "--threads",
+        "1",
+        "--set",
+        "training.envs=2",
+        "--set",
+        "training.batch=2",
+        "--set",
+        "training.buffer=20",
+        "--set",
+        "training.eval_every=200",
+        "--set",
+        "training.eval_episodes=2",
+        "--server",
+        &rest,
+        "--name",
+        "over-tls",
+    ]);
+    let trained = tokio::task::spawn_blocking({
+        let (run, train, trainer) = (run, train.clone(), trainer.clone());
+        move || run(train, trainer)
+    });
+    assert!(soon(trained).await.unwrap().ends_with("policy over-tls:1"));
+    let fly = words(&[
+        "evaluate",
+        "--policy",
+        "over-tls:1",
+        "--uavs",
+        "2",
+        "--users",
+        "2",
+        "--slots",
+        "10",
+        "--episodes",
+        "1",
+        "--server",
+        &format!("127.0.0.1:{}", server.endpoints.grpc.port()),
+    ]);
+    let flown = tokio::task::spawn_blocking(move || run(fly, pilot));
+    assert!(soon(flown).await.unwrap().contains("over-tls:1"));
+    // Without a certificate, or with a key that opens something else, nothing is.
+    let told = tokio::task::spawn_blocking(move || {
+        let bare: Vec<&str> =
+            train.iter().map(String::as_str).filter(|word| !word.contains("client-") && !word.contains("own.")).collect();
+        failed(&bare, Some(&trainer))
+    });
+    assert!(soon(told).await.unwrap().contains("cannot reach https://localhost"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn sighup_reads_the_certificates_again() {
+    let dir = tempfile::tempdir().unwrap();
+    let [first, second] = ["first", "second"].map(tls::Authority::new);
+    let [early, late] = ["early", "late"].map(tls::Authority::new);
+    let (of_early, of_late) = (early.issue(), late.issue());
+    let files = tls::write(dir.path(), &first.issue(), Some(&early));
+    let (cert, key, client_ca) = (text(&files.cert), text(&files.key), text(files.client_ca.as_ref().unwrap()));
+    let flags = ["--tls-cert", cert, "--tls-key", key, "--tls-client-ca", client_ca];
+    let mut process = Process::start(tempfile::tempdir().unwrap(), &flags);
+    let url = format!("https://{}/livez", process.address("http"));
+    let old = tls::caller(&first, Some(&of_early));
+    assert_eq!(tls::get(&old, false, &url).await.unwrap().0, 200);
+    let open = tls::channel(&old, process.address("grpc")).await.unwrap();
+    tls::policies(open.clone()).await.unwrap();
+
+    let fresh = second.issue();
+    tls::write(dir.path(), &fresh, Some(&late));
+    process.signal("HUP");
+    process.says("certificates were read again");
+    let new = tls::caller(&second, Some(&of_late));
+    assert_eq!(tls::get(&new, false, &url).await.unwrap().0, 200);
+    tls::policies(tls::channel(&new, process.address("grpc")).await.unwrap()).await.unwrap();
+    // Who was connected goes on; who comes with what was good before does not get in.
+    tls::policies(open.clone()).await.unwrap();
+    assert!(tls::get(&tls::caller(&first, Some(&of_late)), false, &url).await.is_err());
+    assert!(tls::get(&tls::caller(&second, Some(&of_early)), false, &url).await.is_err());
+
+    for (file, garbage) in [(&files.key, "no key"), (&files.cert, ""), (files.client_ca.as_ref().unwrap(), "nobody")] {
+        let good = std::fs::read(file).unwrap();
+        std::fs::write(file, garbage).unwrap();
+        process.signal("HUP");
+        process.says("certificates were not read again");
+        assert!(process.log.last().unwrap().contains(text(file)), "{:?}", process.log.last());
+        assert_eq!(tls::get(&new, false, &url).await.unwrap().0, 200);
+        std::fs::write(file, good).unwrap();
+    }
+    tls::policies(open).await.unwrap();
+    let log = process.end();
+    assert!(!log.contains("PRIVATE KEY") && !log.contains(fresh.key.lines().nth(1).unwrap()));
+}

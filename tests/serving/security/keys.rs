@@ -1,0 +1,192 @@
+//! Keys begin and end, the server notices, and what it asked for once it asks for ever.
+
+use std::time::Duration;
+
+use qedgix::service::keys;
+use qedgix::wire::v1;
+use tonic::Code;
+
+use super::super::harness::*;
+use super::{key, make, refresh, signed};
+
+/// What `GET /v1/policies` answers: status and detail.
+async fn ask(server: &Server, key: &str) -> (u16, String) {
+    let answer = reqwest::Client::new().get(server.url("/v1/policies")).bearer_auth(key).send().await.unwrap();
+    let (status, body) = (answer.status().as_u16(), answer.json::<serde_json::Value>().await.unwrap());
+    (status, body["detail"].as_str().unwrap_or("").to_owned())
+}
+
+#[tokio::test]
+async fn keys_end_and_the_server_never_falls_open() {
+    let server = Server::start().await;
+    let forever = make(&server, "admin", |_| {}).await;
+    let short = make(&server, "read", |new| new.lifetime = Some(Duration::from_secs(3600))).await;
+    assert_eq!(ask(&server, &short.key).await.0, 200);
+    server.pass(3599);
+    assert_eq!(ask(&server, &short.key).await.0, 200);
+    server.pass(1);
+    assert_eq!(ask(&server, &short.key).await, (401, "this API key has expired".into()));
+    keys::revoke(&server.app.store, &forever.info.id, server.app.clock.now()).await.unwrap();
+    refresh(&server).await;
+    assert_eq!(ask(&server, &forever.key).await, (401, "this API key was revoked".into()));
+    // Nobody has a good key now, and nobody gets in.
+    assert!(ask(&server, "").await.1.starts_with("an API key is needed"));
+    assert_eq!(reqwest::get(server.url("/v1/policies")).await.unwrap().status(), 401);
+    let mut client = server.grpc().await;
+    assert_eq!(refused(client.list_policies(v1::ListPoliciesRequest::default()).await).0, Code::Unauthenticated);
+    // Not even when somebody empties the table under a running server; what was in it is over.
+    let last = key(&server, "read").await;
+    assert_eq!(ask(&server, &last).await.0, 200);
+    let database = format!("sqlite://{}", server.dir.path().join("qedgix.sqlite").display());
+    let mut other = <sqlx::SqliteConnection as sqlx::Connection>::connect(&database).await.unwrap();
+    sqlx::query("DELETE FROM api_keys").execute(&mut other).await.unwrap();
+    refresh(&server).await;
+    assert_eq!(reqwest::get(server.url("/v1/policies")).await.unwrap().status(), 401);
+    assert_eq!(ask(&server, &last).await.0, 401);
+}
+
+#[tokio::test]
+async fn what_is_almost_a_key_is_none() {
+    let server = Server::start().await;
+    let (good, other) = (key(&server, "read").await, key(&server, "read").await);
+    let (head, secret) = good.rsplit_once('_').unwrap();
+    let last = if good.ends_with('x') { 'y' } else { 'x' };
+    for wrong in [
+        String::new(),
+        secret.to_owned(),
+        format!("{head}_"),
+        format!("{good}x"),
+        format!("{}{last}", &good[..good.len() - 1]),
+        good.to_uppercase(),
+        // The id of one with the secret of another.
+        format!("{head}_{}", other.rsplit_once('_').unwrap().1),
+        format!("qdx_{}_{secret}", "0".repeat(10)),
+        "x".repeat(10_000),
+    ] {
+        assert_eq!(ask(&server, &wrong).await.0, 401, "{wrong}");
+    }
+    assert_eq!(ask(&server, &good).await.0, 200);
+}
+
+#[tokio::test]
+async fn a_running_server_notices_by_itself() {
+    let server = Server::start().await;
+    assert_eq!(ask(&server, "").await.0, 200, "without keys everybody on this machine may ask");
+    // Another process would do the same: a database of its own on the same file.
+    let store = keys::open(server.dir.path(), false).await.unwrap();
+    let new = keys::NewKey { name: "k".into(), scopes: "read".parse().unwrap(), lifetime: None, rate: None, burst: None };
+    let created = keys::create(&store, new, server.app.clock.now()).await.unwrap();
+    let until = async |status| {
+        while ask(&server, &created.key).await.0 != status || ask(&server, "").await.0 != 401 {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    soon(until(200)).await;
+    keys::revoke(&store, &created.key, server.app.clock.now()).await.unwrap();
+    soon(until(401)).await;
+}
+
+#[tokio::test]
+async fn a_stream_ends_with_its_key() {
+    let server = Server::start().await;
+    let created = make(&server, "act", |_| {}).await;
+    let mut client = server.grpc().await;
+    let (ask, asked) = tokio::sync::mpsc::channel(1);
+    let stream = tokio_stream::wrappers::ReceiverStream::new(asked);
+    let mut answers = client.act_stream(signed(&created.key, stream)).await.unwrap().into_inner();
+    let slot = || held("sweep", bytes::Bytes::new(), scene(2, 2, 0));
+    ask.send(slot()).await.unwrap();
+    let first = soon(answers.message()).await.unwrap().unwrap();
+    assert!(matches!(first.result, Some(v1::act_result::Result::Response(_))), "{first:?}");
+    keys::revoke(&server.app.store, &created.info.id, server.app.clock.now()).await.unwrap();
+    refresh(&server).await;
+    ask.send(slot()).await.unwrap();
+    let status = soon(answers.message()).await.unwrap_err();
+    assert_eq!((status.code(), status.message()), (Code::Unauthenticated, "this API key was revoked"));
+}
+
+#[tokio::test]
+async fn rotation_keeps_what_a_key_is_and_ends_the_old_one() {
+    let server = Server::start().await;
+    let change = |new: &mut keys::NewKey| (new.lifetime, new.rate) = (Some(Duration::from_secs(1000)), Some(50.0));
+    let old = make(&server, "read", change).await;
+    server.pass(400);
+    let (store, now) = (&server.app.store, server.app.clock.now());
+    let new = keys::rotate(store, &old.key, Duration::from_secs(60), now).await.unwrap();
+    assert_ne!(new.info.id, old.info.id);
+    assert_eq!((new.info.scopes, new.info.rate, &new.info.name), (old.info.scopes, Some(50.0), &old.info.name));
+    assert_eq!(new.info.expires_at.unwrap().duration_since(now).as_secs(), 1000);
+    refresh(&server).await;
+    assert_eq!([ask(&server, &old.key).await.0, ask(&server, &new.key).await.0], [200, 200]);
+    server.pass(60);
+    assert_eq!([ask(&server, &old.key).await.0, ask(&server, &new.key).await.0], [401, 200]);
+    // It does not live longer for being rotated again, and one that is over is not rotated.
+    let again = keys::rotate(store, &new.info.id, Duration::from_secs(1_000_000), server.app.clock.now()).await.unwrap();
+    let list = keys::list(store, server.app.clock.now()).await.unwrap();
+    let ends: Vec<_> = list.iter().map(|key| (key.id.as_str(), key.state, key.expires_at)).collect();
+    assert!(ends.contains(&(&new.info.id, "active", new.info.expires_at)), "{ends:?}");
+    assert!(ends.contains(&(&old.info.id, "expired", Some(now + Duration::from_secs(60)))), "{ends:?}");
+    assert_eq!(again.info.name, old.info.name);
+    let over = keys::rotate(store, &old.info.id, Duration::ZERO, server.app.clock.now()).await;
+    assert_eq!(over.err().unwrap().code(), "wrong_state");
+    assert_eq!(keys::revoke(store, "nobody", now).await.err().unwrap().code(), "not_found");
+}
+
+#[tokio::test]
+async fn names_and_numbers_of_keys_are_checked() {
+    let server = Server::start().await;
+    let refused = async |change: fn(&mut keys::NewKey)| {
+        let mut new = keys::NewKey { name: "k".into(), scopes: "read".parse().unwrap(), lifetime: None, rate: None, burst: None };
+        change(&mut new);
+        match keys::create(&server.app.store, new, server.app.clock.now()).await {
+            Err(qedgix::service::Error::Invalid(error)) => error.field,
+            Err(other) => panic!("{other}"),
+            Ok(_) => panic!("this has to be refused"),
+        }
+    };
+    assert_eq!(refused(|new| new.name = String::new()).await, "name");
+    assert_eq!(refused(|new| new.name = "x".repeat(129)).await, "name");
+    assert_eq!(refused(|new| new.name = "a\nb".into()).await, "name");
+    assert_eq!(refused(|new| new.rate = Some(f64::NAN)).await, "rate");
+    assert_eq!(refused(|new| new.burst = Some(0.0)).await, "burst");
+    assert_eq!(refused(|new| new.lifetime = Some(Duration::from_secs(u64::MAX / 4))).await, "expires");
+    assert_eq!(reqwest::get(server.url("/v1/policies")).await.unwrap().status(), 200, "none was made");
+}
+
+#[tokio::test]
+async fn the_last_use_is_kept_and_a_restart_changes_nothing() {
+    let mut server = Server::start().await;
+    let created = make(&server, "read", |_| {}).await;
+    server.pass(5000);
+    assert_eq!(ask(&server, &created.key).await.0, 200);
+    let used = async |server: &Server| keys::list(&server.app.store, server.app.clock.now()).await.unwrap()[0].last_used_at;
+    assert_eq!(used(&server).await, None, "no request writes");
+    server.app.keys.keep_last_uses(&server.app.store).await.unwrap();
+    assert_eq!(used(&server).await, Some(server.app.clock.now()));
+    server.pass(5);
+    assert_eq!(ask(&server, &created.key).await.0, 200);
+    let last = server.app.clock.now();
+    server.begin_stop();
+    let server = server.restarted().await;
+    assert_eq!(used(&server).await, Some(last), "it is kept at the end");
+    assert_eq!(reqwest::get(server.url("/v1/policies")).await.unwrap().status(), 401);
+    assert_eq!(ask(&server, &created.key).await.0, 200);
+}
+
+#[tokio::test]
+async fn the_database_holds_no_secret() {
+    let server = Server::start().await;
+    let created = make(&server, "read", |new| new.name = "findable".into()).await;
+    assert_eq!(ask(&server, &created.key).await.0, 200);
+    let secret = created.key.rsplit_once('_').unwrap().1;
+    let mut bytes = Vec::new();
+    for file in std::fs::read_dir(server.dir.path()).unwrap() {
+        bytes.extend(std::fs::read(file.unwrap().path()).unwrap());
+    }
+    let found = |text: &[u8]| bytes.windows(text.len()).any(|window| window == text);
+    assert!(found(b"findable") && found(created.info.id.as_bytes()), "this is where keys are");
+    assert!(found(&<sha2::Sha256 as sha2::Digest>::digest(secret)), "and their digests");
+    for part in secret.as_bytes().chunks_exact(12) {
+        assert!(!found(part));
+    }
+}

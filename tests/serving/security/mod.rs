@@ -1,0 +1,38 @@
+//! Who gets in: keys and scopes, rates, TLS, limits on connections; and that no secret is told to anybody.
+
+mod access;
+mod binary;
+mod connections;
+mod keys;
+mod rates;
+mod tls;
+
+use qedgix::service::keys::{Created, NewKey, create};
+use tonic::Request;
+
+use super::harness::Server;
+
+/// A key of a server in this process, which knows it when this returns.
+async fn make(server: &Server, scopes: &str, change: impl FnOnce(&mut NewKey)) -> Created {
+    let mut new = NewKey { name: "of a test".into(), scopes: scopes.parse().unwrap(), lifetime: None, rate: None, burst: None };
+    change(&mut new);
+    let created = create(&server.app.store, new, server.app.clock.now()).await.unwrap();
+    refresh(server).await;
+    created
+}
+
+async fn key(server: &Server, scopes: &str) -> String {
+    make(server, scopes, |_| {}).await.key
+}
+
+/// What the server does every second.
+async fn refresh(server: &Server) {
+    server.app.keys.refresh(&server.app.store).await.unwrap();
+}
+
+/// A gRPC request that shows a key.
+fn signed<T>(key: &str, message: T) -> Request<T> {
+    let mut request = Request::new(message);
+    request.metadata_mut().insert("authorization", format!("Bearer {key}").parse().unwrap());
+    request
+}

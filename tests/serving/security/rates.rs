@@ -1,0 +1,84 @@
+//! How often a key may ask: per key, on both transports, slot by slot in batches and streams.
+
+use bytes::Bytes;
+use qedgix::wire::v1;
+use tonic::Code;
+use v1::act_result::Result as Told;
+
+use super::super::harness::*;
+use super::{key, make, signed};
+
+fn slot() -> v1::ActRequest {
+    held("sweep", Bytes::new(), scene(2, 2, 0))
+}
+
+async fn rest(server: &Server, key: &str) -> (u16, Option<String>) {
+    let answer = reqwest::Client::new().get(server.url("/v1/policies")).bearer_auth(key).send().await.unwrap();
+    let retry = answer.headers().get("retry-after").map(|value| value.to_str().unwrap().to_owned());
+    (answer.status().as_u16(), retry)
+}
+
+#[tokio::test]
+async fn a_key_that_asks_too_often_waits_and_others_do_not() {
+    let server = Server::start().await;
+    let slow = make(&server, "read,act", |new| (new.rate, new.burst) = (Some(0.5), Some(3.0))).await.key;
+    let free = key(&server, "read,act").await;
+    let mut client = server.grpc().await;
+    assert_eq!(rest(&server, &slow).await.0, 200);
+    assert_eq!(rest(&server, &slow).await.0, 200);
+    client.act(signed(&slow, slot())).await.unwrap();
+    assert_eq!(rest(&server, &slow).await, (429, Some("2".into())));
+    let status = client.act(signed(&slow, slot())).await.unwrap_err();
+    assert_eq!(status.code(), Code::ResourceExhausted);
+    assert_eq!(status.metadata().get("retry-after").unwrap(), "2");
+    assert_eq!(status.metadata().get("qedgix-code").unwrap(), "resource_exhausted");
+    assert!(status.message().contains("limited to 0.5 requests per second"), "{}", status.message());
+    assert_eq!(rest(&server, &free).await.0, 200);
+    server.pass(1);
+    assert_eq!(rest(&server, &slow).await, (429, Some("1".into())));
+    server.pass(1);
+    assert_eq!(rest(&server, &slow).await.0, 200);
+    assert_eq!(rest(&server, &slow).await.0, 429);
+}
+
+#[tokio::test]
+async fn the_server_has_a_rate_for_keys_without_one() {
+    let server = Server::with(|config| (config.key_rate, config.key_burst) = (Some(1.0), Some(2.0))).await;
+    let (usual, own) = (key(&server, "read").await, make(&server, "read", |new| new.rate = Some(100.0)).await.key);
+    let all = async |key: &str| {
+        let mut statuses = Vec::new();
+        for _ in 0..4 {
+            statuses.push(rest(&server, key).await.0);
+        }
+        statuses
+    };
+    assert_eq!(all(&usual).await, [200, 200, 429, 429]);
+    assert_eq!(all(&own).await, [200; 4]);
+}
+
+#[tokio::test]
+async fn batches_and_streams_count_their_slots() {
+    let server = Server::start().await;
+    let mut client = server.grpc().await;
+    let limited = async || make(&server, "act", |new| (new.rate, new.burst) = (Some(1.0), Some(3.0))).await.key;
+    // A batch is answered whole, and what it cost is waited for.
+    let batch = limited().await;
+    let answer = client.act_batch(signed(&batch, v1::ActBatchRequest { requests: vec![slot(); 6] })).await.unwrap();
+    assert!(answer.into_inner().results.iter().all(|result| matches!(result.result, Some(Told::Response(_)))));
+    assert_eq!(client.act(signed(&batch, slot())).await.unwrap_err().metadata().get("retry-after").unwrap(), "4");
+    server.pass(4);
+    client.act(signed(&batch, slot())).await.unwrap();
+
+    // A stream counts when it begins, then each slot; one that comes too soon is refused on its own.
+    let stream = limited().await;
+    let slots = tokio_stream::iter(vec![slot(); 4]);
+    let mut answers = client.act_stream(signed(&stream, slots)).await.unwrap().into_inner();
+    let mut told = Vec::new();
+    while let Some(answer) = soon(answers.message()).await.unwrap() {
+        told.push(match answer.result.unwrap() {
+            Told::Response(_) => Code::Ok,
+            Told::Error(error) => Code::from(error.status),
+        });
+    }
+    assert_eq!(told, [Code::Ok, Code::Ok, Code::ResourceExhausted, Code::ResourceExhausted]);
+}

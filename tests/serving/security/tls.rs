@@ -1,0 +1,217 @@
+//! TLS on both addresses: who is trusted, what is spoken inside, what else may come along.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use axum::body::Body;
+use axum::http::{Request, Uri, Version};
+use hyper_rustls::HttpsConnectorBuilder;
+use hyper_util::client::legacy::Client;
+use hyper_util::rt::TokioExecutor;
+use qedgix::config::{Config, TlsFiles};
+use qedgix::server::Listeners;
+use qedgix::wire::v1;
+use qedgix::wire::v1::policy_service_client::PolicyServiceClient;
+use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, DnType, IsCa, KeyPair};
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use rustls::{ClientConfig, RootCertStore};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+use tonic::transport::{Channel, Endpoint};
+
+use super::super::harness::*;
+use super::{key, signed};
+
+/// Issues certificates.
+pub struct Authority(CertifiedIssuer<'static, KeyPair>);
+
+/// A certificate and its key, in PEM.
+pub struct Identity {
+    pub cert: String,
+    pub key: String,
+}
+
+impl Authority {
+    pub fn new(name: &str) -> Self {
+        let mut params = CertificateParams::new(Vec::new()).unwrap();
+        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        params.distinguished_name.push(DnType::CommonName, name);
+        Self(CertifiedIssuer::self_signed(params, KeyPair::generate().unwrap()).unwrap())
+    }
+
+    pub fn pem(&self) -> String {
+        self.0.pem()
+    }
+
+    /// For this machine, and for callers.
+    pub fn issue(&self) -> Identity {
+        let key = KeyPair::generate().unwrap();
+        let params = CertificateParams::new(vec!["127.0.0.1".into(), "localhost".into()]).unwrap();
+        Identity { cert: params.signed_by(&key, &self.0).unwrap().pem(), key: key.serialize_pem() }
+    }
+}
+
+/// Files for a server, as flags name them.
+pub fn write(dir: &Path, identity: &Identity, client_ca: Option<&Authority>) -> TlsFiles {
+    let file = |name: &str, text: &str| -> PathBuf {
+        std::fs::write(dir.join(name), text).unwrap();
+        dir.join(name)
+    };
+    TlsFiles {
+        cert: file("cert.pem", &identity.cert),
+        key: file("key.pem", &identity.key),
+        client_ca: client_ca.map(|authority| file("clients.pem", &authority.pem())),
+    }
+}
+
+/// A caller that trusts an authority and may show a certificate.
+pub fn caller(trusted: &Authority, identity: Option<&Identity>) -> ClientConfig {
+    let mut roots = RootCertStore::empty();
+    roots.add(CertificateDer::from_pem_slice(trusted.pem().as_bytes()).unwrap()).unwrap();
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let builder = ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions().unwrap();
+    let builder = builder.with_root_certificates(roots);
+    let Some(identity) = identity else { return builder.with_no_client_auth() };
+    let certs = vec![CertificateDer::from_pem_slice(identity.cert.as_bytes()).unwrap()];
+    builder.with_client_auth_cert(certs, PrivateKeyDer::from_pem_slice(identity.key.as_bytes()).unwrap()).unwrap()
+}
+
+/// `GET` over TLS: status and the version of HTTP that was agreed on.
+pub async fn get(caller: &ClientConfig, http2: bool, url: &str) -> Result<(u16, Version), String> {
+    let builder = HttpsConnectorBuilder::new().with_tls_config(caller.clone()).https_only();
+    let connector = if http2 { builder.enable_all_versions().build() } else { builder.enable_http1().build() };
+    let client = Client::builder(TokioExecutor::new()).build(connector);
+    let request = Request::get(url).body(Body::empty()).unwrap();
+    let answer = soon(client.request(request)).await.map_err(|e| format!("{e:?}"))?;
+    Ok((answer.status().as_u16(), answer.version()))
+}
+
+pub async fn channel(caller: &ClientConfig, address: impl std::fmt::Display) -> Result<Channel, String> {
+    let connector = HttpsConnectorBuilder::new().with_tls_config(caller.clone()).https_only().enable_http2().build();
+    let uri: Uri = format!("https://{address}").parse().unwrap();
+    let connected = soon(Endpoint::from(uri).connect_with_connector(connector)).await;
+    connected.map_err(|e| format!("{e:?}"))
+}
+
+/// Asks for policies; a handshake that the server breaks off is noticed here at the latest.
+pub async fn policies(channel: Channel) -> Result<usize, String> {
+    let mut client = PolicyServiceClient::new(channel);
+    let answer = soon(client.list_policies(v1::ListPoliciesRequest::default())).await;
+    answer.map(|answer| answer.into_inner().policies.len()).map_err(|status| format!("{status:?}"))
+}
+
+async fn over_tls(dir: &Path, authority: &Authority, clients: Option<&Authority>) -> Server {
+    let files = write(dir, &authority.issue(), clients);
+    Server::with(|config| config.tls = Some(files)).await
+}
+
+#[tokio::test]
+async fn both_addresses_speak_tls() {
+    let (dir, authority) = (tempfile::tempdir().unwrap(), Authority::new("ours"));
+    let server = over_tls(dir.path(), &authority, None).await;
+    let url = format!("https://localhost:{}/v1/policies", server.endpoints.http.port());
+    let trusting = caller(&authority, None);
+    assert_eq!(get(&trusting, false, &url).await, Ok((200, Version::HTTP_11)));
+    assert_eq!(get(&trusting, true, &url).await, Ok((200, Version::HTTP_2)));
+    assert!(policies(channel(&trusting, server.endpoints.grpc).await.unwrap()).await.unwrap() > 5);
+    // Old TLS, new TLS.
+    for version in [&rustls::version::TLS12, &rustls::version::TLS13] {
+        let mut roots = RootCertStore::empty();
+        roots.add(CertificateDer::from_pem_slice(authority.pem().as_bytes()).unwrap()).unwrap();
+        let builder = ClientConfig::builder_with_provider(Arc::new(rustls::crypto::ring::default_provider()));
+        let config = builder.with_protocol_versions(&[version]).unwrap().with_root_certificates(roots).with_no_client_auth();
+        assert_eq!(get(&config, false, &url).await, Ok((200, Version::HTTP_11)));
+    }
+    // A caller that trusts somebody else is told by its own side.
+    let stranger = caller(&Authority::new("theirs"), None);
+    assert!(get(&stranger, false, &url).await.unwrap_err().contains("UnknownIssuer"));
+    assert!(channel(&stranger, server.endpoints.grpc).await.unwrap_err().contains("UnknownIssuer"));
+    // Keys work inside as they do outside.
+    let admin = key(&server, "admin").await;
+    assert_eq!(get(&trusting, true, &url).await.unwrap().0, 401);
+    let mut client = PolicyServiceClient::new(channel(&trusting, server.endpoints.grpc).await.unwrap());
+    client.list_policies(signed(&admin, v1::ListPoliciesRequest::default())).await.unwrap();
+}
+
+#[tokio::test]
+async fn callers_show_certificates_where_they_are_asked_to() {
+    let (dir, ours, clients) = (tempfile::tempdir().unwrap(), Authority::new("ours"), Authority::new("clients"));
+    let server = over_tls(dir.path(), &ours, Some(&clients)).await;
+    let url = format!("https://localhost:{}/livez", server.endpoints.http.port());
+    let (known, unknown) = (clients.issue(), ours.issue());
+    let with = |identity| caller(&ours, identity);
+    assert_eq!(get(&with(Some(&known)), false, &url).await.map(|answer| answer.0), Ok(200));
+    let connected = channel(&with(Some(&known)), server.endpoints.grpc).await.unwrap();
+    assert!(policies(connected).await.is_ok());
+    // Neither without one nor with one of somebody else; what is broken off is not the server.
+    for identity in [None, Some(&unknown)] {
+        assert!(get(&with(identity), false, &url).await.is_err());
+        let refused = match channel(&with(identity), server.endpoints.grpc).await {
+            Ok(channel) => policies(channel).await.map(drop),
+            Err(e) => Err(e),
+        };
+        assert!(refused.is_err());
+    }
+    assert_eq!(get(&with(Some(&known)), true, &url).await.map(|answer| answer.0), Ok(200));
+}
+
+/// Sends bytes to an address, and whatever comes back until the server closes.
+async fn send(address: std::net::SocketAddr, bytes: &[u8]) -> Vec<u8> {
+    let mut stream = TcpStream::connect(address).await.unwrap();
+    stream.write_all(bytes).await.unwrap();
+    let mut answer = Vec::new();
+    // A reset is an end as well.
+    let _ = soon(stream.read_to_end(&mut answer)).await;
+    answer
+}
+
+#[tokio::test]
+async fn what_is_no_tls_is_turned_away() {
+    let (dir, authority) = (tempfile::tempdir().unwrap(), Authority::new("ours"));
+    let server = over_tls(dir.path(), &authority, None).await;
+    for address in [server.endpoints.grpc, server.endpoints.http] {
+        for bytes in [&b"GET / HTTP/1.1\r\nhost: x\r\n\r\n"[..], b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", &[0; 1000], &[0x16; 5000]] {
+            let answer = send(address, bytes).await;
+            assert!(!answer.starts_with(b"HTTP/1.1 2"), "{answer:?}");
+        }
+    }
+    // And TLS sent to a server without it.
+    let plain = Server::start().await;
+    let trusting = caller(&authority, None);
+    assert!(get(&trusting, false, &format!("https://{}/livez", plain.endpoints.http)).await.is_err());
+    assert!(channel(&trusting, plain.endpoints.grpc).await.is_err());
+    assert_eq!(reqwest::get(plain.url("/livez")).await.unwrap().status(), 200);
+    let url = format!("https://{}/livez", server.endpoints.http);
+    assert_eq!(get(&trusting, false, &url).await.map(|answer| answer.0), Ok(200));
+}
+
+#[tokio::test]
+async fn files_that_cannot_be_used_are_named_with_their_flag() {
+    let dir = tempfile::tempdir().unwrap();
+    let (authority, other) = (Authority::new("ours"), Authority::new("others"));
+    let good = write(dir.path(), &authority.issue(), Some(&other));
+    let path = |name: &str| dir.path().join(name);
+    std::fs::write(path("empty.pem"), "").unwrap();
+    std::fs::write(path("garbage.pem"), "-----BEGIN CERTIFICATE-----\nqdx\n-----END CERTIFICATE-----\n").unwrap();
+    std::fs::write(path("other.pem"), authority.issue().key).unwrap();
+    type Change = fn(&mut TlsFiles, PathBuf);
+    let cases: [(&str, &str, Change); 7] = [
+        ("--tls-cert", "missing.pem", |files, path| files.cert = path),
+        ("--tls-cert", "empty.pem", |files, path| files.cert = path),
+        ("--tls-cert", "key.pem", |files, path| files.cert = path),
+        ("--tls-key", "cert.pem", |files, path| files.key = path),
+        ("--tls-key", "other.pem", |files, path| files.key = path),
+        ("--tls-client-ca", "missing.pem", |files, path| files.client_ca = Some(path)),
+        ("--tls-client-ca", "garbage.pem", |files, path| files.client_ca = Some(path)),
+    ];
+    for (flag, name, change) in cases {
+        let mut config = Config::new(dir.path());
+        (config.grpc_addr, config.http_addr) = (([127, 0, 0, 1], 0).into(), ([127, 0, 0, 1], 0).into());
+        let mut files = good.clone();
+        change(&mut files, path(name));
+        config.tls = Some(files);
+        let error = Listeners::bind(&config).await.unwrap_err().to_string();
+        assert!(error.starts_with(&format!("{flag}: {}", path(name).display())), "{error}");
+    }
+}
