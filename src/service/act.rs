@@ -9,7 +9,7 @@ use super::{App, Error};
 use crate::invalid::Invalid;
 use crate::policy::Slot;
 use crate::serving::{
-    Answered, Fleet, HeldState, LoadedPolicy, Observation, Outcome, PolicySpec, Seen, Session, Task, Timings, Turn, Which,
+    Answered, Fleet, HeldState, LoadedPolicy, Observation, Outcome, PolicySpec, Room, Seen, Session, Task, Timings, Turn, Which,
 };
 
 /// Observations of more nodes are prepared away from the threads that serve connections.
@@ -101,8 +101,8 @@ async fn in_session(app: &App, session: &Session, request: Request, deadline: Op
     let answered = match session.turn(&fleet, request.step, request.run_id.as_deref()).await? {
         Turn::Repeat(answered) => answered,
         Turn::Next(mut turn) => {
-            let memory = std::mem::take(&mut turn.memory);
-            let outcome = compute(app, Task { policy: policy.clone(), slot, step: turn.step, memory }, deadline).await?;
+            let (memory, room) = (std::mem::take(&mut turn.memory), std::mem::take(&mut turn.room));
+            let outcome = compute(app, Task::new(policy.clone(), slot, turn.step, memory, room), deadline).await?;
             turn.commit(outcome)
         }
     };
@@ -133,7 +133,7 @@ async fn with_held_state(app: &App, state: &[u8], request: Request, deadline: Op
         policy.policy.start(slot.uavs(), slot.users(), request.seed.unwrap_or(0), &mut memory);
         memory
     };
-    let outcome = compute(app, Task { policy: policy.clone(), slot, step, memory }, deadline).await?;
+    let outcome = compute(app, Task::new(policy.clone(), slot, step, memory, Room::default()), deadline).await?;
     let next = HeldState::new(policy.reference.digest, step.saturating_add(1), &fleet, outcome.memory);
     let (headings, q_values, timings) = (outcome.headings, outcome.q_values, outcome.timings);
     Ok(Answer { policy, uavs: fleet.uavs, order, step, headings, q_values, state: Some(next.encode()), timings })

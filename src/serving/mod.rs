@@ -17,7 +17,7 @@ mod sessions;
 mod table;
 
 pub use clock::Clock;
-pub use engine::{Engine, EngineConfig, Outcome, Task, Timings};
+pub use engine::{Engine, EngineConfig, Outcome, Room, Task, Timings};
 pub use environments::{
     Blueprint, CopyState, Environment, EnvironmentInfo, Environments, EnvironmentsConfig, Finished, Flight, Progress, Reset,
     Sight, State,

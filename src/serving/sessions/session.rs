@@ -12,7 +12,7 @@ use tokio::sync::{Mutex, MutexGuard};
 
 use super::{Opened, SessionInfo};
 use crate::serving::table::{Entry, LastUse};
-use crate::serving::{Clock, Error, Fleet, LoadedPolicy, Outcome, Timings};
+use crate::serving::{Clock, Error, Fleet, LoadedPolicy, Outcome, Room, Timings};
 
 /// Former runs that a session remembers, to refuse them.
 const FORMER_RUNS: usize = 64;
@@ -43,6 +43,9 @@ struct State {
     fleet: Option<Fleet>,
     memory: Vec<f32>,
     last: Option<Answered>,
+    /// Room of slots before the last.
+    used_memory: Vec<f32>,
+    used: Room,
 }
 
 /// What a slot was answered with; headings and values in canonical order of UAVs.
@@ -79,6 +82,8 @@ pub struct NextTurn<'a> {
     pub step: u64,
     /// A copy of the memory before it.
     pub memory: Vec<f32>,
+    /// Room for the answer.
+    pub room: Room,
 }
 
 impl Session {
@@ -93,6 +98,8 @@ impl Session {
             fleet: None,
             memory: Vec::new(),
             last: None,
+            used_memory: Vec::new(),
+            used: Room::default(),
         };
         let used = LastUse::at(opened_at);
         Self { id, policy, opened_at, clock, used, steps: AtomicU64::new(0), state: Mutex::new(state) }
@@ -111,7 +118,7 @@ impl Session {
     /// A step that is neither the last nor the next, a former run, other ids than in the run's first slot, or the session
     /// has ended.
     pub async fn turn<'a>(&'a self, fleet: &Fleet, step: Option<u64>, run_id: Option<&str>) -> Result<Turn<'a>, Error> {
-        let state = self.state.lock().await;
+        let mut state = self.state.lock().await;
         if state.ended {
             return Err(Error::unknown(Self::WHAT, &self.id));
         }
@@ -131,17 +138,19 @@ impl Session {
             return Err(wrong_step(&self.id, steps, step, new_run.is_some()));
         }
         let first = new_run.is_some() || state.fleet.is_none();
-        let memory = if first {
+        let mut memory = std::mem::take(&mut state.used_memory);
+        memory.clear();
+        if first {
             let run = new_run.as_deref().or(state.run_id.as_deref());
             let seed = state.seed.unwrap_or_else(|| hash(&(&self.id, run)));
             let (uavs, users) = (fleet.uavs.len(), fleet.users.len());
-            let mut memory = vec![0.0; self.policy.policy.memory_len(uavs, users)];
+            memory.resize(self.policy.policy.memory_len(uavs, users), 0.0);
             self.policy.policy.start(uavs, users, seed, &mut memory);
-            memory
         } else {
-            state.memory.clone()
-        };
-        Ok(Turn::Next(NextTurn { session: self, state, new_run, fleet: first.then(|| fleet.clone()), step, memory }))
+            memory.extend_from_slice(&state.memory);
+        }
+        let room = std::mem::take(&mut state.used);
+        Ok(Turn::Next(NextTurn { session: self, state, new_run, fleet: first.then(|| fleet.clone()), step, memory, room }))
     }
 
     /// What `OpenSession` with the name of this session does.
@@ -239,9 +248,11 @@ impl NextTurn<'_> {
         if let Some(fleet) = self.fleet.take() {
             state.fleet = Some(fleet);
         }
-        state.memory = outcome.memory;
+        state.used_memory = std::mem::replace(&mut state.memory, outcome.memory);
         state.steps = self.step + 1;
-        state.last = Some(answered.clone());
+        if let Some(Answered { headings, q_values, .. }) = state.last.replace(answered.clone()) {
+            state.used = Room { headings, q_values };
+        }
         self.session.steps.store(state.steps, Ordering::Relaxed);
         self.session.used.touch(self.session.clock.now());
         answered
