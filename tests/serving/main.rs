@@ -6,6 +6,7 @@ mod batch;
 mod conversion;
 mod environments;
 mod harness;
+mod interleavings;
 mod large;
 mod limits;
 mod load;
