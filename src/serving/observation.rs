@@ -187,6 +187,11 @@ impl Graph {
         if !self.left_out.contains(&true) {
             return Ok(derived);
         }
+        // A pair of users that both left out their lists is looked at once, from the one that comes first.
+        let mut silent = vec![0_u64; users.div_ceil(64)];
+        for j in (0..users).filter(|&j| self.left_out[j]) {
+            silent[j / 64] |= 1 << (j % 64);
+        }
         let views: Vec<View> = self.detections[..uavs].iter().map(|list| View::of(list, uavs, users)).collect();
         let mut known = vec![0_u64; users.div_ceil(64)];
         let mut found = vec![0_u64; known.len()];
@@ -199,6 +204,10 @@ impl Graph {
             for user in others.chain([j]) {
                 known[user / 64] |= 1 << (user % 64);
             }
+            for (known, silent) in known.iter_mut().zip(&silent[..j / 64]) {
+                *known |= silent;
+            }
+            known[j / 64] |= silent[j / 64] & ((1 << (j % 64)) - 1);
             for to_uav in seen.iter().take_while(|s| (s.target as usize) < uavs) {
                 let View { bits, first, rel: list } = &views[to_uav.target as usize];
                 for (word, (known, &bits)) in known.iter_mut().zip(bits).enumerate() {
@@ -221,14 +230,10 @@ impl Graph {
                     let k = word * 64 + rest.trailing_zeros() as usize;
                     rest &= rest - 1;
                     derived[j].push(Detection { target: (uavs + k) as u32, rel: rels[k] });
-                    // k derives j by itself if its list was left out too.
-                    if !self.left_out[k] {
-                        derived[k].push(Detection { target: (uavs + j) as u32, rel: rels[k].map(|x| -x) });
-                        total += 1;
-                    }
+                    derived[k].push(Detection { target: (uavs + j) as u32, rel: rels[k].map(|x| 0.0 - x) });
+                    total += 2;
                 }
             }
-            total += derived[j].len();
             if total > MAX_DETECTIONS {
                 return Err(crowded("graph"));
             }
