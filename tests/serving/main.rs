@@ -13,3 +13,4 @@ mod load;
 mod published;
 mod rest;
 mod server;
+mod soak;
