@@ -9,6 +9,8 @@ mod harness;
 mod large;
 mod limits;
 mod load;
+mod policies;
+mod promotion;
 mod published;
 mod rest;
 mod server;
