@@ -23,7 +23,7 @@ use crate::config::Config;
 use crate::invalid::Invalid;
 use crate::jobs::{Jobs, LocalProcess, Settings};
 use crate::service::{App, Draining, policies};
-use crate::serving::{Clock, Engine, Environments, EnvironmentsConfig, Limits, Registry, Sessions};
+use crate::serving::{Clock, Engine, Environments, EnvironmentsConfig, Limits, Sessions};
 use crate::store::{self, Store};
 use crate::telemetry;
 
@@ -179,7 +179,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
     let app = App {
         jobs: Jobs::open(store.clone(), settings, Arc::new(executor)).await?,
         store,
-        registry: Registry::default(),
+        registry: Arc::default(),
         sessions: Sessions::new(sessions, clock.clone()),
         environments: Environments::new(environments, clock.clone()),
         engine: Engine::start(config.engine).map_err(Error::Engine)?,

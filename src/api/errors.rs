@@ -18,6 +18,7 @@ fn row(error: &Error) -> (Code, StatusCode) {
         Error::Conflict { .. } => (Code::AlreadyExists, StatusCode::CONFLICT),
         Error::Busy { .. } => (Code::ResourceExhausted, StatusCode::TOO_MANY_REQUESTS),
         Error::TooLarge(_) => (Code::ResourceExhausted, StatusCode::PAYLOAD_TOO_LARGE),
+        Error::MediaType(_) => (Code::InvalidArgument, StatusCode::UNSUPPORTED_MEDIA_TYPE),
         Error::Deadline(_) => (Code::DeadlineExceeded, StatusCode::GATEWAY_TIMEOUT),
         Error::Draining => (Code::Unavailable, StatusCode::SERVICE_UNAVAILABLE),
         Error::Unauthenticated(_) => (Code::Unauthenticated, StatusCode::UNAUTHORIZED),

@@ -3,7 +3,11 @@
 use std::time::Duration;
 
 use anyhow::{Context, bail};
+use reqwest::header::CONTENT_TYPE;
 use serde_json::Value;
+
+/// Time for a checkpoint to go over.
+const TRANSFER: Duration = Duration::from_secs(600);
 
 /// A server to talk to.
 #[derive(Clone, Debug)]
@@ -40,15 +44,53 @@ impl Client {
         self.answer(self.http.post(format!("{}{path}", self.base)).json(body), path).await
     }
 
+    /// `PUT path` with a JSON body.
+    ///
+    /// # Errors
+    /// As [`Client::get`].
+    pub async fn put(&self, path: &str, body: &Value) -> anyhow::Result<Value> {
+        self.answer(self.http.put(format!("{}{path}", self.base)).json(body), path).await
+    }
+
+    /// `DELETE path`.
+    ///
+    /// # Errors
+    /// As [`Client::get`].
+    pub async fn delete(&self, path: &str) -> anyhow::Result<Value> {
+        self.answer(self.http.delete(format!("{}{path}", self.base)), path).await
+    }
+
+    /// `POST path` with a body of bytes, which may take a while.
+    ///
+    /// # Errors
+    /// As [`Client::get`].
+    pub async fn upload(&self, path: &str, bytes: Vec<u8>) -> anyhow::Result<Value> {
+        let request = self.http.post(format!("{}{path}", self.base)).body(bytes).timeout(TRANSFER);
+        self.answer(request.header(CONTENT_TYPE, "application/octet-stream"), path).await
+    }
+
+    /// `GET path` of bytes, which may take a while.
+    ///
+    /// # Errors
+    /// As [`Client::get`].
+    pub async fn download(&self, path: &str) -> anyhow::Result<Vec<u8>> {
+        self.body(self.http.get(format!("{}{path}", self.base)).timeout(TRANSFER), path).await
+    }
+
     async fn answer(&self, request: reqwest::RequestBuilder, path: &str) -> anyhow::Result<Value> {
+        let body = self.body(request, path).await?;
+        Ok(serde_json::from_slice(&body).unwrap_or(Value::Null))
+    }
+
+    async fn body(&self, request: reqwest::RequestBuilder, path: &str) -> anyhow::Result<Vec<u8>> {
         let response = request.send().await.with_context(|| format!("cannot reach {}{path}", self.base))?;
         let status = response.status();
         let body = response.bytes().await.with_context(|| format!("{path}: the answer broke off"))?;
-        let json: Value = serde_json::from_slice(&body).unwrap_or(Value::Null);
         if !status.is_success() {
-            bail!("{path}: {}", json["detail"].as_str().unwrap_or(status.as_str()));
+            let problem: Value = serde_json::from_slice(&body).unwrap_or(Value::Null);
+            bail!("{path}: {}", problem["detail"].as_str().unwrap_or(status.as_str()));
         }
-        Ok(json)
+        Ok(body.into())
     }
 
     /// Waits for a job to end; `tell` is shown the job every quarter of a second.

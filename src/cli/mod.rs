@@ -9,6 +9,7 @@ mod experiment;
 mod files;
 mod fly;
 mod local;
+mod policies;
 mod progress;
 mod report;
 mod run_args;
@@ -39,6 +40,8 @@ enum Command {
     Train(train::TrainArgs),
     /// Compare policies on frozen layouts
     Evaluate(evaluate::EvaluateArgs),
+    /// The policies of a server: list, upload, export, aliases, load and unload
+    Policies(policies::PoliciesArgs),
     /// Run, resume and draw an experiment: many training runs and what they say together
     Experiment(experiment::ExperimentArgs),
     /// Measure how fast the parts are on this machine
@@ -54,6 +57,7 @@ pub fn run() -> ExitCode {
         Command::Demo(args) => block_on(demo::run(args)),
         Command::Train(args) => block_on(train::run(args)),
         Command::Evaluate(args) => block_on(evaluate::run(args)),
+        Command::Policies(args) => block_on(policies::run(args)),
         Command::Experiment(args) => block_on(experiment::run(args)),
         Command::Bench(args) => block_on(bench::run(args)),
         // It begins without threads and without a runtime.

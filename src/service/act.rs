@@ -115,10 +115,10 @@ async fn with_held_state(app: &App, state: &[u8], request: Request, deadline: Op
         return Err(Invalid::new("policy", "nothing", "NAME, NAME@ALIAS or NAME:VERSION, where there is no session").into());
     };
     let held = if state.is_empty() { None } else { Some(HeldState::decode(state)?) };
-    let mut policy = app.registry.resolve(spec)?;
-    if let Some(held) = &held {
-        policy = version_of(app, policy, spec, held)?;
-    }
+    let policy = match &held {
+        None => app.registry.resolve(spec)?,
+        Some(held) => version_of(app, spec, held)?,
+    };
     let Observation { fleet, uav_order: order, seen } = request.observation;
     let slot = slot_of(&fleet, seen, &policy).await?;
     let step = held.as_ref().map_or(0, |held| held.step);
@@ -148,15 +148,11 @@ fn check_pinned(pinned: &LoadedPolicy, spec: &PolicySpec) -> Result<(), Invalid>
     Err(Invalid::new("policy", spec, format!("{}, which the session is pinned to, or nothing", pinned.reference)))
 }
 
-/// The version that wrote `held`: an episode stays with its version even if a newer one was published since.
-fn version_of(app: &App, asked: Arc<LoadedPolicy>, spec: &PolicySpec, held: &HeldState) -> Result<Arc<LoadedPolicy>, Invalid> {
-    if asked.reference.digest == held.digest {
-        return Ok(asked);
-    }
-    let pinned = app.registry.with_digest(&spec.name, &held.digest);
-    pinned.filter(|_| !matches!(spec.which, Which::Version(_))).ok_or_else(|| {
+/// The version that wrote `held`: an episode stays with its version even if an alias moved or a newer one was published since.
+fn version_of(app: &App, spec: &PolicySpec, held: &HeldState) -> Result<Arc<LoadedPolicy>, Error> {
+    app.registry.pinned(spec, &held.digest)?.ok_or_else(|| {
         let expected = format!("the recurrent_state of an earlier answer of {spec}");
-        Invalid::new("recurrent_state", "the memory of another policy or version", expected)
+        Invalid::new("recurrent_state", "the memory of another policy or version", expected).into()
     })
 }
 

@@ -8,6 +8,8 @@ pub mod policies;
 pub mod sessions;
 pub mod worker;
 
+use std::sync::Arc;
+
 pub use error::Error;
 use tokio_util::sync::CancellationToken;
 
@@ -22,7 +24,7 @@ pub struct App {
     /// The scheduler.
     pub jobs: Jobs,
     /// Policies that can be asked.
-    pub registry: Registry,
+    pub registry: Arc<Registry>,
     /// Fleets whose memory the server keeps.
     pub sessions: Sessions,
     /// Environments that learners elsewhere fly.
@@ -86,7 +88,7 @@ impl From<crate::serving::Error> for Error {
             E::Unknown { what, id } => Self::NotFound { what, id },
             E::Precondition { code, message } => Self::Precondition { code, message },
             E::Exists(message) => Self::Conflict { code: "already_exists", message },
-            E::Busy(message) => Self::Busy { message, retry_after: std::time::Duration::from_secs(1) },
+            E::Busy(message) => Self::busy(message),
             E::Deadline(place) => Self::Deadline(place),
             E::Fault(cause) => Self::internal(cause),
         }

@@ -27,6 +27,6 @@ pub use fleet::Fleet;
 pub use memory::HeldState;
 pub use observation::{Graph, MAX_DETECTIONS, MAX_NODES, Observation, Seen, Sighting};
 pub use reference::{PolicyRef, PolicySpec, Which, check_name};
-pub use registry::{Kind, LoadedPolicy, Registry};
+pub use registry::{About, Described, Kind, LoadedPolicy, Registry};
 pub use sessions::{Answered, Opened, Session, SessionInfo, Sessions, Turn};
 pub use table::{Entry, LastUse, Limits, Table};

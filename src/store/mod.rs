@@ -5,13 +5,15 @@ mod checkpoints;
 mod jobs;
 mod metrics;
 mod policies;
+mod promotions;
 mod snapshots;
 
 pub use attempts::{Attempt, Ending, Lease, LeaseRecord, Outcome};
 pub use checkpoints::{Checkpoint, CheckpointKind, NewCheckpoint};
 pub use jobs::{Changed, Job, JobId, JobKind, JobSpec, JobState, NewJob, Submitted, Verb, Wanted};
 pub use metrics::{Metric, MetricCursor, MetricRow};
-pub use policies::{NewPolicyVersion, PolicyAlias, PolicyVersion};
+pub use policies::{NewPolicyVersion, PolicyVersion, PublishedPolicy};
+pub use promotions::{AliasMove, PolicyAlias, Promotion, PromotionFilter};
 pub use snapshots::{OpenSnapshot, Snapshot};
 
 use std::path::Path;

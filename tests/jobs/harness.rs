@@ -13,7 +13,7 @@ use qedgix::config::Config;
 use qedgix::jobs::{Executor, Exit, Jobs, Launch, Settings};
 use qedgix::server::{self, DataDir, Listeners};
 use qedgix::service::{App, Draining};
-use qedgix::serving::{Clock, Engine, EngineConfig, Environments, EnvironmentsConfig, Limits, Registry, Sessions};
+use qedgix::serving::{Clock, Engine, EngineConfig, Environments, EnvironmentsConfig, Limits, Sessions};
 use qedgix::store::Store;
 use qedgix::wire::v1::job_service_client::JobServiceClient;
 use qedgix::wire::v1::worker_service_client::WorkerServiceClient;
@@ -156,7 +156,7 @@ impl Server {
         let app = Arc::new(App {
             jobs: Jobs::open(store.clone(), settings, executor).await.unwrap(),
             store,
-            registry: Registry::default(),
+            registry: Arc::default(),
             sessions: Sessions::new(limits, clock.clone()),
             environments: Environments::new(EnvironmentsConfig { limits, memory: 1 << 20 }, clock.clone()),
             engine: Engine::start(EngineConfig { threads: 1, queue: 1, max_batch: 1, max_batch_delay: Duration::ZERO }).unwrap(),

@@ -10,6 +10,8 @@ mod interleavings;
 mod large;
 mod limits;
 mod load;
+mod policies;
+mod promotion;
 mod published;
 mod rest;
 mod server;
