@@ -10,8 +10,7 @@ use futures::future::BoxFuture;
 use jiff::Timestamp;
 use qedgix::learner::{Algorithm, Learner, Preset, TrainConfig};
 use qedgix::policy::{Learned, Slot};
-use qedgix::serving::{Engine, EngineConfig, Error, Kind, LoadedPolicy, Outcome, PolicyRef, Room, Task};
-use serde_json::Value;
+use qedgix::serving::{Engine, EngineConfig, Error, LoadedPolicy, Outcome, PolicyRef, Room, Task};
 
 const UAVS: usize = 3;
 const USERS: usize = 5;
@@ -20,17 +19,8 @@ fn policy() -> Arc<LoadedPolicy> {
     let config = TrainConfig::preset(Algorithm::Qedgix, Preset::Practical);
     let learner = Learner::new(&config, 1).expect("a thread");
     let policy = Learned::new(config.agent(), config.dims(), learner.agent_parameters().to_vec()).expect("its own");
-    Arc::new(LoadedPolicy {
-        reference: PolicyRef { name: "p".into(), version: 1, digest: [0; 32] },
-        policy: Arc::new(policy),
-        kind: Kind::Checkpoint,
-        description: String::new(),
-        uavs: None,
-        users: None,
-        config: Value::Null,
-        metrics: Value::Null,
-        created_at: Timestamp::UNIX_EPOCH,
-    })
+    let reference = PolicyRef { name: "p".into(), version: 1, digest: [0; 32] };
+    Arc::new(LoadedPolicy::baseline(reference, "of a test", Arc::new(policy), Timestamp::UNIX_EPOCH))
 }
 
 /// Slot `step` of fleet `fleet`; who sees whom changes from slot to slot.
