@@ -162,3 +162,45 @@ fn learned(reference: PolicyRef, checkpoint: &Checkpoint, created_at: i64) -> Lo
         reference,
     }
 }
+
+/// A policy version as an index of all shows it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct IndexEntry {
+    /// Name.
+    pub name: String,
+    /// Version.
+    pub version: u64,
+    /// Whether it can be asked for.
+    pub ready: bool,
+    /// Why not.
+    pub reason: String,
+}
+
+/// Lets all versions of `name` be asked for again.
+///
+/// # Errors
+/// There is no such policy.
+#[allow(clippy::unused_async)]
+pub async fn load_policy(app: &App, name: &str) -> Result<(), Error> {
+    Ok(app.registry.set_loaded(name, true)?)
+}
+
+/// Lets no version of `name` be asked for any more. Sessions that have begun go on.
+///
+/// # Errors
+/// There is no such policy.
+#[allow(clippy::unused_async)]
+pub async fn unload_policy(app: &App, name: &str) -> Result<(), Error> {
+    Ok(app.registry.set_loaded(name, false)?)
+}
+
+/// All policy versions in order of names, those included that cannot be asked for.
+pub fn index(app: &App) -> Vec<IndexEntry> {
+    let entry = |(policy, ready): (PolicyRef, bool)| IndexEntry {
+        name: policy.name,
+        version: policy.version,
+        ready,
+        reason: if ready { String::new() } else { "unloaded".into() },
+    };
+    app.registry.index().into_iter().map(entry).collect()
+}

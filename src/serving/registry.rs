@@ -50,6 +50,8 @@ impl std::fmt::Debug for LoadedPolicy {
 struct Entry {
     versions: BTreeMap<u64, Arc<LoadedPolicy>>,
     aliases: BTreeMap<String, u64>,
+    /// Nobody new may ask for it.
+    unloaded: bool,
 }
 
 /// All policies of this server. The lock is held for look-ups only.
@@ -85,7 +87,7 @@ impl Registry {
     /// [`Error::Unknown`].
     pub fn resolve(&self, spec: &PolicySpec) -> Result<Arc<LoadedPolicy>, Error> {
         let entries = self.read();
-        let found = entries.get(&spec.name).and_then(|entry| match &spec.which {
+        let found = entries.get(&spec.name).filter(|entry| !entry.unloaded).and_then(|entry| match &spec.which {
             Which::Newest => entry.versions.values().next_back(),
             Which::Alias(alias) => entry.aliases.get(alias).and_then(|version| entry.versions.get(version)),
             Which::Version(version) => entry.versions.get(version),
@@ -114,6 +116,27 @@ impl Registry {
         let mut rest = entries.range::<str, _>((Excluded(after), Unbounded)).filter_map(|(_, e)| e.versions.values().next_back());
         let page = rest.by_ref().take(limit).cloned().collect();
         (page, rest.next().is_some())
+    }
+
+    /// Lets all versions of `name` be asked for, or not. Whoever holds one keeps it.
+    ///
+    /// # Errors
+    /// [`Error::Unknown`].
+    pub fn set_loaded(&self, name: &str, loaded: bool) -> Result<(), Error> {
+        let mut entries = self.0.write().unwrap_or_else(PoisonError::into_inner);
+        let entry = entries.get_mut(name).ok_or_else(|| Error::unknown("policy", name))?;
+        entry.unloaded = !loaded;
+        Ok(())
+    }
+
+    /// All versions in order of names, and whether they can be asked for.
+    pub fn index(&self) -> Vec<(PolicyRef, bool)> {
+        let entries = self.read();
+        let of = |entry: &Entry| {
+            let loaded = !entry.unloaded;
+            entry.versions.values().map(|policy| (policy.reference.clone(), loaded)).collect::<Vec<_>>()
+        };
+        entries.values().flat_map(of).collect()
     }
 
     /// Number of policy versions.
