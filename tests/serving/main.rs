@@ -9,6 +9,7 @@ mod harness;
 mod large;
 mod limits;
 mod load;
+mod oip;
 mod published;
 mod rest;
 mod server;
