@@ -5,6 +5,7 @@ pub mod environments;
 mod error;
 pub mod jobs;
 pub mod policies;
+pub mod sequences;
 pub mod sessions;
 pub mod worker;
 

@@ -25,7 +25,7 @@ pub use environments::{
 pub use error::Error;
 pub use fleet::Fleet;
 pub use memory::HeldState;
-pub use observation::{Graph, MAX_DETECTIONS, MAX_NODES, Observation, Seen, Sighting};
+pub use observation::{Graph, GraphForm, MAX_DETECTIONS, MAX_NODES, Observation, Seen, Sighting};
 pub use reference::{PolicyRef, PolicySpec, Which, check_name};
 pub use registry::{About, Described, Kind, LoadedPolicy, Registry};
 pub use sessions::{Answered, Opened, Session, SessionInfo, Sessions, Turn};

@@ -10,6 +10,7 @@ mod interleavings;
 mod large;
 mod limits;
 mod load;
+mod oip;
 mod policies;
 mod promotion;
 mod published;

@@ -9,6 +9,7 @@ pub mod request;
 pub mod response;
 mod scene;
 pub mod structs;
+pub mod tensors;
 
 use fleet::Ids;
 

@@ -3,6 +3,7 @@
 mod deadline;
 mod envelope;
 mod environment;
+mod inference;
 mod job;
 mod policy;
 mod worker;
@@ -17,7 +18,7 @@ use deadline::{Deadline, deadline};
 
 use crate::api::observe::Meters;
 use crate::service::App;
-use crate::wire::{DESCRIPTORS, v1};
+use crate::wire::{DESCRIPTORS, oip, v1};
 
 /// Names of the services that health tells about.
 pub const SERVICES: &[&str] = &[
@@ -25,6 +26,7 @@ pub const SERVICES: &[&str] = &[
     v1::environment_service_server::SERVICE_NAME,
     v1::job_service_server::SERVICE_NAME,
     v1::worker_service_server::SERVICE_NAME,
+    oip::grpc_inference_service_server::SERVICE_NAME,
 ];
 
 const BUILT_IN: &str = "the descriptors are built into the program";
@@ -41,6 +43,7 @@ pub fn routes<H: Health>(app: &Arc<App>, health: HealthServer<H>, max_message: u
     let mut routes = Routes::builder();
     routes
         .add_service(policy::service(app.clone()).max_decoding_message_size(max_message))
+        .add_service(inference::service(app.clone()).max_decoding_message_size(max_message))
         .add_service(environment::service(app.clone()).max_decoding_message_size(max_message))
         .add_service(job::service(app.clone()).max_decoding_message_size(max_message))
         .add_service(worker::service(app.clone()).max_decoding_message_size(max_message.max(worker::LARGEST_MESSAGE)))

@@ -1,4 +1,5 @@
-//! REST: JSON under `/v1`, probes, metrics. Every error is a problem of RFC 9457, also those of paths and methods.
+//! REST: JSON under `/v1`, the Open Inference Protocol under `/v2`, probes, metrics. Every error is a problem of RFC 9457,
+//! also those of paths and methods; under `/v2` it is what that protocol wants.
 
 mod act;
 mod environments;
@@ -8,6 +9,7 @@ mod observation;
 mod ops;
 mod policies;
 mod sessions;
+mod v2;
 mod wording;
 
 use std::panic::AssertUnwindSafe;
@@ -42,6 +44,7 @@ pub fn router(app: Arc<App>, metrics: PrometheusHandle, max_body: usize) -> Rout
         .merge(policies::router())
         .merge(environments::router())
         .merge(jobs::router())
+        .merge(v2::router())
         .fallback(|request: Request| async move { Error::not_found("endpoint", request.uri().path()).into_response() })
         .method_not_allowed_fallback(|request: Request| async move {
             let detail = format!("{} does not answer {}", request.uri().path(), request.method());
@@ -59,10 +62,14 @@ async fn around(meters: Arc<Meters>, request: Request, next: Next) -> Response {
     let path = request.extensions().get::<MatchedPath>().map_or("unknown", MatchedPath::as_str).to_owned();
     let id = request_id(request.headers());
     let span = tracing::info_span!("http", %verb, path, request_id = ?id);
+    let is_v2 = v2::is_ours(request.uri().path());
     let work = AssertUnwindSafe(next.run(request).instrument(span.clone())).catch_unwind();
     let answered = work.await;
     let _inside = span.enter();
     let mut response = answered.unwrap_or_else(|_| Error::internal("a handler panicked").into_response());
+    if is_v2 {
+        response = v2::in_our_words(response);
+    }
     response.headers_mut().insert(REQUEST_ID, id);
     // Made-up verbs are the caller's; they do not become labels.
     let verb = if response.status() == StatusCode::METHOD_NOT_ALLOWED { "other" } else { verb.as_str() };

@@ -4,7 +4,7 @@
 use std::collections::VecDeque;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
 use jiff::Timestamp;
@@ -27,12 +27,16 @@ pub struct Session {
     used: LastUse,
     /// Copy of `State::steps`, readable while a slot is in flight.
     steps: AtomicU64,
+    /// Copy of `State::finished`.
+    over: AtomicBool,
     state: Mutex<State>,
 }
 
 #[derive(Debug)]
 struct State {
     ended: bool,
+    /// Only the last step may be repeated.
+    finished: bool,
     run_id: Option<String>,
     /// Hashes of former runs, newest last.
     former: VecDeque<u64>,
@@ -91,6 +95,7 @@ impl Session {
         let opened_at = clock.now();
         let state = State {
             ended: false,
+            finished: false,
             run_id: how.run_id.clone(),
             former: VecDeque::new(),
             seed: how.seed,
@@ -102,7 +107,8 @@ impl Session {
             used: Room::default(),
         };
         let used = LastUse::at(opened_at);
-        Self { id, policy, opened_at, clock, used, steps: AtomicU64::new(0), state: Mutex::new(state) }
+        let (steps, over) = (AtomicU64::new(0), AtomicBool::new(false));
+        Self { id, policy, opened_at, clock, used, steps, over, state: Mutex::new(state) }
     }
 
     /// The policy version it is pinned to.
@@ -119,7 +125,12 @@ impl Session {
     /// has ended.
     pub async fn turn<'a>(&'a self, fleet: &Fleet, step: Option<u64>, run_id: Option<&str>) -> Result<Turn<'a>, Error> {
         let mut state = self.state.lock().await;
-        if state.ended {
+        let missed = state.last.as_ref().filter(|last| state.finished && step == Some(last.step));
+        if let (Some(last), Some(known)) = (missed, &state.fleet) {
+            known.check_same(fleet)?;
+            return Ok(Turn::Repeat(last.clone()));
+        }
+        if state.ended || state.finished {
             return Err(Error::unknown(Self::WHAT, &self.id));
         }
         let new_run = state.judge_run(&self.id, run_id)?;
@@ -184,6 +195,12 @@ impl Session {
         self.state.lock().await.ended = true;
     }
 
+    /// No slot follows; the last one may be asked for again for a moment, by its step.
+    pub async fn finish(&self) {
+        self.state.lock().await.finished = true;
+        self.over.store(true, Ordering::Relaxed);
+    }
+
     /// What a caller is told of it.
     pub fn info(&self, ttl: Duration) -> SessionInfo {
         SessionInfo {
@@ -206,6 +223,10 @@ impl Entry for Session {
 
     fn used(&self) -> &LastUse {
         &self.used
+    }
+
+    fn over(&self) -> bool {
+        self.over.load(Ordering::Relaxed)
     }
 }
 
