@@ -6,7 +6,7 @@
 //!     QEDGIX_FUZZ_INPUTS=1000000 cargo test --release --test fuzz -- --nocapture
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use axum::body::Body;
@@ -21,7 +21,7 @@ use qedgix::server::{self, DataDir};
 use qedgix::service::App;
 use qedgix::serving::Clock;
 use qedgix::telemetry;
-use qedgix::wire::v1;
+use qedgix::wire::{oip, v1};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use serde_json::json;
@@ -32,6 +32,8 @@ use tower::ServiceExt;
 const LARGEST: usize = 1 << 20;
 /// Most memory that one input may take at a time, in bytes.
 const MEMORY: u64 = 64 << 20;
+/// Ways into the server.
+const KINDS: [&str; 4] = ["proto", "JSON", "tensors", "safetensors"];
 /// An input that takes longer hangs.
 const LONGEST: Duration = Duration::from_secs(10);
 
@@ -156,6 +158,10 @@ fn messages() -> Vec<(&'static str, Vec<u8>)> {
         ("qedgix.v1.PolicyService/Act", graph_act.encode_to_vec()),
         ("qedgix.v1.PolicyService/Act", session.encode_to_vec()),
         ("qedgix.v1.PolicyService/Act", act("tour", Observation::Scene(scene(4)), None).encode_to_vec()),
+        ("inference.GRPCInferenceService/ModelInfer", infer(true)),
+        ("inference.GRPCInferenceService/ModelInfer", infer(false)),
+        ("inference.GRPCInferenceService/ModelStreamInfer", infer(true)),
+        ("qedgix.v1.PolicyService/ActStream", scene_act.encode_to_vec()),
         ("qedgix.v1.PolicyService/ActBatch", batch.encode_to_vec()),
         ("qedgix.v1.PolicyService/OpenSession", open.encode_to_vec()),
         (
@@ -166,6 +172,61 @@ fn messages() -> Vec<(&'static str, Vec<u8>)> {
         ("qedgix.v1.EnvironmentService/CreateEnvironment", environment.encode_to_vec()),
         ("qedgix.v1.EnvironmentService/Step", step.encode_to_vec()),
     ]
+}
+
+/// A slot of the Open Inference Protocol, its values raw or typed.
+fn infer(raw: bool) -> Vec<u8> {
+    use oip::infer_parameter::ParameterChoice as P;
+    use oip::model_infer_request::{InferInputTensor, InferRequestedOutputTensor};
+    let tensors: [(&str, &[i64], Vec<f32>); 3] = [
+        ("uav_positions", &[2, 2], vec![0.1, 0.2, 0.3, 0.4]),
+        ("user_positions", &[3, 2], vec![0.5, 0.1, 0.2, 0.2, 0.9, 0.9]),
+        ("user_aoi", &[3], vec![1.0, 2.0, 3.0]),
+    ];
+    let input = |(name, shape, values): &(&str, &[i64], Vec<f32>)| InferInputTensor {
+        name: (*name).into(),
+        datatype: "FP32".into(),
+        shape: shape.to_vec(),
+        contents: (!raw).then(|| oip::InferTensorContents { fp32_contents: values.clone(), ..Default::default() }),
+        ..Default::default()
+    };
+    let bytes = |values: &[f32]| values.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>().into();
+    let parameter = |choice| oip::InferParameter { parameter_choice: Some(choice) };
+    oip::ModelInferRequest {
+        model_name: "qedgix".into(),
+        id: "1".into(),
+        parameters: [("sequence_id", P::Int64Param(5)), ("sequence_start", P::BoolParam(true)), ("seed", P::Int64Param(3))]
+            .map(|(name, choice)| (name.to_owned(), parameter(choice)))
+            .into(),
+        inputs: tensors.iter().map(input).collect(),
+        outputs: vec![InferRequestedOutputTensor { name: "q_values".into(), ..Default::default() }],
+        raw_input_contents: if raw { tensors.iter().map(|(_, _, values)| bytes(values)).collect() } else { Vec::new() },
+        ..Default::default()
+    }
+    .encode_to_vec()
+}
+
+/// The same over HTTP: its JSON, and what follows it.
+fn tensors(binary: bool) -> (String, Vec<u8>) {
+    let values = [0.1_f32, 0.2, 0.3, 0.4];
+    let positions = if binary {
+        json!({"name": "uav_positions", "datatype": "FP32", "shape": [2, 2], "parameters": {"binary_data_size": 16}})
+    } else {
+        json!({"name": "uav_positions", "datatype": "FP32", "shape": [2, 2], "data": [0.1, 0.2, 0.3, 0.4]})
+    };
+    let document = json!({
+        "id": "7",
+        "parameters": {"sequence_id": "a", "sequence_start": true, "binary_data_output": binary},
+        "inputs": [
+            positions,
+            {"name": "edge_index", "datatype": "INT64", "shape": [1, 2], "data": [[0, 2]]},
+            {"name": "edge_relative", "datatype": "FP32", "shape": [1, 2], "data": [[0.1, 0.0]]},
+            {"name": "user_aoi", "datatype": "FP32", "shape": [3], "data": [1, 2, 3]},
+            {"name": "uav_ids", "datatype": "BYTES", "shape": [2], "data": ["a", "b"]},
+        ],
+        "outputs": [{"name": "heading_index"}, {"name": "q_values", "parameters": {"binary_data": binary}}],
+    });
+    (document.to_string(), if binary { values.iter().flat_map(|x| x.to_le_bytes()).collect() } else { Vec::new() })
 }
 
 /// Requests of REST: method, path, content type, body.
@@ -184,6 +245,9 @@ fn documents() -> Vec<(&'static str, &'static str, &'static str, Vec<u8>)> {
         ("POST", "/v1/act", JSON, json(json!({"policy": "sweep", "graph": {"nodes": nodes}}))),
         ("POST", "/v1/act", JSON, json(json!({"session_id": "t", "scene": scene, "step": 0, "run_id": "r"}))),
         ("POST", "/v1/sessions", JSON, json(json!({"policy": "qedgix", "session_id": "t", "seed": 1}))),
+        ("POST", "/v2/models/qedgix/infer", JSON, tensors(false).0.into_bytes()),
+        ("POST", "/v2/models/sweep/versions/1/infer", JSON, tensors(false).0.into_bytes()),
+        ("POST", "/v2/repository/models/nobody/load", JSON, json(json!({"parameters": {"config": "{}"}}))),
         ("POST", "/v1/environments", JSON, json(json!({"environment": {"users": 4, "slots": 20}, "seed": 1}))),
     ]
 }
@@ -242,6 +306,15 @@ impl Subject {
         status.to_string()
     }
 
+    /// Sends a document followed by tensors; sometimes the length that tells them apart is wrong.
+    async fn send_binary(&self, body: Vec<u8>, length: usize) -> String {
+        let request = Request::post("/v2/models/qedgix/infer").header("inference-header-content-length", length);
+        let response = self.rest.clone().oneshot(request.body(Body::from(body)).unwrap()).await.unwrap();
+        let status = response.status().as_u16();
+        axum::body::to_bytes(response.into_body(), usize::MAX).await.unwrap();
+        status.to_string()
+    }
+
     /// Reads a file; one that is accepted must fly.
     fn read(&self, bytes: &[u8]) -> String {
         let Ok(checkpoint) = Checkpoint::from_bytes(bytes) else { return "refused".into() };
@@ -257,6 +330,21 @@ impl Subject {
     }
 }
 
+/// Ends the process when one input takes too long: a loop that never waits cannot be ended otherwise.
+fn watch(current: &Arc<Mutex<(Instant, u64)>>) {
+    let current = Arc::downgrade(current);
+    std::thread::spawn(move || {
+        while let Some(current) = current.upgrade() {
+            let (began, number) = *current.lock().unwrap();
+            if began.elapsed() > LONGEST {
+                eprintln!("input number {number} hangs");
+                std::process::exit(1);
+            }
+            std::thread::sleep(Duration::from_millis(100));
+        }
+    });
+}
+
 #[test]
 fn wrong_inputs_are_refused_and_nothing_else_happens() {
     let inputs: u64 =
@@ -267,10 +355,13 @@ fn wrong_inputs_are_refused_and_nothing_else_happens() {
     let (messages, documents) = (messages(), documents());
     let mut rng = qedgix::rng::stream(1, "fuzz", 0);
     let mut answers: BTreeMap<(&str, String), u64> = BTreeMap::new();
+    let watched = Arc::new(Mutex::new((Instant::now(), 0)));
+    watch(&watched);
     let (mut slowest, mut largest) = (Duration::ZERO, 0);
-    for _ in 0..inputs {
-        let kind = ["proto", "JSON", "safetensors"][rng.random_range(0..3)];
+    for number in 0..inputs {
+        let kind = KINDS[rng.random_range(0..KINDS.len())];
         let began = Instant::now();
+        *watched.lock().unwrap() = (began, number);
         let (mut input, mut answer) = (Vec::new(), String::new());
         let used = allocation_counter::measure(|| match kind {
             "proto" => {
@@ -284,6 +375,14 @@ fn wrong_inputs_are_refused_and_nothing_else_happens() {
                 let other = &documents[rng.random_range(0..documents.len())].3;
                 input = spoil(&mut rng, &document.3, other);
                 answer = runtime.block_on(subject.send(document, input.clone()));
+            }
+            "tensors" => {
+                let (document, rest) = tensors(true);
+                let document = spoil(&mut rng, document.as_bytes(), &rest);
+                let rest = spoil(&mut rng, &rest, document.as_slice());
+                let length = if rng.random_range(0..8) == 0 { rng.random_range(0..2000) } else { document.len() };
+                input = [document, rest].concat();
+                answer = runtime.block_on(subject.send_binary(input.clone(), length));
             }
             _ => {
                 input = spoil(&mut rng, &subject.checkpoint, &subject.checkpoint);
@@ -303,7 +402,7 @@ fn wrong_inputs_are_refused_and_nothing_else_happens() {
     }
     println!("{inputs} inputs; the slowest took {slowest:?}, the largest {largest} bytes");
     println!("sessions {}, environments {}", subject.app.sessions.len(), subject.app.environments.table().len());
-    for kind in ["proto", "JSON", "safetensors"] {
+    for kind in KINDS {
         assert!(answers.keys().filter(|(of, _)| *of == kind).count() > 1, "some of {kind} are right and some are wrong");
     }
 }

@@ -44,18 +44,29 @@ fn too_late() -> Response {
     Status::from(Error::Deadline("before the answer was ready")).into_http()
 }
 
-/// The transport has its own statuses for messages that are too large or do not decode; the table of errors has others.
 fn in_line(response: Response) -> (Response, Code) {
     let Some(status) = response.extensions().get::<Status>() else { return (response, Code::Ok) };
-    let ours = status.metadata().contains_key("qedgix-code");
-    let error = match status.code() {
-        Code::OutOfRange if !ours => Error::TooLarge(status.message().to_owned()),
-        Code::Internal if !ours => Invalid::new("message", status.message(), "one message of the method's request type").into(),
-        code => return (response, code),
-    };
-    let status = Status::from(error);
     let code = status.code();
-    (status.into_http(), code)
+    match of_the_table(status) {
+        None => (response, code),
+        Some(status) => {
+            let code = status.code();
+            (status.into_http(), code)
+        }
+    }
+}
+
+/// The transport has its own statuses for messages that are too large or do not decode; the table of errors has others.
+pub(super) fn of_the_table(status: &Status) -> Option<Status> {
+    let ours = status.metadata().contains_key("qedgix-code");
+    match status.code() {
+        Code::OutOfRange if !ours => Some(Error::TooLarge(status.message().to_owned()).into()),
+        Code::Internal if !ours => {
+            let wrong = Invalid::new("message", status.message(), "one message of the method's request type");
+            Some(Error::from(wrong).into())
+        }
+        _ => None,
+    }
 }
 
 /// The status code as gRPC's documents write it.

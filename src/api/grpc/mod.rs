@@ -6,6 +6,7 @@ mod environment;
 mod inference;
 mod job;
 mod policy;
+mod stream;
 mod worker;
 
 use std::sync::Arc;

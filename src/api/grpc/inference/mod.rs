@@ -9,7 +9,7 @@ use futures::stream::{BoxStream, StreamExt};
 use tonic::{Request, Response, Status, Streaming};
 
 use self::messages::{call, config, final_answer, metadata, reply};
-use super::deadline;
+use super::{deadline, stream};
 use crate::api::errors::act_error;
 use crate::api::oip;
 use crate::service::{App, Error};
@@ -92,13 +92,10 @@ impl GrpcInferenceService for Service {
     ) -> Answer<Self::ModelStreamInferStream> {
         let deadline = deadline(request.extensions());
         let app = self.0.clone();
-        let draining = app.clone();
-        // What was asked before the server drains is answered; then the stream ends, so that it does not hold up the end.
-        let requests = request.into_inner().take_until(async move { draining.draining.wait().await });
+        let requests = stream::requests(app.clone(), request.into_inner());
         // One after another: a sequence's slots follow each other without their steps being told.
         let answers = requests.then(move |request| {
             let app = app.clone();
-            // A message that does not decode, or a caller that left: the stream is over.
             async move { Ok(answer_in_stream(&app, request?, deadline).await) }
         });
         Ok(Response::new(answers.boxed()))
