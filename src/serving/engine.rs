@@ -13,9 +13,9 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use metrics::Histogram;
 use tokio::sync::oneshot::{self, error::TryRecvError};
 
+use super::meters::Meters;
 use super::{Error, LoadedPolicy};
 use crate::policy::{Slot, Turn};
 
@@ -128,13 +128,6 @@ struct Shared {
     meters: Meters,
 }
 
-/// Kept, because making a handle takes as long as some fleets.
-struct Meters {
-    queue: Histogram,
-    compute: Histogram,
-    batch_size: Histogram,
-}
-
 impl Shared {
     fn lock(&self) -> MutexGuard<'_, Queue> {
         // Policies run outside the lock; the queue is whole at every step.
@@ -202,6 +195,11 @@ impl Shared {
         }
     }
 
+    /// Counts a fleet that leaves without having been computed for.
+    fn unanswered(&self, task: &Task) {
+        self.meters.policy(&task.policy.reference.name).failure.increment(1);
+    }
+
     /// One forward pass over a batch.
     fn compute(&self, batch: Vec<Queued>) {
         compute(batch, &self.meters);
@@ -220,12 +218,7 @@ impl Engine {
     /// # Errors
     /// The system refuses a thread.
     pub fn start(config: EngineConfig) -> std::io::Result<Self> {
-        let meters = Meters {
-            queue: metrics::histogram!("qedgix_act_queue_seconds"),
-            compute: metrics::histogram!("qedgix_act_compute_seconds"),
-            batch_size: metrics::histogram!("qedgix_act_batch_size"),
-        };
-        let shared = Arc::new(Shared { queue: Mutex::default(), filled: Condvar::new(), config, meters });
+        let shared = Arc::new(Shared { queue: Mutex::default(), filled: Condvar::new(), config, meters: Meters::new() });
         let engine = Self { shared: shared.clone() };
         for i in 0..config.threads {
             let shared = shared.clone();
@@ -257,9 +250,16 @@ impl Engine {
             let capacity = self.shared.config.queue;
             if queue.waiting.len() >= capacity {
                 // Who gave up makes room.
-                queue.waiting.retain(|queued| !queued.reply.is_closed());
+                queue.waiting.retain(|queued| {
+                    let wanted = !queued.reply.is_closed();
+                    if !wanted {
+                        self.shared.unanswered(&queued.task);
+                    }
+                    wanted
+                });
             }
             if queue.waiting.len() >= capacity {
+                self.shared.unanswered(&task);
                 return Err(Error::Busy(format!("the engine's queue is full ({capacity} fleets)")));
             }
             queue.waiting.push_back(Queued { task, since: Instant::now(), deadline, reply });
@@ -305,9 +305,14 @@ impl std::fmt::Debug for Engine {
 
 fn compute(batch: Vec<Queued>, meters: &Meters) {
     let begun = Instant::now();
+    let Some(policy) = batch.first().map(|first| first.task.policy.clone()) else { return };
+    let meter = meters.policy(&policy.reference.name);
+    let asked = batch.len();
     let batch: Vec<Queued> = batch.into_iter().filter_map(|queued| queued.wanted(begun)).collect();
-    let Some(first) = batch.first() else { return };
-    let policy = first.task.policy.clone();
+    meter.failure.increment((asked - batch.len()) as u64);
+    if batch.is_empty() {
+        return;
+    }
     let actions = policy.policy.actions();
     let batch_size = batch.len() as u32;
     let mut replies = Vec::with_capacity(batch.len());
@@ -343,15 +348,21 @@ fn compute(batch: Vec<Queued>, meters: &Meters) {
             .map(move |(_, _, outcome)| Outcome { timings: Timings { compute, ..outcome.timings }, ..outcome })
             .collect::<Vec<_>>()
     }));
-    meters.batch_size.record(f64::from(batch_size));
     let Ok(outcomes) = outcomes else {
+        meter.failure.increment(u64::from(batch_size));
         let fault = || Error::Fault(format!("policy {} panicked", policy.reference));
         return replies.into_iter().for_each(|reply| drop(reply.send(Err(fault()))));
     };
+    meters.batch_size.record(f64::from(batch_size));
+    meter.passes.increment(1);
+    meter.fleets.increment(u64::from(batch_size));
+    let mut answered = 0;
     for (reply, outcome) in replies.into_iter().zip(outcomes) {
         meters.queue.record(outcome.timings.queue.as_secs_f64());
         meters.compute.record(outcome.timings.compute.as_secs_f64());
         // A caller that left meanwhile needs no answer.
-        drop(reply.send(Ok(outcome)));
+        answered += u64::from(reply.send(Ok(outcome)).is_ok());
     }
+    meter.success.increment(answered);
+    meter.failure.increment(u64::from(batch_size) - answered);
 }

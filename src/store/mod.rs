@@ -2,6 +2,7 @@
 
 mod attempts;
 mod checkpoints;
+mod events;
 mod jobs;
 mod metrics;
 mod policies;
@@ -9,12 +10,14 @@ mod snapshots;
 
 pub use attempts::{Attempt, Ending, Lease, LeaseRecord, Outcome};
 pub use checkpoints::{Checkpoint, CheckpointKind, NewCheckpoint};
+pub use events::{Happened, JobEvent};
 pub use jobs::{Changed, Job, JobId, JobKind, JobSpec, JobState, NewJob, Submitted, Verb, Wanted};
 pub use metrics::{Metric, MetricCursor, MetricRow};
 pub use policies::{NewPolicyVersion, PolicyAlias, PolicyVersion};
 pub use snapshots::{OpenSnapshot, Snapshot};
 
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
@@ -52,6 +55,7 @@ pub struct Store {
     read: SqlitePool,
     /// A single connection: writers queue here instead of meeting `SQLITE_BUSY`.
     write: SqlitePool,
+    bells: Arc<events::Bells>,
 }
 
 impl Store {
@@ -71,7 +75,7 @@ impl Store {
         let write = SqlitePoolOptions::new().max_connections(1).connect_with(options.clone()).await?;
         MIGRATIONS.run(&write).await?;
         let read = SqlitePoolOptions::new().max_connections(4).connect_with(options.read_only(true)).await?;
-        Ok(Self { read, write })
+        Ok(Self { read, write, bells: Arc::new(events::Bells::new()) })
     }
 }
 

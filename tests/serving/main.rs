@@ -3,12 +3,15 @@
 
 mod act;
 mod batch;
+mod binary;
 mod conversion;
 mod environments;
 mod harness;
+mod health;
 mod large;
 mod limits;
 mod load;
+mod operations;
 mod published;
 mod rest;
 mod server;
