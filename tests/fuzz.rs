@@ -6,11 +6,12 @@
 //!     QEDGIX_FUZZ_INPUTS=1000000 cargo test --release --test fuzz -- --nocapture
 
 use std::collections::BTreeMap;
+use std::convert::Infallible;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use axum::body::Body;
-use axum::http::{Request, header};
+use axum::http::{Request, Response, header};
 use prost::Message;
 use qedgix::api::{grpc, rest};
 use qedgix::checkpoint::{Checkpoint, layout};
@@ -25,8 +26,9 @@ use qedgix::wire::{oip, v1};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use serde_json::json;
-use tonic_health::server::{HealthReporter, HealthService};
-use tower::ServiceExt;
+use tokio_util::sync::CancellationToken;
+use tower::util::BoxCloneSyncService;
+use tower::{ServiceBuilder, ServiceExt};
 
 /// Largest body and message, in bytes.
 const LARGEST: usize = 1 << 20;
@@ -255,7 +257,7 @@ fn documents() -> Vec<(&'static str, &'static str, &'static str, Vec<u8>)> {
 struct Subject {
     app: Arc<App>,
     rest: axum::Router,
-    grpc: axum::Router,
+    grpc: BoxCloneSyncService<Request<tonic::body::Body>, Response<Body>, Infallible>,
     checkpoint: Vec<u8>,
     slot: Slot,
 }
@@ -267,15 +269,17 @@ impl Subject {
         (config.max_sessions, config.max_environments) = (64, 16);
         let data = DataDir::take(dir).unwrap();
         let app = server::open(&config, &data, Clock::system()).await.unwrap();
-        let health = HealthService::from_health_reporter(HealthReporter::new());
-        let health = tonic_health::pb::health_server::HealthServer::new(health);
+        telemetry::metrics();
+        let health = grpc::Health::new(CancellationToken::new());
+        let routes = grpc::routes(&app, &health, LARGEST).prepare();
+        let grpc = ServiceBuilder::new().map_response(|r: Response<_>| r.map(Body::new)).layer(grpc::envelope()).service(routes);
         let mut recipe = TrainConfig::preset(Algorithm::Vdn, Preset::Practical);
         recipe.environment.reward_scale = Some(1.0);
         let weights = (0..layout(&recipe).len()).map(|i| (i % 7) as f32 * 0.01).collect();
         let points = |n: usize| (0..n).map(|i| [0.1 * i as f64, 0.2]).collect::<Vec<_>>();
         Self {
-            rest: rest::router(app.clone(), telemetry::metrics(), LARGEST),
-            grpc: grpc::routes(&app, health, LARGEST).into_axum_router(),
+            rest: rest::router(app.clone(), telemetry::render, LARGEST),
+            grpc: BoxCloneSyncService::new(grpc),
             app,
             checkpoint: Checkpoint::new(recipe, 1, None, weights).unwrap().to_bytes(),
             slot: Slot::from_scene(&points(3), &points(5), &[1.0; 5], 0.28),
@@ -290,7 +294,7 @@ impl Subject {
         let request = Request::post(format!("http://here/{method}"))
             .header(header::CONTENT_TYPE, "application/grpc")
             .header("te", "trailers")
-            .body(Body::from(body));
+            .body(tonic::body::Body::new(http_body_util::Full::from(body)));
         let response = self.grpc.clone().oneshot(request.unwrap()).await.unwrap();
         let (head, body) = response.into_parts();
         let body = http_body_util::BodyExt::collect(body).await.unwrap();

@@ -73,6 +73,7 @@ pub async fn act(app: &App, request: Request, deadline: Option<Instant>) -> Resu
     app.admit()?;
     match &request.memory {
         Memory::Session(id) => {
+            note("session", id);
             let session = app.sessions.get(id)?;
             within(deadline, in_session(app, &session, request, deadline)).await
         }
@@ -211,6 +212,14 @@ pub(super) async fn slot_of(fleet: &Fleet, seen: Seen, policy: &Arc<LoadedPolicy
     Ok(prepared.await.map_err(Error::internal)??)
 }
 
+/// Tells the span of the request what it is about, if anybody reads it.
+fn note(field: &'static str, value: &dyn std::fmt::Display) {
+    if tracing::enabled!(target: "qedgix::request", tracing::Level::DEBUG) {
+        tracing::Span::current().record(field, tracing::field::display(value));
+    }
+}
+
 async fn compute(app: &App, task: Task, deadline: Option<Instant>) -> Result<Outcome, Error> {
+    note("policy", &task.policy().reference);
     Ok(app.engine.run(task, deadline).await?)
 }

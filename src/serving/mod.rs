@@ -10,6 +10,7 @@ mod environments;
 mod error;
 mod fleet;
 mod memory;
+mod meters;
 mod observation;
 mod reference;
 mod registry;

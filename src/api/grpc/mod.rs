@@ -1,10 +1,13 @@
 //! gRPC: all services on one router, health and reflection included.
 
+mod call;
 mod deadline;
 mod envelope;
 mod environment;
+mod health;
 mod inference;
 mod job;
+mod meters;
 mod policy;
 mod stream;
 mod worker;
@@ -12,12 +15,11 @@ mod worker;
 use std::sync::Arc;
 
 use tonic::service::Routes;
-use tonic_health::pb::health_server::{Health, HealthServer};
 
-pub use deadline::stamp;
-use deadline::{Deadline, deadline};
+use deadline::deadline;
+pub use envelope::EnvelopeLayer;
+pub use health::Health;
 
-use crate::api::observe::Meters;
 use crate::service::App;
 use crate::wire::{DESCRIPTORS, oip, v1};
 
@@ -36,7 +38,7 @@ const BUILT_IN: &str = "the descriptors are built into the program";
 ///
 /// # Panics
 /// When the descriptor set built into the program does not decode; a test would have failed before.
-pub fn routes<H: Health>(app: &Arc<App>, health: HealthServer<H>, max_message: usize) -> Routes {
+pub fn routes(app: &Arc<App>, health: &Health, max_message: usize) -> Routes {
     let reflection = || {
         let builder = tonic_reflection::server::Builder::configure().register_encoded_file_descriptor_set(DESCRIPTORS);
         builder.register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
@@ -48,11 +50,22 @@ pub fn routes<H: Health>(app: &Arc<App>, health: HealthServer<H>, max_message: u
         .add_service(environment::service(app.clone()).max_decoding_message_size(max_message))
         .add_service(job::service(app.clone()).max_decoding_message_size(max_message))
         .add_service(worker::service(app.clone()).max_decoding_message_size(max_message.max(worker::LARGEST_MESSAGE)))
-        .add_service(health)
+        .add_service(health.server())
         .add_service(reflection().build_v1().expect(BUILT_IN))
         .add_service(reflection().build_v1alpha().expect(BUILT_IN));
-    let meters = Arc::new(Meters::new("grpc"));
-    let around = move |request, next| envelope::around(meters.clone(), request, next);
-    let router = routes.routes().into_axum_router().layer(axum::middleware::from_fn(around));
-    Routes::from(router)
+    routes.routes()
+}
+
+/// What happens around every call, to be put around all routes.
+///
+/// # Panics
+/// When a descriptor set built into the program does not decode; a test would have failed before.
+pub fn envelope() -> EnvelopeLayer {
+    use tonic_reflection::pb::{v1, v1alpha};
+    EnvelopeLayer::new(&[
+        DESCRIPTORS,
+        tonic_health::pb::FILE_DESCRIPTOR_SET,
+        v1::FILE_DESCRIPTOR_SET,
+        v1alpha::FILE_DESCRIPTOR_SET,
+    ])
 }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use futures::stream::{Stream, StreamExt};
 use tonic::{Status, Streaming};
 
-use super::envelope::of_the_table;
+use super::call::in_line;
 use crate::service::App;
 
 /// The messages of a stream until the server drains: what was asked before is answered, then the stream ends, so that it does
@@ -16,7 +16,7 @@ pub(super) fn requests<T: Send + 'static>(app: Arc<App>, messages: Streaming<T>)
     let until_drained = messages.take_until(async move { app.draining.wait().await });
     until_drained.scan(false, |over, message| {
         let last = std::mem::replace(over, message.is_err());
-        let message = message.map_err(|status| of_the_table(&status).unwrap_or(status));
+        let message = message.map_err(|status| in_line(&status).unwrap_or(status));
         ready((!last).then_some(message))
     })
 }

@@ -4,34 +4,11 @@
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::{Duration, Instant};
 
-use metrics::Histogram;
-
 use super::reply::Promise;
 use super::{Outcome, Task, Timings};
 use crate::policy::Turn;
+use crate::serving::meters::Meters;
 use crate::serving::{Error, LoadedPolicy};
-
-/// Handles of metrics, kept because making one takes as long as some fleets.
-pub(super) struct Meters {
-    queue: Histogram,
-    compute: Histogram,
-    batch_size: Histogram,
-}
-
-impl Meters {
-    pub(super) fn new() -> Self {
-        Self {
-            queue: metrics::histogram!("qedgix_act_queue_seconds"),
-            compute: metrics::histogram!("qedgix_act_compute_seconds"),
-            batch_size: metrics::histogram!("qedgix_act_batch_size"),
-        }
-    }
-
-    fn record(&self, timings: &Timings) {
-        self.queue.record(timings.queue.as_secs_f64());
-        self.compute.record(timings.compute.as_secs_f64());
-    }
-}
 
 /// A fleet that waits.
 pub(super) struct Queued {
@@ -52,6 +29,9 @@ impl Batch {
     /// Computes all fleets that somebody still waits for, and answers them. Returns how many that were.
     pub(super) fn compute(&mut self, meters: &Meters) -> usize {
         let begun = Instant::now();
+        let Some(policy) = self.fleets.first().map(|first| first.task.policy.clone()) else { return 0 };
+        let meter = meters.policy(&policy.reference.name);
+        let asked = self.fleets.len();
         let in_time = |queued: &Queued| queued.deadline.is_none_or(|deadline| begun < deadline);
         if !self.fleets.iter().all(|queued| in_time(queued) && !queued.promise.is_void()) {
             for late in self.fleets.extract_if(.., |queued| !in_time(queued)) {
@@ -59,25 +39,34 @@ impl Batch {
             }
             self.fleets.retain(|queued| !queued.promise.is_void());
         }
-        let Some(first) = self.fleets.first() else { return 0 };
-        let policy = first.task.policy.clone();
+        let size = self.fleets.len();
+        meter.failure.increment((asked - size) as u64);
+        if size == 0 {
+            return 0;
+        }
         let mut turns = recycled(std::mem::take(&mut self.turns));
         turns.extend(self.fleets.iter_mut().map(|queued| queued.task.turn()));
         // What is half-written after a panic is dropped below.
         let decided = catch_unwind(AssertUnwindSafe(|| policy.policy.act(&mut turns)));
         self.turns = recycled(turns);
-        let size = self.fleets.len();
-        meters.batch_size.record(size as f64);
         let compute = begun.elapsed();
-        for Queued { task, since, promise, .. } in self.fleets.drain(..) {
-            if decided.is_err() {
-                promise.keep(Err(panicked(&policy)));
-                continue;
+        if decided.is_err() {
+            meter.failure.increment(size as u64);
+            for queued in self.fleets.drain(..) {
+                queued.promise.keep(Err(panicked(&policy)));
             }
-            let timings = Timings { queue: begun - since, compute, batch_size: size as u32 };
-            meters.record(&timings);
-            promise.keep(Ok(task.done(timings)));
+            return size;
         }
+        meters.pass(&meter, size);
+        let mut answered = 0;
+        for Queued { task, since, promise, .. } in self.fleets.drain(..) {
+            let timings = Timings { queue: begun - since, compute, batch_size: size as u32 };
+            meters.times(timings.queue, timings.compute);
+            // A caller that left meanwhile needs no answer.
+            answered += u64::from(promise.keep(Ok(task.done(timings))));
+        }
+        meter.success.increment(answered);
+        meter.failure.increment(size as u64 - answered);
         size
     }
 }
@@ -85,14 +74,17 @@ impl Batch {
 /// Computes one fleet for its caller.
 pub(super) fn alone(mut task: Task, meters: &Meters) -> Result<Outcome, Error> {
     let begun = Instant::now();
+    let meter = meters.policy(&task.policy.reference.name);
     // What is half-written after a panic is dropped.
     let decided = catch_unwind(AssertUnwindSafe(|| task.policy.clone().policy.act(&mut [task.turn()])));
-    meters.batch_size.record(1.0);
     if decided.is_err() {
+        meter.failure.increment(1);
         return Err(panicked(&task.policy));
     }
+    meters.pass(&meter, 1);
+    meter.success.increment(1);
     let timings = Timings { queue: Duration::ZERO, compute: begun.elapsed(), batch_size: 1 };
-    meters.record(&timings);
+    meters.times(timings.queue, timings.compute);
     Ok(task.done(timings))
 }
 

@@ -16,9 +16,10 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use batch::{Batch, Meters, Queued};
+use batch::{Batch, Queued};
 use reply::{Expected, Places};
 
+use super::meters::Meters;
 use super::{Error, LoadedPolicy};
 use crate::policy::{Slot, Turn};
 
@@ -68,6 +69,11 @@ impl Task {
         q_values.clear();
         q_values.resize(slot.uavs() * policy.policy.actions(), f32::NAN);
         Self { policy, slot, step, out: Outcome { memory, headings, q_values, timings: Timings::default() } }
+    }
+
+    /// Who decides.
+    pub fn policy(&self) -> &LoadedPolicy {
+        &self.policy
     }
 
     fn turn(&mut self) -> Turn<'_> {
@@ -196,6 +202,11 @@ impl Shared {
         }
     }
 
+    /// Counts a fleet that leaves without having been computed for.
+    fn unanswered(&self, task: &Task) {
+        self.meters.policy(&task.policy.reference.name).failure.increment(1);
+    }
+
     /// Computes a small fleet that comes while nothing else is to be done; gives it back otherwise.
     fn at_once(&self, task: Task) -> Result<Result<Outcome, Error>, Task> {
         {
@@ -247,9 +258,16 @@ impl Shared {
         let capacity = self.config.queue;
         if queue.waiting.len() >= capacity {
             // Who gave up makes room.
-            queue.waiting.retain(|queued| !queued.promise.is_void());
+            queue.waiting.retain(|queued| {
+                let wanted = !queued.promise.is_void();
+                if !wanted {
+                    self.unanswered(&queued.task);
+                }
+                wanted
+            });
         }
         if queue.waiting.len() >= capacity {
+            self.unanswered(&task);
             return Err(Error::Busy(format!("the engine's queue is full ({capacity} fleets)")));
         }
         let (promise, expected) = self.places.pair();

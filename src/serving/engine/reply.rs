@@ -72,18 +72,19 @@ impl Promise {
         self.place.as_ref().is_none_or(|place| matches!(*place.lock(), State::Left))
     }
 
-    /// Answers.
-    pub(super) fn keep(mut self, answer: Result<Outcome, Error>) {
-        self.settle(answer);
+    /// Answers; whether somebody was there to hear it.
+    pub(super) fn keep(mut self, answer: Result<Outcome, Error>) -> bool {
+        self.settle(answer)
     }
 
-    fn settle(&mut self, answer: Result<Outcome, Error>) {
-        let Some(place) = self.place.take() else { return };
+    fn settle(&mut self, answer: Result<Outcome, Error>) -> bool {
+        let Some(place) = self.place.take() else { return false };
         let mut state = place.lock();
         match std::mem::take(&mut *state) {
             State::Left => {
                 drop(state);
                 self.places.take_back(place);
+                return false;
             }
             State::Awaited(waker) => {
                 *state = State::Kept(answer);
@@ -92,6 +93,7 @@ impl Promise {
             }
             State::Open | State::Kept(_) => *state = State::Kept(answer),
         }
+        true
     }
 }
 
