@@ -16,22 +16,24 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use hyper::Request;
+use hyper::body::Incoming;
 use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
-use tonic_health::ServingStatus;
-use tonic_health::server::{HealthReporter, HealthService};
+use tower::ServiceExt;
 
 use self::connections::{Connections, Protocol};
 pub use self::connections::{KEEPALIVE, WINDOW};
+use self::prompt::PromptBody;
 pub use self::tls::Tls;
 use crate::api::{grpc, rest};
 use crate::config::Config;
 use crate::invalid::Invalid;
 use crate::jobs::{Jobs, LocalProcess, Settings};
 use crate::service::keys::{Keyring, Rate};
-use crate::service::{App, Draining, policies};
-use crate::serving::{Clock, Engine, Environments, EnvironmentsConfig, Limits, Registry, Sessions};
+use crate::service::{App, Draining, Watchers, operations, policies};
+use crate::serving::{Clock, Engine, Environments, EnvironmentsConfig, Limits, Sessions};
 use crate::store::{self, Store};
 use crate::telemetry;
 
@@ -207,10 +209,11 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         keys,
         jobs: Jobs::open(store.clone(), settings, Arc::new(executor)).await?,
         store,
-        registry: Registry::default(),
+        registry: Arc::default(),
         sessions: Sessions::new(sessions, clock.clone()),
         environments: Environments::new(environments, clock.clone()),
         engine: Engine::start(config.engine).map_err(Error::Engine)?,
+        watchers: Watchers::new(config.max_watchers, config.heartbeat),
         clock,
         draining: Draining::default(),
     };
@@ -231,17 +234,11 @@ pub async fn run(
 ) -> Result<(), Error> {
     let endpoints = listeners.endpoints().map_err(Error::Listener)?;
     let workers = listeners.workers.local_addr().map_err(Error::Listener)?;
-    let metrics = telemetry::metrics();
-    let health = HealthReporter::new();
-    let report = async |status| {
-        for service in ["", grpc::SERVICES[0]].iter().chain(&grpc::SERVICES[1..]) {
-            health.set_service_status(*service, status).await;
-        }
-    };
-    report(ServingStatus::Serving).await;
+    telemetry::metrics();
     let stop = CancellationToken::new();
+    let health = grpc::Health::new(stop.clone());
+    health.report(operations::vitals(&app).await);
 
-    let health_server = tonic_health::pb::health_server::HealthServer::new(HealthService::from_health_reporter(health.clone()));
     let connections = Connections {
         permits: Arc::new(Semaphore::new(config.max_connections)),
         tls: listeners.tls,
@@ -250,14 +247,20 @@ pub async fn run(
         stop: stop.clone(),
     };
     let own = Connections { permits: Arc::new(Semaphore::new(WORKERS)), tls: None, ..connections.clone() };
-    let serve_workers = own.serve(listeners.workers, Protocol::Grpc, grpc::worker_routes(&app, config.max_message_size));
-    let routes = grpc::routes(&app, health_server, config.max_message_size);
-    let serve_grpc = connections.clone().serve(listeners.grpc, Protocol::Grpc, routes);
-    let router = rest::router(app.clone(), metrics.clone(), config.max_message_size);
+    // A stream of gRPC may be silent for as long as its connection answers pings, a body of REST may not.
+    let grpc = |services: grpc::Services| services.map_request(|r: Request<Incoming>| r.map(tonic::body::Body::new));
+    let services = grpc::services(&app, &health, config.max_message_size);
+    let patience = config.read_timeout;
+    let router = rest::router(app.clone(), telemetry::render, config.max_message_size);
+    let router =
+        router.map_request(move |r: Request<Incoming>| r.map(|body| axum::body::Body::new(PromptBody::new(body, patience))));
+    let serve_workers = own.serve(listeners.workers, Protocol::Grpc, grpc(grpc::worker_services(&app, config.max_message_size)));
+    let serve_grpc = connections.clone().serve(listeners.grpc, Protocol::Grpc, grpc(services));
     let serve_rest = connections.serve(listeners.http, Protocol::Http, router);
 
     let scheduling = tokio::spawn(app.jobs.clone().run(format!("http://{workers}")));
-    let housekeeping = tokio::spawn(housekeeping(app.clone(), metrics, config.session_ttl.min(config.environment_ttl)));
+    let housekeeping = tokio::spawn(housekeeping(app.clone(), config.session_ttl.min(config.environment_ttl)));
+    let monitoring = tokio::spawn(health.clone().follow(app.clone()));
     let following = tokio::spawn(keys::follow(app.clone()));
     data.publish(endpoints)?;
     tracing::info!(grpc = %endpoints.grpc, http = %endpoints.http, policies = app.registry.len(), "serving");
@@ -266,7 +269,7 @@ pub async fn run(
         shutdown.await;
         tracing::info!("draining");
         app.draining.begin();
-        report(ServingStatus::NotServing).await;
+        health.drain();
         // Workers send their snapshots, so they are waited for while everything still answers.
         app.jobs.drain(config.drain_timeout + Duration::from_secs(5)).await;
         stop.cancel();
@@ -280,6 +283,7 @@ pub async fn run(
     }
     scheduling.abort();
     housekeeping.abort();
+    monitoring.abort();
     following.abort();
     keys::keep_last_uses(&app).await;
     data.withdraw();
@@ -291,12 +295,13 @@ pub async fn run(
 const WORKERS: usize = 4096;
 
 /// What has to be done now and then, however quiet it is.
-async fn housekeeping(app: Arc<App>, metrics: metrics_exporter_prometheus::PrometheusHandle, ttl: Duration) {
-    let pause = (ttl / 4).clamp(Duration::from_secs(1), Duration::from_secs(30));
+async fn housekeeping(app: Arc<App>, ttl: Duration) {
+    // Figures that were recorded wait in memory until then.
+    let pause = (ttl / 4).clamp(Duration::from_secs(1), Duration::from_secs(5));
     loop {
         tokio::time::sleep(pause).await;
         app.sessions.sweep();
         app.environments.table().sweep();
-        metrics.run_upkeep();
+        telemetry::metrics().run_upkeep();
     }
 }

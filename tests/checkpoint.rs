@@ -4,6 +4,8 @@ use proptest::prelude::*;
 use qedgix::checkpoint::{self, Checkpoint, Error};
 use qedgix::env::EpisodeMetrics;
 use qedgix::learner::{Algorithm, MixerKind, Preset, TrainConfig, evaluate, layouts};
+use qedgix::policy::{Policy, Slot, Turn};
+use rand::RngExt;
 use serde_json::{Value, json};
 
 fn config() -> TrainConfig {
@@ -178,6 +180,134 @@ fn values_must_be_numbers_of_sensible_size() {
     assert!(Checkpoint::new(config(), 0, None, vec![0.0; 3]).is_err());
 }
 
+#[test]
+fn containers_that_lie_are_refused() {
+    let good = example(config()).to_bytes();
+    let length = u64::from_le_bytes(good[..8].try_into().unwrap());
+    let announcing = |length: u64| {
+        let mut bytes = good.clone();
+        bytes[..8].copy_from_slice(&length.to_le_bytes());
+        Checkpoint::from_bytes(&bytes).unwrap_err().to_string()
+    };
+    for absurd in [u64::MAX, 1 << 63, 1 << 40, (16 << 20) + 1] {
+        assert!(announcing(absurd).contains(&format!("a header of {absurd} bytes; at most 16777216 are read")));
+    }
+    assert!(announcing(16 << 20).contains("a header of 16777216 bytes in a file of"));
+    assert!(announcing(length - 8).contains("its header: EOF while parsing"));
+    assert!(announcing(0).contains("its header: EOF while parsing"));
+    for cut in 0..8 {
+        let error = Checkpoint::from_bytes(&good[..cut]).unwrap_err().to_string();
+        assert!(error.contains("less than the length of a header"), "{error}");
+    }
+    let offsets = |name: &'static str, from: u64, to: u64| refused(move |h| h[name]["data_offsets"] = json!([from, to]));
+    // Names are in the order of their data: the first tensor is agent.fc.bias, 256 bytes.
+    let (header, data) = parts(&good);
+    let first = "agent.fc.bias";
+    assert_eq!(header[first]["data_offsets"], json!([0, 256]));
+    let second = "agent.fc.weight";
+    let end = header[second]["data_offsets"][1].as_u64().unwrap();
+    assert!(offsets(second, 0, end).contains("`agent.fc.weight` begins at byte 0 of the data; expected 256"), "overlap");
+    assert!(offsets(second, 0, 256).contains("without gap or overlap"), "the same data twice");
+    assert!(offsets(second, 260, end).contains("begins at byte 260 of the data; expected 256"), "a gap");
+    assert!(offsets(second, end, 256).contains("begins at byte"), "backwards");
+    assert!(offsets(first, 0, 255).contains("of shape [64] has 255 bytes"));
+    let huge = usize::MAX as u64;
+    assert!(offsets(first, 0, huge).contains(&format!("is bytes 0 to {huge} of {} bytes", data.len())));
+    let overflowing = refused(|h| h[first]["shape"] = json!([1_u64 << 62, 1_u64 << 62]));
+    assert!(overflowing.contains("of shape [4611686018427387904, 4611686018427387904] has 256 bytes"), "{overflowing}");
+    let longer = Checkpoint::from_bytes(&[&good[..], &[0; 4]].concat()).unwrap_err().to_string();
+    assert!(longer.contains(&format!("{} bytes of data, of which tensors take {}", data.len() + 4, data.len())), "{longer}");
+    assert!(refused(|h| h[first]["color"] = json!("red")).contains("unknown field `color`"));
+    assert!(refused(|h| h[first]["shape"] = json!([-1])).contains("its header: invalid value"));
+    let text = header.to_string();
+    for name in [first, "__metadata__"] {
+        let entry = format!("\"{name}\":{}", header[name]);
+        let twice = text.replacen(&entry, &format!("{entry},{entry}"), 1);
+        let bytes = [&(twice.len() as u64).to_le_bytes()[..], twice.as_bytes(), &data].concat();
+        let error = Checkpoint::from_bytes(&bytes).unwrap_err().to_string();
+        assert!(error.contains(&format!("\"{name}\" is there twice")), "{error}");
+    }
+    let deep = format!("{{\"a\":{}", "[".repeat(1 << 20));
+    let bytes = [&(deep.len() as u64).to_le_bytes()[..], deep.as_bytes()].concat();
+    assert!(matches!(Checkpoint::from_bytes(&bytes), Err(Error::Container(_))));
+}
+
+/// Flies a few slots with the fleet that the checkpoint was trained with and, where it may, with others.
+fn fly(checkpoint: &Checkpoint, seed: u64) {
+    let (policy, dims) = (checkpoint.policy(), checkpoint.config().dims());
+    let policy: &dyn Policy = &policy;
+    for (uavs, users) in [(dims.uavs, dims.users), (1, 1), (5, 9)] {
+        // Larger ones fly in `service`, where observations are bounded.
+        if policy.check_fleet(uavs, users).is_err() || uavs + users > 64 {
+            continue;
+        }
+        let mut rng = qedgix::rng::stream(seed, "test-flight", 0);
+        let mut place = || [rng.random_range(-0.2..1.2), rng.random_range(-0.2..1.2)];
+        let mut memory = vec![0.0; policy.memory_len(uavs, users)];
+        policy.start(uavs, users, seed, &mut memory);
+        for step in 0..3 {
+            let (at, of): (Vec<_>, Vec<_>) = ((0..uavs).map(|_| place()).collect(), (0..users).map(|_| place()).collect());
+            let aoi: Vec<f32> = (0..users).map(|user| (user * 1000) as f32).collect();
+            let slot = Slot::from_scene(&at, &of, &aoi, policy.detection_range());
+            let (mut headings, mut q) = (vec![255; uavs], vec![0.0; uavs * policy.actions()]);
+            policy.act(&mut [Turn { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: Some(&mut q) }]);
+            assert!(headings.iter().all(|&heading| usize::from(heading) < policy.actions()), "{headings:?}");
+        }
+    }
+}
+
+/// Configurations of every kind of agent and mixer, small, with their neighbours on the far side of valid.
+fn configurations() -> impl Strategy<Value = TrainConfig> {
+    let algorithm = prop::sample::select(vec!["qmix", "vdn", "iql", "qedgix", "agggnn", "rgcn"]);
+    let preset = prop::sample::select(vec!["paper", "authors", "practical"]);
+    let sizes = (1..5_usize, 1..6_usize, 1..4_usize, 1..4_usize);
+    let observation = prop::sample::select(vec!["flat", "set"]);
+    let identity = prop::sample::select(vec!["onehot", "phase", "token", "none"]);
+    let range = prop::sample::select(vec![0.12, 0.28, 2.0]);
+    (algorithm, preset, sizes, observation, identity, range, any::<[bool; 4]>()).prop_filter_map(
+        "hops are for agents without a graph",
+        |(algorithm, preset, (uavs, users, layers, hops), observation, identity, range, [position, loops, normalise, hover])| {
+            let environment = json!({"uavs": uavs, "users": users, "detection_range": range, "hover": hover});
+            let training = json!({"layers": layers, "hops": hops, "observation": observation, "identity": identity,
+                "self_position": position, "self_loops": loops, "normalise": normalise});
+            let named = |name: &str| serde_json::from_value(json!(name)).unwrap();
+            let object = |value: &Value| value.as_object().unwrap().clone();
+            let preset = serde_json::from_value(json!(preset)).unwrap();
+            TrainConfig::resolve(named(algorithm), preset, &object(&environment), &object(&training), 1).ok()
+        },
+    )
+}
+
+/// All places in a document.
+fn places(value: &Value, at: &str, found: &mut Vec<String>) {
+    found.push(at.to_owned());
+    match value {
+        Value::Object(fields) => fields.iter().for_each(|(name, value)| places(value, &format!("{at}/{name}"), found)),
+        Value::Array(items) => items.iter().enumerate().for_each(|(i, value)| places(value, &format!("{at}/{i}"), found)),
+        _ => {}
+    }
+}
+
+/// `document` with what is at one of its places put in another's place, or replaced by something of no sense.
+fn disarranged(document: &mut Value, (to, from, other): (usize, usize, usize)) {
+    let mut all = Vec::new();
+    places(document, "", &mut all);
+    let odd = [
+        json!(null),
+        json!(0),
+        json!(-1),
+        json!(1e300),
+        json!(u64::MAX),
+        json!(""),
+        json!("F32"),
+        json!([]),
+        json!({}),
+        json!(true),
+    ];
+    let value = if other < odd.len() { odd[other].clone() } else { document.pointer(&all[from % all.len()]).unwrap().clone() };
+    *document.pointer_mut(&all[to % all.len()]).unwrap() = value;
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(200))]
 
@@ -194,7 +324,39 @@ proptest! {
             prop_assert!(Checkpoint::from_bytes(&bytes).is_err(), "a truncated file is never whole");
         } else if let Ok(checkpoint) = Checkpoint::from_bytes(&bytes) {
             prop_assert!(checkpoint.parameters().iter().all(|x| x.is_finite()));
-            checkpoint.policy();
+            fly(&checkpoint, 1);
+        }
+    }
+
+    #[test]
+    fn whatever_is_accepted_flies(config in configurations(), scale in prop::sample::select(vec![0.1, 10.0, 1e6]), seed: u64) {
+        let mut rng = qedgix::rng::stream(seed, "test-weights", 0);
+        let weights = (0..checkpoint::layout(&config).len()).map(|_| rng.random_range(-scale..scale)).collect();
+        let bytes = Checkpoint::new(config, 1, None, weights).unwrap().to_bytes();
+        fly(&Checkpoint::from_bytes(&bytes).unwrap(), seed);
+    }
+
+    #[test]
+    fn disarranged_headers_are_refused_or_fly(
+        config in configurations(),
+        changes in prop::collection::vec((any::<usize>(), any::<usize>(), 0..20_usize), 1..3),
+        inner: bool,
+    ) {
+        let (mut header, data) = parts(&example(config).to_bytes());
+        for &change in &changes {
+            if inner {
+                let mut inside: Value = serde_json::from_str(header["__metadata__"]["config"].as_str().unwrap()).unwrap();
+                disarranged(&mut inside, change);
+                header["__metadata__"]["config"] = inside.to_string().into();
+            } else {
+                disarranged(&mut header, change);
+                if header["__metadata__"]["config"].as_str().is_none() {
+                    break;
+                }
+            }
+        }
+        if let Ok(checkpoint) = Checkpoint::from_bytes(&file(&header, &data)) {
+            fly(&checkpoint, 1);
         }
     }
 

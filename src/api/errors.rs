@@ -18,6 +18,7 @@ fn row(error: &Error) -> (Code, StatusCode) {
         Error::Conflict { .. } => (Code::AlreadyExists, StatusCode::CONFLICT),
         Error::Busy { .. } => (Code::ResourceExhausted, StatusCode::TOO_MANY_REQUESTS),
         Error::TooLarge(_) => (Code::ResourceExhausted, StatusCode::PAYLOAD_TOO_LARGE),
+        Error::MediaType(_) => (Code::InvalidArgument, StatusCode::UNSUPPORTED_MEDIA_TYPE),
         Error::Deadline(_) => (Code::DeadlineExceeded, StatusCode::GATEWAY_TIMEOUT),
         Error::Draining => (Code::Unavailable, StatusCode::SERVICE_UNAVAILABLE),
         Error::Unauthenticated(_) => (Code::Unauthenticated, StatusCode::UNAUTHORIZED),
@@ -35,21 +36,31 @@ pub fn retry_after_seconds(error: &Error) -> Option<u64> {
     }
 }
 
-fn log_internal(error: &Error) {
+/// Logs a fault that no other line will tell about: part of an answer, or of a stream that has begun.
+pub(super) fn log_internal(error: &Error) {
     if let Error::Internal(cause) = error {
         tracing::error!(error = %cause, "internal error");
     }
 }
 
+/// The status with which a stream that has begun ends.
+pub(super) fn in_stream(error: Error) -> Status {
+    log_internal(&error);
+    error.into()
+}
+
+/// The cause of a fault is the status's source: it is logged when the call ends, and not sent.
 impl From<Error> for Status {
     fn from(error: Error) -> Self {
-        log_internal(&error);
         let mut status = Self::new(row(&error).0, error.to_string());
         if let Ok(code) = error.code().parse() {
             status.metadata_mut().insert("qedgix-code", code);
         }
         if let Some(seconds) = retry_after_seconds(&error) {
             status.metadata_mut().insert("retry-after", seconds.into());
+        }
+        if let Error::Internal(cause) = error {
+            status.set_source(cause.into());
         }
         status
     }
@@ -62,7 +73,7 @@ pub fn act_error(error: &Error) -> crate::wire::v1::ActError {
 }
 
 /// RFC 9457 problem details.
-#[derive(Debug, Serialize)]
+#[derive(Clone, Debug, Serialize)]
 pub struct Problem {
     /// `about:blank`: the title says it all.
     pub r#type: &'static str,
@@ -94,15 +105,20 @@ impl Problem {
 impl IntoResponse for Problem {
     fn into_response(self) -> Response {
         let status = StatusCode::from_u16(self.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
-        let mut response = (status, Json(self)).into_response();
+        let mut response = (status, Json(&self)).into_response();
+        // For those who say it in other words.
+        response.extensions_mut().insert(self);
         response.headers_mut().insert(header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
         response
     }
 }
 
+/// What an error response is about, for the log.
+#[derive(Clone, Debug)]
+pub(super) struct Failure(pub(super) String);
+
 impl IntoResponse for Error {
     fn into_response(self) -> Response {
-        log_internal(&self);
         let mut problem = Problem::new(row(&self).1, self.code(), self.to_string());
         if let Self::Invalid(e) = &self {
             problem.field = Some(e.field.clone());
@@ -114,6 +130,11 @@ impl IntoResponse for Error {
         if let Self::Unauthenticated(_) = self {
             response.headers_mut().insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer realm=\"qedgix\""));
         }
+        let detail = match &self {
+            Self::Internal(cause) => cause.to_string(),
+            error => error.to_string(),
+        };
+        response.extensions_mut().insert(Failure(detail));
         response
     }
 }

@@ -1,10 +1,12 @@
-//! The outside: gRPC, REST, conversions between wire and domain, one table of errors.
+//! The outside: gRPC, REST, the Open Inference Protocol over both, conversions between wire and domain, one table of errors.
 
 pub mod access;
 pub mod convert;
 mod errors;
+mod gate;
 pub mod grpc;
 mod observe;
+mod oip;
 pub mod rest;
 
 pub use errors::{Problem, retry_after_seconds};

@@ -1,14 +1,20 @@
 //! The safetensors container: named f32 tensors and string metadata. Knows nothing of what they mean.
 //!
 //! Written here rather than by the crate, whose metadata has the order of a hash map: the same content must give the same
-//! bytes, because files are known by their digest. Reading is the crate's.
+//! bytes, because files are known by their digest. Read here, because files come from anywhere: a name that is there twice is
+//! an error, sums of offsets cannot overflow, and messages say which tensor is wrong.
 
 use std::collections::BTreeMap;
+use std::fmt;
 
-use safetensors::{Dtype, SafeTensors};
+use serde::de::{Error as _, MapAccess, Visitor};
+use serde::{Deserialize, Deserializer};
 use serde_json::{Map, Value, json};
 
 use super::Error;
+
+/// Where a header keeps what is no tensor.
+const METADATA: &str = "__metadata__";
 
 /// A named f32 tensor, row-major.
 #[derive(Clone, Debug, PartialEq)]
@@ -27,7 +33,7 @@ pub(super) fn write(metadata: &BTreeMap<&str, String>, tensors: &[Tensor]) -> Ve
     sorted.sort_by(|a, b| a.name.cmp(&b.name));
     // serde_json's map is ordered by key, whatever the names.
     let mut header = Map::new();
-    header.insert("__metadata__".into(), json!(metadata));
+    header.insert(METADATA.into(), json!(metadata));
     let mut end = 0;
     for t in &sorted {
         let begin = end;
@@ -45,23 +51,101 @@ pub(super) fn write(metadata: &BTreeMap<&str, String>, tensors: &[Tensor]) -> Ve
     bytes
 }
 
-/// Metadata and tensors of a file, sorted by name. Only finite values of sensible size pass.
+/// Most bytes of a header: a configuration with a place for each of the most UAVs and users there may be, several times over.
+const LARGEST_HEADER: u64 = 16 << 20;
+
+/// Metadata and tensors of a file, sorted by name. Only finite values of sensible size pass. What is read takes a small
+/// multiple of the bytes that are there, whatever they announce.
 pub(super) fn read(bytes: &[u8]) -> Result<(BTreeMap<String, String>, Vec<Tensor>), Error> {
-    let container = |e: safetensors::SafeTensorError| Error::Container(e.to_string());
-    let (_, header) = SafeTensors::read_metadata(bytes).map_err(container)?;
-    let metadata = header.metadata().clone().unwrap_or_default().into_iter().collect();
-    let file = SafeTensors::deserialize(bytes).map_err(container)?;
-    let mut tensors = Vec::with_capacity(file.len());
-    for (name, view) in file.iter() {
-        if view.dtype() != Dtype::F32 {
-            return Err(Error::Type { name: name.into(), found: view.dtype().to_string() });
+    let container = |reason: String| Error::Container(reason);
+    let Some((announced, rest)) = bytes.split_first_chunk() else {
+        return Err(container(format!("{} bytes, less than the length of a header", bytes.len())));
+    };
+    let announced = u64::from_le_bytes(*announced);
+    if announced > LARGEST_HEADER {
+        return Err(container(format!("a header of {announced} bytes; at most {LARGEST_HEADER} are read")));
+    }
+    let Some((header, data)) = rest.split_at_checked(announced as usize) else {
+        return Err(container(format!("a header of {announced} bytes in a file of {}", bytes.len())));
+    };
+    let header: Header = serde_json::from_slice(header).map_err(|e| container(format!("its header: {e}")))?;
+    let mut entries: Vec<(String, Entry)> = header.tensors.into_iter().collect();
+    entries.sort_by_key(|(_, entry)| entry.data_offsets);
+    let mut tensors = Vec::with_capacity(entries.len());
+    let mut end = 0;
+    for (name, Entry { dtype, shape, data_offsets: [from, to] }) in entries {
+        if dtype != "F32" {
+            return Err(Error::Type { name, found: dtype });
         }
-        let values: Vec<f32> = view.data().chunks_exact(4).map(|x| f32::from_le_bytes([x[0], x[1], x[2], x[3]])).collect();
-        if let Some(i) = values.iter().position(|x| x.is_nan() || x.abs() > super::LARGEST) {
-            return Err(Error::Value { name: name.into(), index: i, found: values[i] });
+        if from != end {
+            return Err(container(format!(
+                "tensor `{name}` begins at byte {from} of the data; expected {end}, without gap or overlap"
+            )));
         }
-        tensors.push(Tensor { name: name.into(), shape: view.shape().to_vec(), values });
+        let Some(values) = data.get(from..to) else {
+            return Err(container(format!("tensor `{name}` is bytes {from} to {to} of {} bytes of data", data.len())));
+        };
+        let size = shape.iter().try_fold(4, |size: usize, &n| size.checked_mul(n));
+        if size != Some(values.len()) {
+            return Err(container(format!("tensor `{name}` of shape {shape:?} has {} bytes", values.len())));
+        }
+        let values: Vec<f32> = values.chunks_exact(4).map(|x| f32::from_le_bytes([x[0], x[1], x[2], x[3]])).collect();
+        if let Some(index) = values.iter().position(|x| x.is_nan() || x.abs() > super::LARGEST) {
+            return Err(Error::Value { name, index, found: values[index] });
+        }
+        end = to;
+        tensors.push(Tensor { name, shape, values });
+    }
+    if end != data.len() {
+        return Err(container(format!("{} bytes of data, of which tensors take {end}", data.len())));
     }
     tensors.sort_by(|a, b| a.name.cmp(&b.name));
-    Ok((metadata, tensors))
+    Ok((header.metadata, tensors))
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Entry {
+    dtype: String,
+    shape: Vec<usize>,
+    data_offsets: [usize; 2],
+}
+
+#[derive(Default)]
+struct Header {
+    metadata: BTreeMap<String, String>,
+    tensors: BTreeMap<String, Entry>,
+}
+
+impl<'de> Deserialize<'de> for Header {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct Reader;
+
+        impl<'de> Visitor<'de> for Reader {
+            type Value = Header;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("an object of tensors and __metadata__")
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Header, A::Error> {
+                let mut header = Header::default();
+                while let Some(name) = map.next_key::<String>()? {
+                    let again = if name == METADATA {
+                        let before = std::mem::replace(&mut header.metadata, map.next_value()?);
+                        !before.is_empty()
+                    } else {
+                        header.tensors.insert(name.clone(), map.next_value()?).is_some()
+                    };
+                    // Whichever counted, somebody else would read another file.
+                    if again {
+                        return Err(A::Error::custom(format!("{name:?} is there twice")));
+                    }
+                }
+                Ok(header)
+            }
+        }
+
+        deserializer.deserialize_map(Reader)
+    }
 }

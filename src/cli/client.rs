@@ -13,8 +13,10 @@ use super::connect::{ConnectArgs, Connector};
 
 /// Time that a request may take.
 const PATIENCE: Duration = Duration::from_secs(60);
+/// Time for a checkpoint to go over.
+const TRANSFER: Duration = Duration::from_secs(600);
 /// Largest answer, in bytes.
-const LARGEST: usize = 256 << 20;
+const LARGEST: usize = 1 << 30;
 
 /// A server to talk to.
 #[derive(Clone, Debug)]
@@ -41,7 +43,7 @@ impl Client {
     /// # Errors
     /// The server cannot be reached or answers with a problem, whose detail is told.
     pub async fn get(&self, path: &str) -> anyhow::Result<Value> {
-        self.answer(Method::GET, path, Body::empty()).await
+        self.json(Method::GET, path, None).await
     }
 
     /// `POST path` with a JSON body.
@@ -49,29 +51,77 @@ impl Client {
     /// # Errors
     /// As [`Client::get`].
     pub async fn post(&self, path: &str, body: &Value) -> anyhow::Result<Value> {
-        self.answer(Method::POST, path, Body::from(body.to_string())).await
+        self.json(Method::POST, path, Some(body)).await
     }
 
-    async fn answer(&self, method: Method, path: &str, body: Body) -> anyhow::Result<Value> {
+    /// `PUT path` with a JSON body.
+    ///
+    /// # Errors
+    /// As [`Client::get`].
+    pub async fn put(&self, path: &str, body: &Value) -> anyhow::Result<Value> {
+        self.json(Method::PUT, path, Some(body)).await
+    }
+
+    /// `DELETE path`.
+    ///
+    /// # Errors
+    /// As [`Client::get`].
+    pub async fn delete(&self, path: &str) -> anyhow::Result<Value> {
+        self.json(Method::DELETE, path, None).await
+    }
+
+    /// `POST path` with a body of bytes, which may take a while.
+    ///
+    /// # Errors
+    /// As [`Client::get`].
+    pub async fn upload(&self, path: &str, bytes: Vec<u8>) -> anyhow::Result<Value> {
+        let body = self.bytes(Method::POST, path, Some(("application/octet-stream", bytes)), TRANSFER).await?;
+        Ok(serde_json::from_slice(&body).unwrap_or(Value::Null))
+    }
+
+    /// `GET path` of bytes, which may take a while.
+    ///
+    /// # Errors
+    /// As [`Client::get`].
+    pub async fn download(&self, path: &str) -> anyhow::Result<Vec<u8>> {
+        self.bytes(Method::GET, path, None, TRANSFER).await
+    }
+
+    async fn json(&self, method: Method, path: &str, body: Option<&Value>) -> anyhow::Result<Value> {
+        let body = body.map(|body| ("application/json", body.to_string().into_bytes()));
+        let answer = self.bytes(method, path, body, PATIENCE).await?;
+        Ok(serde_json::from_slice(&answer).unwrap_or(Value::Null))
+    }
+
+    /// Sends a request, with a body and its type, and returns the body of an answer that went well.
+    async fn bytes(
+        &self,
+        method: Method,
+        path: &str,
+        body: Option<(&str, Vec<u8>)>,
+        patience: Duration,
+    ) -> anyhow::Result<Vec<u8>> {
         let mut request = Request::builder().method(method).uri(format!("{}{path}", self.base));
-        request = request.header(header::CONTENT_TYPE, "application/json");
         if let Some(value) = &self.authorization {
             request = request.header(header::AUTHORIZATION, value);
         }
-        let request = request.body(body)?;
+        if let Some((kind, _)) = &body {
+            request = request.header(header::CONTENT_TYPE, *kind);
+        }
+        let request = request.body(body.map_or_else(Body::empty, |(_, bytes)| Body::from(bytes)))?;
         let answered = async {
             let answer = self.http.request(request).await.with_context(|| format!("cannot reach {}{path}", self.base))?;
             let (head, body) = answer.into_parts();
             let body = to_bytes(Body::new(body), LARGEST).await.with_context(|| format!("{path}: the answer broke off"))?;
             anyhow::Ok((head.status, body))
         };
-        let answered = tokio::time::timeout(PATIENCE, answered).await;
-        let (status, body) = answered.with_context(|| format!("{}{path}: no answer in {PATIENCE:?}", self.base))??;
-        let json: Value = serde_json::from_slice(&body).unwrap_or(Value::Null);
+        let answered = tokio::time::timeout(patience, answered).await;
+        let (status, body) = answered.with_context(|| format!("{}{path}: no answer in {patience:?}", self.base))??;
         if !status.is_success() {
-            bail!("{path}: {}", json["detail"].as_str().unwrap_or(status.as_str()));
+            let problem: Value = serde_json::from_slice(&body).unwrap_or(Value::Null);
+            bail!("{path}: {}", problem["detail"].as_str().unwrap_or(status.as_str()));
         }
-        Ok(json)
+        Ok(body.into())
     }
 
     /// Waits for a job to end; `tell` is shown the job every quarter of a second.

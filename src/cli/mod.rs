@@ -11,6 +11,7 @@ mod files;
 mod fly;
 mod keys;
 mod local;
+mod policies;
 mod progress;
 mod report;
 mod run_args;
@@ -41,6 +42,8 @@ enum Command {
     Train(train::TrainArgs),
     /// Compare policies on frozen layouts
     Evaluate(evaluate::EvaluateArgs),
+    /// The policies of a server: list, upload, export, aliases, load and unload
+    Policies(policies::PoliciesArgs),
     /// Run, resume and draw an experiment: many training runs and what they say together
     Experiment(experiment::ExperimentArgs),
     /// Make, list and revoke the API keys of a server
@@ -58,6 +61,7 @@ pub fn run() -> ExitCode {
         Command::Demo(args) => block_on(demo::run(args)),
         Command::Train(args) => block_on(train::run(args)),
         Command::Evaluate(args) => block_on(evaluate::run(args)),
+        Command::Policies(args) => block_on(policies::run(args)),
         Command::Experiment(args) => block_on(experiment::run(args)),
         Command::Keys(args) => block_on(keys::run(args)),
         Command::Bench(args) => block_on(bench::run(args)),

@@ -29,6 +29,17 @@ pub fn of_policies(rows: &[(String, Summary)]) -> Table {
     table
 }
 
+/// A table of words; its first row is a header, unless all of it is empty.
+pub fn of_rows<const N: usize>(header: [&str; N], rows: impl IntoIterator<Item = [String; N]>) -> String {
+    let mut table = Table::new();
+    table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
+    if header.iter().any(|word| !word.is_empty()) {
+        table.set_header(header);
+    }
+    table.add_rows(rows);
+    table.to_string()
+}
+
 /// A learning curve in one line of at most 40 characters, lowest value lowest.
 pub fn sparkline(values: &[f64]) -> String {
     const WIDTH: usize = 40;

@@ -3,15 +3,16 @@
 //! Nothing that a caller does or leaves undone holds up others: handshakes are made in the connection's own task, and every
 //! stage before a request has its time.
 
+use std::convert::Infallible;
+use std::error::Error;
 use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::Router;
-use axum::body::Body;
-use hyper::Request;
-use hyper::body::Incoming;
+use bytes::Bytes;
+use hyper::body::{Body, Incoming};
 use hyper::server::conn::{http1, http2};
+use hyper::{Request, Response};
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::graceful::{GracefulShutdown, Watcher};
 use hyper_util::service::TowerToHyperService;
@@ -21,9 +22,9 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::JoinSet;
 use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
-use tower::ServiceExt;
+use tower::Service;
 
-use super::prompt::{Prompt, PromptBody};
+use super::prompt::Prompt;
 use super::tls::{H2, Tls};
 
 /// What a connection may send before the server has read it, in bytes: a large fleet's observation.
@@ -59,7 +60,13 @@ pub(super) struct Connections {
 
 impl Connections {
     /// Serves until `stop`; returns when requests in flight are answered. Dropped, it ends all connections at once.
-    pub(super) async fn serve(self, listener: TcpListener, protocol: Protocol, router: Router) {
+    pub(super) async fn serve<S, B>(self, listener: TcpListener, protocol: Protocol, service: S)
+    where
+        S: Service<Request<Incoming>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
+        S::Future: Send,
+        B: Body<Data = Bytes> + Send + 'static,
+        B::Error: Into<Box<dyn Error + Send + Sync>>,
+    {
         let (graceful, mut tasks) = (GracefulShutdown::new(), JoinSet::new());
         let open = metrics::gauge!("qedgix_connections");
         let turned_away = metrics::counter!("qedgix_connections_refused_total");
@@ -75,7 +82,7 @@ impl Connections {
                     Ok(permit) => {
                         let one = Open { _permit: permit, gauge: open.clone() };
                         one.gauge.increment(1.0);
-                        tasks.spawn(self.clone().connection(stream, protocol, router.clone(), graceful.watcher(), one));
+                        tasks.spawn(self.clone().connection(stream, protocol, service.clone(), graceful.watcher(), one));
                     }
                     // Closed at once: a caller that is told goes elsewhere or comes again; one that waits thinks the server hangs.
                     Err(_) => turned_away.increment(1),
@@ -92,10 +99,16 @@ impl Connections {
         graceful.shutdown().await;
     }
 
-    async fn connection(self, stream: TcpStream, protocol: Protocol, router: Router, watcher: Watcher, _open: Open) {
+    async fn connection<S, B>(self, stream: TcpStream, protocol: Protocol, service: S, watcher: Watcher, _open: Open)
+    where
+        S: Service<Request<Incoming>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
+        S::Future: Send,
+        B: Body<Data = Bytes> + Send + 'static,
+        B::Error: Into<Box<dyn Error + Send + Sync>>,
+    {
         // Only latency is lost where it cannot be set.
         let _ = stream.set_nodelay(true);
-        let Some(tls) = &self.tls else { return self.speak(stream, protocol, protocol == Protocol::Grpc, router, watcher).await };
+        let Some(tls) = &self.tls else { return self.speak(stream, protocol == Protocol::Grpc, service, watcher).await };
         let configs = tls.now();
         let config = if protocol == Protocol::Grpc { configs.grpc } else { configs.http };
         let handshake = tokio::time::timeout(self.patience, TlsAcceptor::from(config).accept(stream));
@@ -108,25 +121,22 @@ impl Connections {
                 let agreed = stream.get_ref().1.alpn_protocol();
                 // Who speaks of no protocol means the one of the port.
                 let http2 = agreed.map_or(protocol == Protocol::Grpc, |agreed| agreed == H2);
-                self.speak(stream, protocol, http2, router, watcher).await;
+                self.speak(stream, http2, service, watcher).await;
             }
             Ok(Err(error)) => tracing::debug!(%error, "no TLS handshake"),
             Err(_) => tracing::debug!(after = ?self.patience, "no TLS handshake in time"),
         }
     }
 
-    async fn speak<IO>(&self, io: IO, protocol: Protocol, http2: bool, router: Router, watcher: Watcher)
+    async fn speak<IO, S, B>(&self, io: IO, http2: bool, service: S, watcher: Watcher)
     where
         IO: AsyncRead + AsyncWrite + Send + Unpin + 'static,
+        S: Service<Request<Incoming>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
+        S::Future: Send,
+        B: Body<Data = Bytes> + Send + 'static,
+        B::Error: Into<Box<dyn Error + Send + Sync>>,
     {
-        let patience = (protocol == Protocol::Http).then_some(self.patience);
-        let service = TowerToHyperService::new(router.map_request(move |request: Request<Incoming>| {
-            request.map(|body| match patience {
-                Some(patience) => Body::new(PromptBody::new(body, patience)),
-                // A stream of gRPC may be silent for as long as its connection answers pings.
-                None => Body::new(body),
-            })
-        }));
+        let service = TowerToHyperService::new(service);
         let served = if http2 {
             let mut builder = http2::Builder::new(TokioExecutor::new());
             builder

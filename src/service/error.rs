@@ -48,6 +48,9 @@ pub enum Error {
     /// A body or message over the limit.
     #[error("{0}")]
     TooLarge(String),
+    /// A body of a kind that is not read here.
+    #[error("{0}")]
+    MediaType(String),
     /// The caller's deadline passed.
     #[error("the deadline passed {0}")]
     Deadline(&'static str),
@@ -75,6 +78,7 @@ impl Error {
             Self::Precondition { code, .. } | Self::Conflict { code, .. } => code,
             Self::Busy { .. } => "resource_exhausted",
             Self::TooLarge(_) => "too_large",
+            Self::MediaType(_) => "unsupported_media_type",
             Self::Deadline(_) => "deadline_exceeded",
             Self::Draining => "draining",
             Self::Unauthenticated(_) => "unauthenticated",
@@ -86,6 +90,11 @@ impl Error {
     /// A fault of ours.
     pub fn internal(cause: impl Into<Box<dyn std::error::Error + Send + Sync>>) -> Self {
         Self::Internal(cause.into())
+    }
+
+    /// Too much at once, for about a second.
+    pub fn busy(message: impl Into<String>) -> Self {
+        Self::Busy { message: message.into(), retry_after: Duration::from_secs(1) }
     }
 
     /// No `what` called `id`.

@@ -3,13 +3,19 @@
 pub mod act;
 pub mod environments;
 mod error;
+pub mod events;
 pub mod jobs;
 pub mod keys;
+pub mod operations;
 pub mod policies;
+pub mod sequences;
 pub mod sessions;
 pub mod worker;
 
+use std::sync::Arc;
+
 pub use error::Error;
+pub use events::Watchers;
 use tokio_util::sync::CancellationToken;
 
 use crate::jobs::Jobs;
@@ -23,7 +29,7 @@ pub struct App {
     /// The scheduler.
     pub jobs: Jobs,
     /// Policies that can be asked.
-    pub registry: Registry,
+    pub registry: Arc<Registry>,
     /// Fleets whose memory the server keeps.
     pub sessions: Sessions,
     /// Environments that learners elsewhere fly.
@@ -32,6 +38,8 @@ pub struct App {
     pub engine: Engine,
     /// Who may ask.
     pub keys: keys::Keyring,
+    /// Who follows a job.
+    pub watchers: Watchers,
     /// The time of day.
     pub clock: Clock,
     /// Whether the server is shutting down.
@@ -67,18 +75,6 @@ impl App {
     pub fn admit(&self) -> Result<(), Error> {
         if self.draining.begun() { Err(Error::Draining) } else { Ok(()) }
     }
-
-    /// Checks that the server can do its work: the database answers, there is something to serve, and it is not draining.
-    ///
-    /// # Errors
-    /// The first of these that is not the case.
-    pub async fn ready(&self) -> Result<(), Error> {
-        self.admit()?;
-        if self.registry.is_empty() {
-            return Err(Error::internal("no policy is loaded"));
-        }
-        Ok(self.store.ping().await?)
-    }
 }
 
 impl From<crate::serving::Error> for Error {
@@ -89,7 +85,7 @@ impl From<crate::serving::Error> for Error {
             E::Unknown { what, id } => Self::NotFound { what, id },
             E::Precondition { code, message } => Self::Precondition { code, message },
             E::Exists(message) => Self::Conflict { code: "already_exists", message },
-            E::Busy(message) => Self::Busy { message, retry_after: std::time::Duration::from_secs(1) },
+            E::Busy(message) => Self::busy(message),
             E::Deadline(place) => Self::Deadline(place),
             E::Fault(cause) => Self::internal(cause),
         }

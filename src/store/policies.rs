@@ -1,8 +1,10 @@
-//! Published policies: names, immutable versions with their checkpoints, aliases.
+//! Published policies: names, and immutable versions with their checkpoints.
 
-use sqlx::Row;
+use jiff::Timestamp;
 use sqlx::sqlite::SqliteRow;
+use sqlx::{Row, SqliteConnection};
 
+use super::promotions::{AliasMove, move_alias};
 use super::{Error, Store};
 
 /// A published version, with the checkpoint's bytes.
@@ -20,17 +22,6 @@ pub struct PolicyVersion {
     pub created_at: i64,
 }
 
-/// A name for a version that may move.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct PolicyAlias {
-    /// Name of the policy.
-    pub name: String,
-    /// The alias.
-    pub alias: String,
-    /// The version it means.
-    pub version: u64,
-}
-
 /// What to publish.
 #[derive(Clone, Copy, Debug)]
 pub struct NewPolicyVersion<'a> {
@@ -40,8 +31,23 @@ pub struct NewPolicyVersion<'a> {
     pub digest: &'a str,
     /// Safetensors.
     pub checkpoint: &'a [u8],
-    /// Milliseconds since the epoch.
-    pub now: i64,
+    /// When.
+    pub now: Timestamp,
+    /// An alias that shall mean it.
+    pub alias: Option<&'a str>,
+    /// Who does it, where that is known.
+    pub by: Option<&'a str>,
+}
+
+/// What became of it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PublishedPolicy {
+    /// The version's number.
+    pub version: u64,
+    /// When it was published, in milliseconds since the epoch.
+    pub created_at: i64,
+    /// Whether the name had no version of these bytes before.
+    pub new: bool,
 }
 
 impl Store {
@@ -54,40 +60,24 @@ impl Store {
         Ok(())
     }
 
-    /// Stores a new version; where the name already has one of this digest, nothing changes. Returns the version's number
-    /// and the time it was published at.
+    /// Stores a new version, unless the name has one of this digest, and moves the alias to it, all or nothing.
     ///
     /// # Errors
     /// The database fails.
-    pub async fn publish_policy(&self, new: NewPolicyVersion<'_>) -> Result<(u64, i64), Error> {
+    pub async fn publish_policy(&self, new: NewPolicyVersion<'_>) -> Result<PublishedPolicy, Error> {
         let mut tx = self.begin().await?;
-        let known = sqlx::query("SELECT version, created_at FROM policy_versions WHERE name = ? AND digest = ?")
-            .bind(new.name)
-            .bind(new.digest)
-            .fetch_optional(&mut *tx)
-            .await?;
-        if let Some(row) = known {
-            return Ok((row.try_get::<i64, _>(0)? as u64, row.try_get(1)?));
+        let sql = "SELECT version, created_at FROM policy_versions WHERE name = ? AND digest = ?";
+        let known: Option<(i64, i64)> = sqlx::query_as(sql).bind(new.name).bind(new.digest).fetch_optional(&mut *tx).await?;
+        let published = match known {
+            Some((version, created_at)) => PublishedPolicy { version: version as u64, created_at, new: false },
+            None => insert(&mut tx, new).await?,
+        };
+        if let Some(alias) = new.alias {
+            let NewPolicyVersion { name, now: at, by, .. } = new;
+            move_alias(&mut tx, AliasMove { name, alias, to: Some(published.version), at, by }).await?;
         }
-        sqlx::query("INSERT INTO policies (name, created_at) VALUES (?, ?) ON CONFLICT (name) DO NOTHING")
-            .bind(new.name)
-            .bind(new.now)
-            .execute(&mut *tx)
-            .await?;
-        let row = sqlx::query(
-            "INSERT INTO policy_versions (name, version, digest, checkpoint, created_at)
-             SELECT ?1, COALESCE(MAX(version), 0) + 1, ?2, ?3, ?4 FROM policy_versions WHERE name = ?1
-             RETURNING version",
-        )
-        .bind(new.name)
-        .bind(new.digest)
-        .bind(new.checkpoint)
-        .bind(new.now)
-        .fetch_one(&mut *tx)
-        .await?;
-        let version: i64 = row.try_get(0)?;
         tx.commit().await?;
-        Ok((version as u64, new.now))
+        Ok(published)
     }
 
     /// Names and numbers of all published versions.
@@ -108,30 +98,18 @@ impl Store {
         let row = sqlx::query(query).bind(name).bind(version as i64).fetch_optional(&self.read).await?;
         row.as_ref().map(read_version).transpose()
     }
+}
 
-    /// Lets `alias` of `name` mean `version`, which exists.
-    ///
-    /// # Errors
-    /// The database fails, or there is no such version.
-    pub async fn set_policy_alias(&self, name: &str, alias: &str, version: u64) -> Result<(), Error> {
-        let query = "INSERT INTO policy_aliases (name, alias, version) VALUES (?, ?, ?)
-                     ON CONFLICT (name, alias) DO UPDATE SET version = excluded.version";
-        sqlx::query(query).bind(name).bind(alias).bind(version as i64).execute(&self.write).await?;
-        Ok(())
-    }
-
-    /// All aliases.
-    ///
-    /// # Errors
-    /// The database fails.
-    pub async fn policy_aliases(&self) -> Result<Vec<PolicyAlias>, Error> {
-        let rows =
-            sqlx::query("SELECT name, alias, version FROM policy_aliases ORDER BY name, alias").fetch_all(&self.read).await?;
-        let read = |row: &SqliteRow| -> Result<PolicyAlias, Error> {
-            Ok(PolicyAlias { name: row.try_get(0)?, alias: row.try_get(1)?, version: row.try_get::<i64, _>(2)? as u64 })
-        };
-        rows.iter().map(read).collect()
-    }
+async fn insert(db: &mut SqliteConnection, new: NewPolicyVersion<'_>) -> Result<PublishedPolicy, Error> {
+    let created_at = new.now.as_millisecond();
+    let sql = "INSERT INTO policies (name, created_at) VALUES (?, ?) ON CONFLICT (name) DO NOTHING";
+    sqlx::query(sql).bind(new.name).bind(created_at).execute(&mut *db).await?;
+    let sql = "INSERT INTO policy_versions (name, version, digest, checkpoint, created_at)
+               SELECT ?1, COALESCE(MAX(version), 0) + 1, ?2, ?3, ?4 FROM policy_versions WHERE name = ?1
+               RETURNING version";
+    let query = sqlx::query_scalar(sql).bind(new.name).bind(new.digest).bind(new.checkpoint).bind(created_at);
+    let version: i64 = query.fetch_one(&mut *db).await?;
+    Ok(PublishedPolicy { version: version as u64, created_at, new: true })
 }
 
 fn read_version(row: &SqliteRow) -> Result<PolicyVersion, Error> {

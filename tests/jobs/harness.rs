@@ -13,8 +13,8 @@ use qedgix::config::Config;
 use qedgix::jobs::{Executor, Exit, Jobs, Launch, Settings};
 use qedgix::server::{self, DataDir, Listeners};
 use qedgix::service::keys::Keyring;
-use qedgix::service::{App, Draining};
-use qedgix::serving::{Clock, Engine, EngineConfig, Environments, EnvironmentsConfig, Limits, Registry, Sessions};
+use qedgix::service::{App, Draining, Watchers};
+use qedgix::serving::{Clock, Engine, EngineConfig, Environments, EnvironmentsConfig, Limits, Sessions};
 use qedgix::store::Store;
 use qedgix::wire::v1::job_service_client::JobServiceClient;
 use qedgix::wire::v1::worker_service_client::WorkerServiceClient;
@@ -27,6 +27,9 @@ use tonic::transport::Channel;
 
 /// Longest that anything in these tests may take; only a failure ever waits for it.
 pub const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Streams of events that a server of these tests allows.
+pub const WATCHERS: usize = 4;
 
 /// A worker that the scheduler has started, played by the test.
 pub struct Worker {
@@ -143,7 +146,8 @@ impl Server {
         executor: Option<Arc<dyn Executor>>,
     ) -> Self {
         let free = SocketAddr::from(([127, 0, 0, 1], 0));
-        let config = Config { grpc_addr: free, http_addr: free, ..Config::new(data_dir) };
+        let (max_watchers, heartbeat) = (WATCHERS, Duration::from_millis(20));
+        let config = Config { grpc_addr: free, http_addr: free, max_watchers, heartbeat, ..Config::new(data_dir) };
         let data = DataDir::take(data_dir).unwrap();
         let listeners = Listeners::bind(&config).await.unwrap();
         let endpoints = listeners.endpoints().unwrap();
@@ -157,11 +161,12 @@ impl Server {
         let app = Arc::new(App {
             jobs: Jobs::open(store.clone(), settings, executor).await.unwrap(),
             store,
-            registry: Registry::default(),
+            registry: Arc::default(),
             sessions: Sessions::new(limits, clock.clone()),
             environments: Environments::new(EnvironmentsConfig { limits, memory: 1 << 20 }, clock.clone()),
             engine: Engine::start(EngineConfig { threads: 1, queue: 1, max_batch: 1, max_batch_delay: Duration::ZERO }).unwrap(),
             keys: Keyring::new(None),
+            watchers: Watchers::new(config.max_watchers, config.heartbeat),
             clock,
             draining: Draining::default(),
         });

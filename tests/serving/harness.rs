@@ -12,7 +12,7 @@ use qedgix::invalid::Invalid;
 use qedgix::policy::{Needs, Policy, Turn};
 use qedgix::server::{self, DataDir, Endpoints, Listeners};
 use qedgix::service::App;
-use qedgix::serving::{Clock, Kind, LoadedPolicy, PolicyRef};
+use qedgix::serving::{Clock, LoadedPolicy, PolicyRef};
 use qedgix::wire::v1;
 use qedgix::wire::v1::policy_service_client::PolicyServiceClient;
 use rand::RngExt;
@@ -46,7 +46,8 @@ impl Server {
         Self::on(self.dir, |_| {}).await
     }
 
-    async fn on(dir: tempfile::TempDir, change: impl FnOnce(&mut Config)) -> Self {
+    /// On a data directory that may hold something.
+    pub async fn on(dir: tempfile::TempDir, change: impl FnOnce(&mut Config)) -> Self {
         let mut config = Config::new(dir.path());
         config.grpc_addr.set_port(0);
         config.http_addr.set_port(0);
@@ -96,17 +97,8 @@ impl Server {
 
     /// Adds a policy called `name`, to be flown by any fleet.
     pub fn add(&self, name: &str, version: u64, policy: Arc<dyn Policy>) {
-        self.app.registry.insert(LoadedPolicy {
-            reference: PolicyRef { name: name.into(), version, digest: [version as u8; 32] },
-            policy,
-            kind: Kind::Baseline,
-            description: "of a test".into(),
-            uavs: None,
-            users: None,
-            config: serde_json::Value::Null,
-            metrics: serde_json::Value::Null,
-            created_at: Timestamp::UNIX_EPOCH,
-        });
+        let reference = PolicyRef { name: name.into(), version, digest: [version as u8; 32] };
+        self.app.registry.insert(LoadedPolicy::baseline(reference, "of a test", policy, Timestamp::UNIX_EPOCH));
     }
 }
 

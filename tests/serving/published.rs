@@ -12,7 +12,7 @@ use rand::RngExt;
 use super::harness::*;
 
 /// A checkpoint with weights drawn from `seed`.
-fn checkpoint(algorithm: Algorithm, preset: Preset, seed: u64) -> Checkpoint {
+pub fn checkpoint(algorithm: Algorithm, preset: Preset, seed: u64) -> Checkpoint {
     let mut config = TrainConfig::preset(algorithm, preset);
     config.environment.reward_scale = Some(1.0);
     let mut rng = qedgix::rng::stream(seed, "test-weights", 0);
@@ -20,7 +20,7 @@ fn checkpoint(algorithm: Algorithm, preset: Preset, seed: u64) -> Checkpoint {
     Checkpoint::new(config, 1234, None, weights).unwrap()
 }
 
-async fn publish(server: &Server, name: &str, checkpoint: &Checkpoint) -> PolicyRef {
+pub async fn publish(server: &Server, name: &str, checkpoint: &Checkpoint) -> PolicyRef {
     policies::publish(&server.app, name, checkpoint.to_bytes()).await.unwrap()
 }
 
@@ -48,7 +48,8 @@ async fn what_was_published_is_served_after_a_restart() {
     let mut server = Server::start().await;
     let mine = checkpoint(Algorithm::Qedgix, Preset::Practical, 1);
     let reference = publish(&server, "mine", &mine).await;
-    server.app.store.set_policy_alias("mine", "prod", 1).await.unwrap();
+    let target = policies::Target { name: "mine".into(), alias: "prod".into(), expected: None, by: None };
+    policies::set_alias(&server.app, target, 1).await.unwrap();
     let mut client = server.grpc().await;
     let before = client.act(held("mine", Bytes::new(), scene(3, 5, 0))).await.unwrap().into_inner();
     server.begin_stop();

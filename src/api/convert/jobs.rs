@@ -50,6 +50,7 @@ pub struct JobView<'a> {
     attempts: u32,
     failures: u32,
     policy: &'a Option<String>,
+    last_event_id: u64,
     created_at: Timestamp,
     started_at: Option<Timestamp>,
     ended_at: Option<Timestamp>,
@@ -74,6 +75,7 @@ impl<'a> From<&'a Job> for JobView<'a> {
             attempts: job.attempts,
             failures: job.failures,
             policy: &job.policy,
+            last_event_id: job.last_event,
             created_at: job.created_at,
             started_at: job.started_at,
             ended_at: job.ended_at,
@@ -196,6 +198,7 @@ impl From<Job> for v1::Job {
             created_at: Some(timestamp(job.created_at)),
             started_at: job.started_at.map(timestamp),
             ended_at: job.ended_at.map(timestamp),
+            last_event_id: job.last_event,
         }
     }
 }

@@ -6,14 +6,19 @@ use jiff::Timestamp;
 
 use super::structs::to_struct;
 use crate::policy::Needs;
-use crate::service::{act, policies};
-use crate::serving::{Kind, PolicyRef, SessionInfo};
+use crate::service::act;
+use crate::serving::{Described, Kind, PolicyRef, SessionInfo};
 use crate::wire::v1;
 
 /// Degrees between two headings.
 const DEGREES: f64 = 45.0;
 /// Headings of the compass; the ninth action hovers.
 const COMPASS: u8 = 8;
+
+/// The direction of a heading, in degrees counter-clockwise from +x; none when hovering.
+pub fn degrees(heading: u8) -> Option<f64> {
+    (heading < COMPASS).then(|| DEGREES * f64::from(heading))
+}
 
 /// The answer, with Q-values if `values` were asked for and the policy has them.
 pub fn act_response(answer: act::Answer, values: bool) -> v1::ActResponse {
@@ -29,8 +34,8 @@ pub fn act_response(answer: act::Answer, values: bool) -> v1::ActResponse {
             v1::Action {
                 uav_id: std::mem::take(&mut ids[uav]),
                 heading_index: u32::from(heading),
-                heading_deg: (heading < COMPASS).then(|| DEGREES * f64::from(heading)),
-                q_values: if values && q.iter().all(|q| !q.is_nan()) { q.to_vec() } else { Vec::new() },
+                heading_deg: degrees(heading),
+                q_values: if values && q.iter().all(|q| q.is_finite()) { q.to_vec() } else { Vec::new() },
             }
         })
         .collect();
@@ -65,32 +70,34 @@ impl From<SessionInfo> for v1::Session {
     }
 }
 
-impl From<policies::Described> for v1::Policy {
-    fn from(described: policies::Described) -> Self {
-        let policies::Described { policy, aliases, versions } = described;
-        let needs = match policy.policy.needs() {
+impl From<Described> for v1::Policy {
+    fn from(described: Described) -> Self {
+        let Described { about, loaded, aliases, versions } = described;
+        let needs = match about.needs {
             Needs::Detections => v1::Needs::Detections,
             Needs::OwnPositions => v1::Needs::OwnPositions,
             Needs::FullScene => v1::Needs::FullScene,
         };
-        let kind = match policy.kind {
+        let kind = match about.kind {
             Kind::Checkpoint => v1::PolicyKind::Checkpoint,
             Kind::Baseline => v1::PolicyKind::Baseline,
         };
         Self {
-            r#ref: Some((&policy.reference).into()),
+            r#ref: Some((&about.reference).into()),
             kind: kind.into(),
-            description: policy.description.clone(),
-            uavs: policy.uavs,
-            users: policy.users,
-            headings: policy.policy.actions() as u32,
+            description: about.description.clone(),
+            uavs: about.uavs,
+            users: about.users,
+            headings: about.headings as u32,
             needs: needs.into(),
-            detection_range: policy.policy.detection_range(),
+            detection_range: about.detection_range,
             aliases,
-            versions,
-            config: to_struct(&policy.config),
-            metrics: to_struct(&policy.metrics),
-            created_at: Some(timestamp(policy.created_at)),
+            loaded,
+            loaded_versions: versions.iter().filter(|(_, loaded)| *loaded).map(|(version, _)| *version).collect(),
+            versions: versions.into_iter().map(|(version, _)| version).collect(),
+            config: to_struct(&about.config),
+            metrics: to_struct(&about.metrics),
+            created_at: Some(timestamp(about.created_at)),
         }
     }
 }

@@ -1,24 +1,29 @@
 //! gRPC: all services on one router, health and reflection included.
 
+mod call;
 mod deadline;
 mod envelope;
 mod environment;
+mod health;
+mod inference;
 mod job;
+mod meters;
 mod policy;
+mod stream;
 mod worker;
 
 use std::sync::Arc;
 
-use axum::Router;
 use tonic::service::Routes;
-use tonic_health::pb::health_server::{Health, HealthServer};
 
 use deadline::deadline;
+use envelope::Envelope;
+pub use health::Health;
 
-use crate::api::observe::Meters;
+use super::gate::Gate;
 use crate::service::App;
 use crate::wire::v1::worker_service_server::{WorkerService, WorkerServiceServer};
-use crate::wire::{DESCRIPTORS, v1};
+use crate::wire::{DESCRIPTORS, oip, v1};
 
 /// Names of the services that health tells about.
 pub const SERVICES: &[&str] = &[
@@ -26,15 +31,19 @@ pub const SERVICES: &[&str] = &[
     v1::environment_service_server::SERVICE_NAME,
     v1::job_service_server::SERVICE_NAME,
     v1::worker_service_server::SERVICE_NAME,
+    oip::grpc_inference_service_server::SERVICE_NAME,
 ];
 
 const BUILT_IN: &str = "the descriptors are built into the program";
 
+/// Services behind the gate, and what happens around every call.
+pub type Services = Envelope<Gate<Routes>>;
+
 /// All services. A message larger than `max_message` bytes is refused.
 ///
 /// # Panics
-/// When the descriptor set built into the program does not decode; a test would have failed before.
-pub fn routes<H: Health>(app: &Arc<App>, health: HealthServer<H>, max_message: usize) -> Router {
+/// When a descriptor set built into the program does not decode; a test would have failed before.
+pub fn services(app: &Arc<App>, health: &Health, max_message: usize) -> Services {
     let reflection = || {
         let builder = tonic_reflection::server::Builder::configure().register_encoded_file_descriptor_set(DESCRIPTORS);
         builder.register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
@@ -42,17 +51,21 @@ pub fn routes<H: Health>(app: &Arc<App>, health: HealthServer<H>, max_message: u
     let mut routes = Routes::builder();
     routes
         .add_service(policy::service(app.clone()).max_decoding_message_size(max_message))
+        .add_service(inference::service(app.clone()).max_decoding_message_size(max_message))
         .add_service(environment::service(app.clone()).max_decoding_message_size(max_message))
         .add_service(job::service(app.clone()).max_decoding_message_size(max_message))
         .add_service(workers(app, max_message))
-        .add_service(health)
+        .add_service(health.server())
         .add_service(reflection().build_v1().expect(BUILT_IN))
         .add_service(reflection().build_v1alpha().expect(BUILT_IN));
     within(app, routes.routes())
 }
 
 /// What workers need and nothing else, for an address of their own.
-pub fn worker_routes(app: &Arc<App>, max_message: usize) -> Router {
+///
+/// # Panics
+/// As [`services`].
+pub fn worker_services(app: &Arc<App>, max_message: usize) -> Services {
     within(app, Routes::new(workers(app, max_message)))
 }
 
@@ -60,8 +73,8 @@ fn workers(app: &Arc<App>, max_message: usize) -> WorkerServiceServer<impl Worke
     worker::service(app.clone()).max_decoding_message_size(max_message.max(worker::LARGEST_MESSAGE))
 }
 
-fn within(app: &Arc<App>, routes: Routes) -> Router {
-    let (app, meters) = (app.clone(), Arc::new(Meters::new("grpc")));
-    let around = move |request, next| envelope::around(app.clone(), meters.clone(), request, next);
-    routes.into_axum_router().layer(axum::middleware::from_fn(around))
+fn within(app: &Arc<App>, routes: Routes) -> Services {
+    use tonic_reflection::pb::{v1, v1alpha};
+    let sets = [DESCRIPTORS, tonic_health::pb::FILE_DESCRIPTOR_SET, v1::FILE_DESCRIPTOR_SET, v1alpha::FILE_DESCRIPTOR_SET];
+    Envelope::new(Gate::new(routes.prepare(), app.clone()), &sets)
 }

@@ -7,11 +7,11 @@ use futures::future::join_all;
 use futures::stream::{BoxStream, StreamExt};
 use tonic::{Request, Response, Status, Streaming};
 
-use super::deadline;
+use super::{deadline, stream};
 use crate::api::convert::{request::open_session, response::act_response};
 use crate::api::errors::act_error;
+use crate::api::gate::Opener;
 use crate::invalid::in_range;
-use crate::service::keys::Caller;
 use crate::service::{App, Error, act, policies, sessions};
 use crate::serving::PolicySpec;
 use crate::wire::v1;
@@ -65,14 +65,11 @@ impl PolicyService for Handlers {
     }
 
     async fn act_batch(&self, request: Request<v1::ActBatchRequest>) -> Result<Response<v1::ActBatchResponse>, Status> {
-        let deadline = deadline(request.extensions());
-        let caller = request.extensions().get::<Caller>().cloned();
+        let (deadline, opener) = (deadline(request.extensions()), Opener::of(request.extensions()));
         let requests = request.into_inner().requests;
         in_range("requests", requests.len(), 1..=LARGEST_BATCH).map_err(Error::from)?;
         // One of them was counted as the call itself.
-        if let Some(caller) = caller {
-            caller.charge(requests.len() as u32 - 1, self.0.clock.now());
-        }
+        opener.charge(&self.0, requests.len() as u32 - 1);
         let answers = requests.into_iter().map(|request| answer(&self.0, request, deadline));
         let results = join_all(answers).await.into_iter().map(act_result).collect();
         Ok(Response::new(v1::ActBatchResponse { results }))
@@ -81,23 +78,16 @@ impl PolicyService for Handlers {
     type ActStreamStream = BoxStream<'static, Result<v1::ActResult, Status>>;
 
     async fn act_stream(&self, request: Request<Streaming<v1::ActRequest>>) -> Result<Response<Self::ActStreamStream>, Status> {
-        let deadline = deadline(request.extensions());
-        let caller = request.extensions().get::<Caller>().cloned();
+        let (deadline, opener) = (deadline(request.extensions()), Opener::of(request.extensions()));
         let app = self.0.clone();
-        let draining = app.clone();
-        // What was asked before the server drains is answered; then the stream ends, so that it does not hold up the end.
-        let requests = request.into_inner().take_until(async move { draining.draining.wait().await });
+        let requests = stream::requests(app.clone(), request.into_inner());
         let answers = requests.map(move |request| {
-            let app = app.clone();
-            let counted = caller.as_ref().map_or(Ok(()), |caller| caller.again(app.clock.now()));
+            let (app, counted) = (app.clone(), opener.count(&app));
             async move {
-                // A message that does not decode, or a caller that left or whose key is over: the stream is over.
-                let request = request?;
-                match counted {
-                    Ok(()) => Ok(act_result(answer(&app, request, deadline).await)),
-                    Err(error @ Error::Busy { .. }) => Ok(act_result(Err(error))),
-                    Err(error) => Err(error.into()),
-                }
+                Ok(act_result(match (request?, counted?) {
+                    (request, Ok(())) => answer(&app, request, deadline).await,
+                    (_, Err(busy)) => Err(busy),
+                }))
             }
         });
         Ok(Response::new(answers.buffered(IN_FLIGHT).boxed()))

@@ -3,6 +3,7 @@
 use axum::body::{Body, BodyDataStream, HttpBody};
 use axum::extract::{FromRequest, FromRequestParts, Request};
 use axum::http::request::Parts;
+use axum::http::{HeaderMap, header};
 use bytes::Bytes;
 use futures::StreamExt;
 use serde::de::DeserializeOwned;
@@ -26,11 +27,18 @@ impl<S: Sync, T: DeserializeOwned> FromRequest<S> for Json<T> {
     type Rejection = Error;
 
     async fn from_request(request: Request, _: &S) -> Result<Self, Error> {
-        parse(&read(request).await?).map(Self)
+        match media_type(request.headers()) {
+            // Who does not say what it is means what is expected.
+            None => {}
+            Some(kind) if kind == "application/json" => {}
+            kind => return Err(unsupported(kind, "application/json")),
+        }
+        let limit = limit(&request);
+        parse(&read(request, limit).await?).map(Self)
     }
 }
 
-/// A body as it comes.
+/// A body as it comes, whatever it says it is.
 #[derive(Debug)]
 pub struct Raw(pub Bytes);
 
@@ -38,12 +46,32 @@ impl<S: Sync> FromRequest<S> for Raw {
     type Rejection = Error;
 
     async fn from_request(request: Request, _: &S) -> Result<Self, Error> {
-        read(request).await.map(Self)
+        let limit = limit(&request);
+        read(request, limit).await.map(Self)
     }
 }
 
-async fn read(request: Request) -> Result<Bytes, Error> {
-    let MaxBody(limit) = request.extensions().get().copied().unwrap_or(MaxBody(4 << 20));
+fn limit(request: &Request) -> usize {
+    request.extensions().get().map_or(4 << 20, |&MaxBody(limit)| limit)
+}
+
+/// What a body says it is, in lower case and without parameters.
+pub fn media_type(headers: &HeaderMap) -> Option<String> {
+    let kind = headers.get(header::CONTENT_TYPE)?.to_str().unwrap_or("unreadable");
+    Some(kind.split(';').next().unwrap_or_default().trim().to_ascii_lowercase())
+}
+
+/// A body is of another kind than `expected`.
+pub fn unsupported(kind: Option<String>, expected: &str) -> Error {
+    let kind = kind.map_or_else(|| "nothing".to_owned(), |kind| format!("{kind:?}"));
+    Error::MediaType(Invalid::new("content-type", kind, expected).to_string())
+}
+
+/// Reads a body of at most `limit` bytes.
+///
+/// # Errors
+/// It is larger, or breaks off.
+pub async fn read(request: Request, limit: usize) -> Result<Bytes, Error> {
     let too_large = || Error::TooLarge(format!("the body is larger than the limit of {limit} bytes"));
     let body = request.into_body();
     let announced = announced_size(&body);

@@ -1,84 +1,54 @@
-//! REST: JSON under `/v1`, probes, metrics. Every error is a problem of RFC 9457, also those of paths and methods.
+//! REST: JSON under `/v1`, the Open Inference Protocol under `/v2`, probes, metrics. Every error is a problem of RFC 9457,
+//! also those of paths and methods; under `/v2` it is what that protocol wants.
 
 mod act;
+mod envelope;
 mod environments;
+mod events;
 pub mod extract;
 mod jobs;
 mod observation;
 mod ops;
 mod policies;
 mod sessions;
+mod v2;
 mod wording;
 
-use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
-use std::time::Instant;
 
 use axum::Router;
-use axum::extract::{MatchedPath, Request, State};
+use axum::extract::{Request, State};
 use axum::http::StatusCode;
-use axum::middleware::Next;
-use axum::response::{IntoResponse, Response};
+use axum::response::IntoResponse;
 use axum::routing::{get, post};
-use futures::FutureExt;
-use metrics_exporter_prometheus::PrometheusHandle;
-use tracing::Instrument;
 
-use super::access;
 use super::errors::problem;
-use super::observe::{Meters, REQUEST_ID, request_id};
+use super::gate;
 use crate::service::{App, Error};
 
-/// All of REST. A body larger than `max_body` bytes is refused.
-pub fn router(app: Arc<App>, metrics: PrometheusHandle, max_body: usize) -> Router {
-    let (gate, meters) = (app.clone(), Arc::new(Meters::new("http")));
+/// All of REST. A body larger than `max_body` bytes is refused; `metrics` renders what was counted.
+pub fn router(app: Arc<App>, metrics: fn() -> String, max_body: usize) -> Router {
+    let (gate, shared) = (app.clone(), Arc::new(envelope::Shared::new()));
     Router::new()
         .route("/", get(ops::index))
         .route("/livez", get(ops::live))
         .route("/readyz", get(ops::ready))
-        .route("/metrics", get(async move |State(app): State<Arc<App>>| ops::metrics(&metrics, &app)))
+        .route("/metrics", get(async move |State(app): State<Arc<App>>| ops::metrics(metrics, &app).await))
         .route("/v1/act", post(act::act))
         .route("/v1/sessions", post(sessions::open).get(sessions::list))
         .route("/v1/sessions/{id}", get(sessions::get).delete(sessions::close))
-        .route("/v1/policies", get(policies::list))
-        .route("/v1/policies/{policy}", get(policies::get))
+        .merge(policies::router())
         .merge(environments::router())
         .merge(jobs::router())
+        .merge(v2::router())
+        .route("/v1/jobs/{id}/events", get(events::follow))
         .fallback(|request: Request| async move { Error::not_found("endpoint", request.uri().path()).into_response() })
         .method_not_allowed_fallback(|request: Request| async move {
             let detail = format!("{} does not answer {}", request.uri().path(), request.method());
             problem(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", detail)
         })
         .layer(axum::Extension(extract::MaxBody(max_body)))
-        .layer(axum::middleware::from_fn(move |request, next| around(gate.clone(), meters.clone(), request, next)))
+        .layer(axum::middleware::from_fn(move |request, next| gate::around(gate.clone(), request, next)))
+        .layer(axum::middleware::from_fn(move |request, next| envelope::around(shared.clone(), request, next)))
         .with_state(app)
-}
-
-/// What happens around every request: its id, whether it is let in, panics caught, and its count.
-async fn around(app: Arc<App>, meters: Arc<Meters>, mut request: Request, next: Next) -> Response {
-    let begun = Instant::now();
-    let verb = request.method().clone();
-    let route = request.extensions().get::<MatchedPath>().cloned();
-    let route = route.as_ref().map(MatchedPath::as_str);
-    let path = route.unwrap_or("unknown");
-    let id = request_id(request.headers());
-    let span = tracing::info_span!("http", %verb, path, request_id = ?id, key = tracing::field::Empty);
-    let admitted = span.in_scope(|| access::admit(&app, &mut request, || access::rest(&verb, route)));
-    let made_up = admitted.as_ref().is_err_and(|refusal| !refusal.listed);
-    let work = async {
-        match admitted {
-            Ok(()) => next.run(request).await,
-            Err(refusal) => refusal.error.into_response(),
-        }
-    };
-    let work = AssertUnwindSafe(work.instrument(span.clone())).catch_unwind();
-    let answered = work.await;
-    let _inside = span.enter();
-    let mut response = answered.unwrap_or_else(|_| Error::internal("a handler panicked").into_response());
-    response.headers_mut().insert(REQUEST_ID, id);
-    // Made-up verbs are the caller's; they do not become labels.
-    let made_up = made_up || response.status() == StatusCode::METHOD_NOT_ALLOWED;
-    let verb = if made_up { "other" } else { verb.as_str() };
-    meters.end(begun, &format!("{verb} {path}"), response.status().as_str());
-    response
 }

@@ -6,10 +6,9 @@ use axum::Json;
 use axum::extract::State;
 use axum::http::header;
 use axum::response::IntoResponse;
-use metrics_exporter_prometheus::PrometheusHandle;
 use serde_json::{Value, json};
 
-use crate::service::{App, Error};
+use crate::service::{App, Error, operations};
 
 /// Where things are.
 pub(super) async fn index() -> Json<Value> {
@@ -28,6 +27,17 @@ pub(super) async fn index() -> Json<Value> {
             "POST /v1/environments/{id}/step",
             "GET|POST /v1/jobs",
             "GET|DELETE /v1/jobs/{id}",
+            "GET /v1/jobs/{id}/events",
+            "GET /v2",
+            "GET /v2/health/live",
+            "GET /v2/health/ready",
+            "GET /v2/models/{model}",
+            "GET /v2/models/{model}/ready",
+            "GET /v2/models/{model}/config",
+            "POST /v2/models/{model}/infer",
+            "POST /v2/repository/index",
+            "POST /v2/repository/models/{model}/load",
+            "POST /v2/repository/models/{model}/unload",
             "GET /livez",
             "GET /readyz",
             "GET /metrics",
@@ -46,10 +56,22 @@ pub(super) async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, E
     Ok("ok\n")
 }
 
-/// Prometheus text.
-pub(super) fn metrics(handle: &PrometheusHandle, app: &App) -> impl IntoResponse + use<> {
-    metrics::gauge!("qedgix_sessions").set(app.sessions.len() as f64);
-    metrics::gauge!("qedgix_environments").set(app.environments.table().len() as f64);
-    metrics::gauge!("qedgix_policy_versions").set(app.registry.len() as f64);
-    ([(header::CONTENT_TYPE, "text/plain; version=0.0.4")], handle.render())
+/// Prometheus text. What is there is counted when it is asked for.
+pub(super) async fn metrics(render: fn() -> String, app: &App) -> impl IntoResponse + use<> {
+    let figures = operations::figures(app).await;
+    for (name, value) in [
+        ("qedgix_sessions", figures.sessions),
+        ("qedgix_environments", figures.environments),
+        ("qedgix_policy_versions", figures.policy_versions),
+        ("qedgix_engine_queue_depth", figures.engine_queue),
+        ("qedgix_training_threads_busy", figures.threads_busy),
+        ("qedgix_training_threads", figures.threads),
+        ("qedgix_job_watchers", figures.watchers),
+    ] {
+        metrics::gauge!(name).set(value as f64);
+    }
+    for (state, jobs) in figures.jobs {
+        metrics::gauge!("qedgix_jobs", "state" => state.as_str()).set(jobs as f64);
+    }
+    ([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], render())
 }

@@ -86,6 +86,8 @@ pub(super) struct Policy {
     detection_range: f64,
     aliases: Vec<String>,
     versions: Vec<u64>,
+    loaded: bool,
+    loaded_versions: Vec<u64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     config: Option<Value>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -146,6 +148,8 @@ impl From<v1::Policy> for Policy {
             detection_range: policy.detection_range,
             aliases: policy.aliases,
             versions: policy.versions,
+            loaded: policy.loaded,
+            loaded_versions: policy.loaded_versions,
             config: policy.config.map(document),
             metrics: policy.metrics.map(document),
             created_at: policy.created_at.and_then(|t| time(&t)),

@@ -3,7 +3,7 @@ use std::sync::Mutex;
 use super::*;
 use crate::invalid::Invalid;
 use crate::policy::{Needs, Policy};
-use crate::serving::{Clock, Fleet, Kind, Limits, Outcome, Timings};
+use crate::serving::{Clock, Fleet, Limits, Outcome, Timings};
 
 struct Nothing;
 
@@ -30,17 +30,8 @@ impl Policy for Nothing {
 }
 
 fn policy(name: &str) -> Arc<LoadedPolicy> {
-    Arc::new(LoadedPolicy {
-        reference: PolicyRef { name: name.into(), version: 1, digest: [0; 32] },
-        policy: Arc::new(Nothing),
-        kind: Kind::Baseline,
-        description: String::new(),
-        uavs: None,
-        users: None,
-        config: serde_json::Value::Null,
-        metrics: serde_json::Value::Null,
-        created_at: Timestamp::UNIX_EPOCH,
-    })
+    let reference = PolicyRef { name: name.into(), version: 1, digest: [0; 32] };
+    Arc::new(LoadedPolicy::baseline(reference, "", Arc::new(Nothing), Timestamp::UNIX_EPOCH))
 }
 
 fn sessions(max: usize) -> (Sessions, impl Fn(u64)) {

@@ -190,3 +190,56 @@ async fn the_database_holds_no_secret() {
         assert!(!found(part));
     }
 }
+
+#[tokio::test]
+async fn who_moved_an_alias_is_kept() {
+    let server = Server::start().await;
+    let created = make(&server, "admin", |_| {}).await;
+    let send = |request: reqwest::RequestBuilder| request.bearer_auth(&created.key).send();
+    let client = reqwest::Client::new();
+    let put = client.put(server.url("/v1/policies/qedgix/aliases/live")).header("content-type", "application/json");
+    assert_eq!(send(put.body(r#"{"version": 1}"#)).await.unwrap().status(), 201);
+    let history = send(client.get(server.url("/v1/policies/qedgix/history"))).await.unwrap().text().await.unwrap();
+    assert!(history.contains(&format!("\"by\":\"{}\"", created.info.id)), "{history}");
+}
+
+#[tokio::test]
+async fn following_a_job_ends_with_its_key() {
+    use std::os::unix::fs::PermissionsExt;
+    // A worker that does nothing: its job runs until it is cancelled.
+    let dir = tempfile::tempdir().unwrap();
+    let idle = dir.path().join("idle");
+    std::fs::write(&idle, "#!/bin/sh\nexec sleep 1000\n").unwrap();
+    std::fs::set_permissions(&idle, std::fs::Permissions::from_mode(0o755)).unwrap();
+    let server = Server::with(|config| config.worker = Some(idle)).await;
+    let (boss, reader) = (key(&server, "jobs").await, make(&server, "read", |_| {}).await);
+    let client = reqwest::Client::new();
+    let post = async |path: &str, body: &'static str| {
+        let request = client.post(server.url(path)).bearer_auth(&boss).header("content-type", "application/json").body(body);
+        request.send().await.unwrap().json::<serde_json::Value>().await.unwrap()
+    };
+    let id = post("/v1/jobs", "{\"algorithm\": \"vdn\"}").await["id"].as_str().unwrap().to_owned();
+    let mut jobs = v1::job_service_client::JobServiceClient::new(server.channel().await);
+    let mut events =
+        jobs.watch_job(signed(&reader.key, v1::WatchJobRequest { id: id.clone(), after: 0 })).await.unwrap().into_inner();
+    let url = server.url(&format!("/v1/jobs/{id}/events"));
+    let mut page = client.get(url).bearer_auth(&reader.key).send().await.unwrap();
+    assert!(soon(events.message()).await.unwrap().is_some());
+    assert!(soon(page.chunk()).await.unwrap().is_some());
+    keys::revoke(&server.app.store, &reader.key, server.app.clock.now()).await.unwrap();
+    refresh(&server).await;
+    post(&format!("/v1/jobs/{id}/cancel"), "").await;
+    let status = soon(async {
+        loop {
+            if let Err(status) = events.message().await {
+                return status;
+            }
+        }
+    });
+    assert_eq!(status.await.code(), Code::Unauthenticated);
+    let mut told = String::new();
+    while let Some(part) = soon(page.chunk()).await.unwrap() {
+        told += std::str::from_utf8(&part).unwrap();
+    }
+    assert!(!told.contains("cancelled"), "{told}");
+}

@@ -1,0 +1,67 @@
+//! `/v1/jobs/{id}/events`: what happens to a job, as server-sent events.
+
+use std::convert::Infallible;
+use std::future::ready;
+use std::sync::Arc;
+
+use axum::extract::State;
+use axum::http::{Extensions, HeaderMap, HeaderName, HeaderValue, StatusCode};
+use axum::response::sse::{Event, KeepAlive, Sse};
+use axum::response::{IntoResponse, Response};
+use futures::{StreamExt, TryStreamExt};
+use serde::Deserialize;
+
+use super::extract::{Path, Query};
+use crate::api::convert::events::EventView;
+use crate::api::errors::log_internal;
+use crate::api::gate::Opener;
+use crate::invalid::Invalid;
+use crate::service::{App, Error, events};
+use crate::store::JobEvent;
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct FollowQuery {
+    #[serde(default)]
+    after: u64,
+}
+
+/// What browsers say when they come back.
+const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
+/// Proxies are asked not to collect events before they pass them on.
+const UNBUFFERED: (HeaderName, HeaderValue) = (HeaderName::from_static("x-accel-buffering"), HeaderValue::from_static("no"));
+
+/// Follows a job behind the last event that the caller has seen. The stream ends when the job has, when the server drains, or
+/// on a fault; a caller that comes back for more than there will ever be is told so by 204, which ends its trying.
+pub(super) async fn follow(
+    State(app): State<Arc<App>>,
+    Path(id): Path<String>,
+    Query(query): Query<FollowQuery>,
+    headers: HeaderMap,
+    extensions: Extensions,
+) -> Result<Response, Error> {
+    let after = match headers.get(LAST_EVENT_ID) {
+        None => query.after,
+        Some(value) => value
+            .to_str()
+            .ok()
+            .and_then(|text| text.parse().ok())
+            .ok_or_else(|| Invalid::new("last-event-id", format!("{value:?}"), "the id of an event of this job"))?,
+    };
+    let watch = events::watch(&app, &id, after).await?;
+    if watch.is_over() {
+        return Ok(StatusCode::NO_CONTENT.into_response());
+    }
+    // Why a stream ends before its job is told to who comes back.
+    let (live, opener) = (app.clone(), Opener::of(&extensions));
+    let shown = move |event| ready(opener.check(&live).and_then(|()| event_of(event)));
+    let events = watch.events().and_then(shown).inspect_err(log_internal);
+    let events = events.map(Result::ok).take_while(|event| ready(event.is_some())).filter_map(ready).map(Ok::<_, Infallible>);
+    let heartbeat = KeepAlive::new().interval(app.watchers.heartbeat());
+    Ok(([UNBUFFERED], Sse::new(events).keep_alive(heartbeat)).into_response())
+}
+
+fn event_of(event: JobEvent) -> Result<Event, Error> {
+    let (id, view) = (event.id, EventView::from(event.what));
+    Event::default().id(id.to_string()).event(view.name()).json_data(&view).map_err(Error::internal)
+}

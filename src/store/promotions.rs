@@ -1,0 +1,169 @@
+//! What aliases mean and have meant, and which versions are not to be served. An alias moves together with its history.
+
+use jiff::Timestamp;
+use sqlx::{FromRow, SqliteConnection};
+
+use super::{Result, Store, timestamp};
+
+/// A name for a version that may move.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PolicyAlias {
+    /// Name of the policy.
+    pub name: String,
+    /// The alias.
+    pub alias: String,
+    /// The version it means.
+    pub version: u64,
+}
+
+/// An alias to move.
+#[derive(Clone, Copy, Debug)]
+pub struct AliasMove<'a> {
+    /// Name of the policy.
+    pub name: &'a str,
+    /// The alias.
+    pub alias: &'a str,
+    /// A version that exists, or nothing more.
+    pub to: Option<u64>,
+    /// When.
+    pub at: Timestamp,
+    /// Who does it, where that is known.
+    pub by: Option<&'a str>,
+}
+
+/// A move that was made.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Promotion {
+    /// Order of moves.
+    pub id: i64,
+    /// The alias.
+    pub alias: String,
+    /// What it means since then; nothing when it was deleted.
+    pub version: Option<u64>,
+    /// What it meant before.
+    pub previous: Option<u64>,
+    /// When.
+    pub at: Timestamp,
+    /// Who did it, where that is known.
+    pub by: Option<String>,
+}
+
+#[derive(FromRow)]
+struct PromotionRow {
+    id: i64,
+    alias: String,
+    version: Option<i64>,
+    previous: Option<i64>,
+    at: i64,
+    by: Option<String>,
+}
+
+/// Which moves are asked for.
+#[derive(Clone, Copy, Debug)]
+pub struct PromotionFilter<'a> {
+    /// Name of the policy.
+    pub name: &'a str,
+    /// Only of this alias.
+    pub alias: Option<&'a str>,
+    /// Only those before this one.
+    pub before: Option<i64>,
+}
+
+/// Moves an alias and writes that down; what it meant before is returned. It may mean that version already: then nothing
+/// happened, and nothing is written down.
+pub(super) async fn move_alias(db: &mut SqliteConnection, m: AliasMove<'_>) -> Result<Option<u64>> {
+    let sql = "SELECT version FROM policy_aliases WHERE name = ? AND alias = ?";
+    let previous: Option<i64> = sqlx::query_scalar(sql).bind(m.name).bind(m.alias).fetch_optional(&mut *db).await?;
+    let to = m.to.map(|version| version as i64);
+    if previous != to {
+        if let Some(version) = to {
+            let sql = "INSERT INTO policy_aliases (name, alias, version) VALUES (?, ?, ?)
+                       ON CONFLICT (name, alias) DO UPDATE SET version = excluded.version";
+            sqlx::query(sql).bind(m.name).bind(m.alias).bind(version).execute(&mut *db).await?;
+        } else {
+            let sql = "DELETE FROM policy_aliases WHERE name = ? AND alias = ?";
+            sqlx::query(sql).bind(m.name).bind(m.alias).execute(&mut *db).await?;
+        }
+        let sql = "INSERT INTO policy_promotions (name, alias, version, previous, at, by) VALUES (?, ?, ?, ?, ?, ?)";
+        sqlx::query(sql)
+            .bind(m.name)
+            .bind(m.alias)
+            .bind(to)
+            .bind(previous)
+            .bind(m.at.as_millisecond())
+            .bind(m.by)
+            .execute(&mut *db)
+            .await?;
+    }
+    Ok(previous.map(|version| version as u64))
+}
+
+impl Store {
+    /// Moves an alias and writes that down, together; what it meant before is returned.
+    ///
+    /// # Errors
+    /// The database fails, or there is no such version.
+    pub async fn move_policy_alias(&self, m: AliasMove<'_>) -> Result<Option<u64>> {
+        let mut tx = self.begin().await?;
+        let previous = move_alias(&mut tx, m).await?;
+        tx.commit().await?;
+        Ok(previous)
+    }
+
+    /// All aliases.
+    ///
+    /// # Errors
+    /// The database fails.
+    pub async fn policy_aliases(&self) -> Result<Vec<PolicyAlias>> {
+        let sql = "SELECT name, alias, version FROM policy_aliases ORDER BY name, alias";
+        let rows: Vec<(String, String, i64)> = sqlx::query_as(sql).fetch_all(&self.read).await?;
+        Ok(rows.into_iter().map(|(name, alias, version)| PolicyAlias { name, alias, version: version as u64 }).collect())
+    }
+
+    /// Moves of aliases, newest first, at most `limit`.
+    ///
+    /// # Errors
+    /// The database fails.
+    pub async fn promotions(&self, filter: PromotionFilter<'_>, limit: u32) -> Result<Vec<Promotion>> {
+        let sql = "SELECT id, alias, version, previous, at, by FROM policy_promotions
+                   WHERE name = ?1 AND (?2 IS NULL OR alias = ?2) AND (?3 IS NULL OR id < ?3) ORDER BY id DESC LIMIT ?4";
+        let PromotionFilter { name, alias, before } = filter;
+        let rows: Vec<PromotionRow> =
+            sqlx::query_as(sql).bind(name).bind(alias).bind(before).bind(limit).fetch_all(&self.read).await?;
+        let read = |row: PromotionRow| {
+            let PromotionRow { id, alias, version, previous, at, by } = row;
+            let (version, previous) = (version.map(|v| v as u64), previous.map(|v| v as u64));
+            Ok(Promotion { id, alias, version, previous, at: timestamp(at)?, by })
+        };
+        rows.into_iter().map(read).collect()
+    }
+
+    /// Remembers that these versions of a policy are to be served, or are not.
+    ///
+    /// # Errors
+    /// The database fails.
+    pub async fn serve_policy_versions(&self, name: &str, versions: &[u64], serve: bool, now: Timestamp) -> Result<()> {
+        let mut tx = self.begin().await?;
+        for &version in versions {
+            let query = if serve {
+                sqlx::query("DELETE FROM policies_unloaded WHERE name = ? AND version = ?").bind(name).bind(version as i64)
+            } else {
+                let sql = "INSERT INTO policies_unloaded (name, version, at) VALUES (?, ?, ?) ON CONFLICT DO NOTHING";
+                sqlx::query(sql).bind(name).bind(version as i64).bind(now.as_millisecond())
+            };
+            query.execute(&mut *tx).await?;
+        }
+        tx.commit().await?;
+        Ok(())
+    }
+
+    /// Names and numbers of the versions that are not to be served.
+    ///
+    /// # Errors
+    /// The database fails.
+    pub async fn unloaded_policies(&self) -> Result<Vec<(String, u64)>> {
+        let sql = "SELECT name, version FROM policies_unloaded ORDER BY name, version";
+        let rows: Vec<(String, i64)> = sqlx::query_as(sql).fetch_all(&self.read).await?;
+        Ok(rows.into_iter().map(|(name, version)| (name, version as u64)).collect())
+    }
+}
