@@ -5,24 +5,27 @@ mod environments;
 pub mod extract;
 mod jobs;
 mod observation;
+mod openapi;
 mod ops;
 mod policies;
+mod schemas;
 mod sessions;
+mod strict;
 mod wording;
 
 use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
 use std::time::Instant;
 
-use axum::Router;
-use axum::extract::{MatchedPath, Request, State};
+use axum::extract::{MatchedPath, Request};
 use axum::http::StatusCode;
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
-use axum::routing::{get, post};
+use axum::{Extension, Router};
 use futures::FutureExt;
 use metrics_exporter_prometheus::PrometheusHandle;
 use tracing::Instrument;
+use utoipa_axum::router::OpenApiRouter;
 
 use super::errors::problem;
 use super::observe::{Meters, REQUEST_ID, request_id};
@@ -31,23 +34,25 @@ use crate::service::{App, Error};
 /// All of REST. A body larger than `max_body` bytes is refused.
 pub fn router(app: Arc<App>, metrics: PrometheusHandle, max_body: usize) -> Router {
     let meters = Arc::new(Meters::new("http"));
-    Router::new()
-        .route("/", get(ops::index))
-        .route("/livez", get(ops::live))
-        .route("/readyz", get(ops::ready))
-        .route("/metrics", get(async move |State(app): State<Arc<App>>| ops::metrics(&metrics, &app)))
-        .route("/v1/act", post(act::act))
-        .route("/v1/sessions", post(sessions::open).get(sessions::list))
-        .route("/v1/sessions/{id}", get(sessions::get).delete(sessions::close))
+    // What is not merged here is not in the document.
+    let (router, document) = OpenApiRouter::with_openapi(openapi::document())
+        .merge(ops::router())
+        .merge(act::router())
+        .merge(sessions::router())
         .merge(policies::router())
         .merge(environments::router())
         .merge(jobs::router())
+        .split_for_parts();
+    let description = openapi::Description::new(&document, app.jobs.settings().cpu_budget);
+    router
         .fallback(|request: Request| async move { Error::not_found("endpoint", request.uri().path()).into_response() })
         .method_not_allowed_fallback(|request: Request| async move {
             let detail = format!("{} does not answer {}", request.uri().path(), request.method());
             problem(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", detail)
         })
-        .layer(axum::Extension(extract::MaxBody(max_body)))
+        .layer(Extension(extract::MaxBody(max_body)))
+        .layer(Extension(metrics))
+        .layer(Extension(description))
         .layer(axum::middleware::from_fn(move |request, next| around(meters.clone(), request, next)))
         .with_state(app)
 }
