@@ -1,8 +1,8 @@
 //! Listeners, background work, shutdown: one process on one data directory.
 //!
-//! Shutdown in order: readiness goes off and new work is refused; training jobs are snapshotted and queued; requests in
-//! flight are answered; then the listeners are
-//! gone and the data directory is free for another server.
+//! Shutdown in order: readiness goes off, watchers of health are told and new work is refused; training jobs are snapshotted
+//! and queued; streams end and requests in flight are answered; then the listeners are gone and the data directory is free for
+//! another server.
 
 use std::fs::{File, TryLockError};
 use std::future::Future;
@@ -207,7 +207,7 @@ pub async fn run(
     health.report(operations::vitals(&app).await);
 
     let serve_grpc = transport()
-        .layer(grpc::envelope())
+        .layer(grpc::envelope(stop.clone()))
         .add_routes(grpc::routes(&app, &health, config.max_message_size))
         .serve_with_incoming_shutdown(incoming(listeners.grpc), stop.clone().cancelled_owned());
     let http = listeners.http.tap_io(|stream| {
@@ -276,12 +276,16 @@ fn from_here(mut addr: SocketAddr) -> SocketAddr {
 
 /// What has to be done now and then, however quiet it is.
 async fn housekeeping(app: Arc<App>, ttl: Duration) {
-    // Figures that were recorded wait in memory until then.
-    let pause = (ttl / 4).clamp(Duration::from_secs(1), Duration::from_secs(5));
+    let mut sweep = tokio::time::interval((ttl / 4).clamp(Duration::from_secs(1), Duration::from_secs(30)));
+    // Times that were recorded wait in memory until they are put into their buckets.
+    let mut upkeep = tokio::time::interval(Duration::from_secs(5));
     loop {
-        tokio::time::sleep(pause).await;
-        app.sessions.sweep();
-        app.environments.table().sweep();
-        telemetry::metrics().run_upkeep();
+        tokio::select! {
+            _ = sweep.tick() => {
+                app.sessions.sweep();
+                app.environments.table().sweep();
+            }
+            _ = upkeep.tick() => telemetry::metrics().run_upkeep(),
+        }
     }
 }

@@ -13,6 +13,7 @@ use std::time::Instant;
 use axum::http::{Request, Response};
 use pin_project_lite::pin_project;
 use tokio::time::Sleep;
+use tokio_util::sync::CancellationToken;
 use tonic::Status;
 use tonic::body::Body;
 use tower::{Layer, Service};
@@ -28,9 +29,9 @@ use crate::service::Error;
 pub struct EnvelopeLayer(Arc<Shared>);
 
 impl EnvelopeLayer {
-    /// For the methods of these descriptor sets.
-    pub(super) fn new(descriptors: &[&[u8]]) -> Self {
-        Self(Arc::new(Shared { meters: Meters::new(descriptors), ids: Ids::new(), valve: Valve::new() }))
+    /// For the methods of these descriptor sets, until `closing` is cancelled.
+    pub(super) fn new(descriptors: &[&[u8]], closing: CancellationToken) -> Self {
+        Self(Arc::new(Shared { meters: Meters::new(descriptors), ids: Ids::new(), valve: Valve::new(), closing }))
     }
 }
 

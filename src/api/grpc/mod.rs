@@ -14,6 +14,7 @@ mod worker;
 
 use std::sync::Arc;
 
+use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
 
 use deadline::deadline;
@@ -56,16 +57,12 @@ pub fn routes(app: &Arc<App>, health: &Health, max_message: usize) -> Routes {
     routes.routes()
 }
 
-/// What happens around every call, to be put around all routes.
+/// What happens around every call, to be put around all routes. Streams end when `closing` is cancelled.
 ///
 /// # Panics
 /// When a descriptor set built into the program does not decode; a test would have failed before.
-pub fn envelope() -> EnvelopeLayer {
+pub fn envelope(closing: CancellationToken) -> EnvelopeLayer {
     use tonic_reflection::pb::{v1, v1alpha};
-    EnvelopeLayer::new(&[
-        DESCRIPTORS,
-        tonic_health::pb::FILE_DESCRIPTOR_SET,
-        v1::FILE_DESCRIPTOR_SET,
-        v1alpha::FILE_DESCRIPTOR_SET,
-    ])
+    let known = [DESCRIPTORS, tonic_health::pb::FILE_DESCRIPTOR_SET, v1::FILE_DESCRIPTOR_SET, v1alpha::FILE_DESCRIPTOR_SET];
+    EnvelopeLayer::new(&known, closing)
 }

@@ -146,9 +146,9 @@ impl Extractor for Headers<'_> {
 /// What became of a request, for who runs the server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Verdict {
-    /// Answered, or the caller's mistake.
+    /// Answered, or the caller's mistake, or a server that drains, which says so itself.
     Settled,
-    /// Turned away: a limit, no right to ask, too late, draining.
+    /// Turned away: a limit, no right to ask, too late.
     Refused,
     /// A fault of the server.
     Fault,
@@ -183,6 +183,7 @@ pub(super) fn tell(ending: &Ending<'_>, span: &Span, valve: &Valve) {
         }
         Verdict::Refused => {
             if let Some(muted) = valve.pass() {
+                let muted = (muted > 0).then_some(muted);
                 tracing::warn!(target: "qedgix::request", %method, request_id = %id, code, seconds, detail = %detail, muted, "refused");
             }
         }
