@@ -272,7 +272,10 @@ impl Subject {
         telemetry::metrics();
         let health = grpc::Health::new(CancellationToken::new());
         let routes = grpc::routes(&app, &health, LARGEST).prepare();
-        let grpc = ServiceBuilder::new().map_response(|r: Response<_>| r.map(Body::new)).layer(grpc::envelope()).service(routes);
+        let grpc = ServiceBuilder::new()
+            .map_response(|r: Response<_>| r.map(Body::new))
+            .layer(grpc::envelope(CancellationToken::new()))
+            .service(routes);
         let mut recipe = TrainConfig::preset(Algorithm::Vdn, Preset::Practical);
         recipe.environment.reward_scale = Some(1.0);
         let weights = (0..layout(&recipe).len()).map(|i| (i % 7) as f32 * 0.01).collect();

@@ -29,6 +29,8 @@ const QUIET: &[&str] = &[
     "Heartbeat",
     "/v1/act",
     "/v1/environments/{id}/step",
+    "/v2/models/{model}/infer",
+    "/v2/models/{model}/versions/{version}/infer",
     "/livez",
     "/readyz",
     "/metrics",
