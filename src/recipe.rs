@@ -4,6 +4,7 @@
 
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use serde_json::{Map, Value};
+use utoipa::ToSchema;
 
 use crate::env::EnvConfig;
 use crate::invalid::{Invalid, expectation, in_range};
@@ -11,7 +12,7 @@ use crate::policy::mixer::Mixing;
 use crate::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, Observation};
 
 /// The algorithms of the paper and its usual company.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Algorithm {
     /// GRU agents, monotonic mixing.
@@ -30,7 +31,7 @@ pub enum Algorithm {
 }
 
 /// Named starting points of a configuration (spec 5).
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Preset {
     /// What the paper writes.
@@ -43,7 +44,7 @@ pub enum Preset {
 }
 
 /// How the UAVs' values become one (spec 4).
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum MixerKind {
     /// Hypernetworks on the flat state.
@@ -68,7 +69,7 @@ impl From<MixerKind> for Mixing {
 }
 
 /// Everything about learning that is not the environment. `steps` counts environment slots.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 #[allow(clippy::struct_excessive_bools, reason = "a document of independent switches")]
 pub struct Training {
@@ -79,6 +80,7 @@ pub struct Training {
     /// Aggregation of `edgeconv`.
     pub aggregation: Aggregation,
     /// Graph layers.
+    #[schema(minimum = 1, maximum = 8)]
     pub layers: usize,
     /// Whether a UAV knows its own position.
     pub self_position: bool,
@@ -86,6 +88,7 @@ pub struct Training {
     pub self_loops: bool,
     /// Links over which a UAV without a graph network observes: 1 is its own range, L + 1 all that L graph layers reach.
     #[serde(default = "one")]
+    #[schema(minimum = 1, maximum = 9)]
     pub hops: usize,
     /// Whether relative positions are divided by d in flat observations too, and own positions scaled to [-1, 1].
     #[serde(default)]
@@ -94,40 +97,56 @@ pub struct Training {
     pub mixer: MixerKind,
     /// Factor of the initial weights of the hypernetworks' last layers.
     #[serde(default = "unit")]
+    #[schema(minimum = 0.0, maximum = 10.0)]
     pub hyper_init: f64,
     /// Environment steps (slots) to train for.
+    #[schema(minimum = 1, maximum = 1e12)]
     pub steps: u64,
     /// Adam's learning rate at the beginning.
+    #[schema(minimum = 1e-12, maximum = 1.0)]
     pub learning_rate: f64,
     /// Share of the learning rate that is left at the end; it falls linearly over `steps`. 1: constant.
     #[serde(default = "unit")]
+    #[schema(minimum = 0.0, maximum = 1.0)]
     pub learning_rate_decay: f64,
     /// Discount.
+    #[schema(minimum = 0.0, maximum = 1.0)]
     pub gamma: f64,
     /// lambda of TD(lambda).
+    #[schema(minimum = 0.0, maximum = 1.0)]
     pub lambda: f64,
     /// Global L2 norm that gradients are clipped to.
+    #[schema(minimum = 1e-9, maximum = 1e9)]
     pub clip: f64,
     /// Exploration at the end.
+    #[schema(minimum = 0.0, maximum = 1.0)]
     pub epsilon_end: f64,
     /// Environment steps over which exploration falls from 1 to its end.
+    #[schema(minimum = 1, maximum = 1e12)]
     pub epsilon_anneal: u64,
     /// Episodes per update.
+    #[schema(minimum = 1, maximum = 4096)]
     pub batch: usize,
     /// Updates per iteration; an iteration collects `envs` episodes.
+    #[schema(minimum = 1, maximum = 1024)]
     pub updates_per_iteration: usize,
     /// Episodes collected together.
+    #[schema(minimum = 1, maximum = 4096)]
     pub envs: usize,
     /// Episodes held in replay.
+    #[schema(minimum = 1, maximum = 1_000_000)]
     pub buffer: usize,
     /// Episodes between copies of the online networks to the targets.
+    #[schema(minimum = 1, maximum = 1e9)]
     pub target_every: u64,
     /// Share of the online networks that every update mixes into the targets, instead of copies; 0: copies.
     #[serde(default)]
+    #[schema(minimum = 0.0, maximum = 1.0)]
     pub target_tau: f64,
     /// Weights that are evaluated and published: the mean of the online weights over about this many updates, fading; 0 or
     /// 1: the online weights themselves.
     #[serde(default)]
+    #[schema(minimum = 0, maximum = 1e9)]
     pub average: u64,
     /// Whether the learner is rewarded for the age it collects instead of punished for the age there is: the same optimal
     /// policies (potential-based shaping), but the reward tells at once what an action was good for.
@@ -137,8 +156,10 @@ pub struct Training {
     #[serde(default)]
     pub augment: bool,
     /// Environment steps between evaluations.
+    #[schema(minimum = 1, maximum = 1e12)]
     pub eval_every: u64,
     /// Episodes of an evaluation.
+    #[schema(minimum = 1, maximum = 4096)]
     pub eval_episodes: usize,
 }
 

@@ -1,8 +1,8 @@
 //! Listeners, background work, shutdown: one process on one data directory.
 //!
-//! Shutdown in order: readiness goes off and new work is refused; training jobs are snapshotted and queued; requests in
-//! flight are answered; then the listeners are
-//! gone and the data directory is free for another server.
+//! Shutdown in order: readiness goes off, watchers of health are told and new work is refused; training jobs are snapshotted
+//! and queued; streams end and requests in flight are answered; then the listeners are gone and the data directory is free for
+//! another server.
 
 mod connections;
 mod keys;
@@ -249,12 +249,13 @@ pub async fn run(
     let own = Connections { permits: Arc::new(Semaphore::new(WORKERS)), tls: None, ..connections.clone() };
     // A stream of gRPC may be silent for as long as its connection answers pings, a body of REST may not.
     let grpc = |services: grpc::Services| services.map_request(|r: Request<Incoming>| r.map(tonic::body::Body::new));
-    let services = grpc::services(&app, &health, config.max_message_size);
+    let services = grpc::services(&app, &health, config.max_message_size, stop.clone());
     let patience = config.read_timeout;
     let router = rest::router(app.clone(), telemetry::render, config.max_message_size);
     let router =
         router.map_request(move |r: Request<Incoming>| r.map(|body| axum::body::Body::new(PromptBody::new(body, patience))));
-    let serve_workers = own.serve(listeners.workers, Protocol::Grpc, grpc(grpc::worker_services(&app, config.max_message_size)));
+    let serve_workers =
+        own.serve(listeners.workers, Protocol::Grpc, grpc(grpc::worker_services(&app, config.max_message_size, stop.clone())));
     let serve_grpc = connections.clone().serve(listeners.grpc, Protocol::Grpc, grpc(services));
     let serve_rest = connections.serve(listeners.http, Protocol::Http, router);
 
@@ -296,12 +297,16 @@ const WORKERS: usize = 4096;
 
 /// What has to be done now and then, however quiet it is.
 async fn housekeeping(app: Arc<App>, ttl: Duration) {
-    // Figures that were recorded wait in memory until then.
-    let pause = (ttl / 4).clamp(Duration::from_secs(1), Duration::from_secs(5));
+    let mut sweep = tokio::time::interval((ttl / 4).clamp(Duration::from_secs(1), Duration::from_secs(30)));
+    // Times that were recorded wait in memory until they are put into their buckets.
+    let mut upkeep = tokio::time::interval(Duration::from_secs(5));
     loop {
-        tokio::time::sleep(pause).await;
-        app.sessions.sweep();
-        app.environments.table().sweep();
-        telemetry::metrics().run_upkeep();
+        tokio::select! {
+            _ = sweep.tick() => {
+                app.sessions.sweep();
+                app.environments.table().sweep();
+            }
+            _ = upkeep.tick() => telemetry::metrics().run_upkeep(),
+        }
     }
 }

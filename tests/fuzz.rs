@@ -271,7 +271,7 @@ impl Subject {
         let app = server::open(&config, &data, Clock::system()).await.unwrap();
         telemetry::metrics();
         let health = grpc::Health::new(CancellationToken::new());
-        let services = grpc::services(&app, &health, LARGEST);
+        let services = grpc::services(&app, &health, LARGEST, CancellationToken::new());
         let grpc = ServiceBuilder::new().map_response(|r: Response<_>| r.map(Body::new)).service(services);
         let mut recipe = TrainConfig::preset(Algorithm::Vdn, Preset::Practical);
         recipe.environment.reward_scale = Some(1.0);

@@ -45,7 +45,7 @@ const GRPC: &[(&str, &str, Need)] = &[
 
 /// Verb, routes as they are registered, what they need. `HEAD` is `GET`.
 const REST: &[(&str, &str, Need)] = &[
-    ("GET", "/livez /readyz /openapi.json /docs /docs/ /docs/{*path} /v2/health/live", OPEN),
+    ("GET", "/livez /readyz /openapi.json /docs /docs/{file} /v2/health/live", OPEN),
     ("GET", "/ /metrics", READ),
     ("POST", "/v1/act /v1/sessions", ACT),
     ("GET", "/v1/sessions /v1/sessions/{id}", READ),

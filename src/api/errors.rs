@@ -5,6 +5,7 @@ use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use tonic::{Code, Status};
+use utoipa::ToSchema;
 
 use crate::service::Error;
 
@@ -73,19 +74,25 @@ pub fn act_error(error: &Error) -> crate::wire::v1::ActError {
 }
 
 /// RFC 9457 problem details.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, ToSchema)]
 pub struct Problem {
     /// `about:blank`: the title says it all.
+    #[schema(example = "about:blank")]
     pub r#type: &'static str,
     /// Reason phrase of the status.
+    #[schema(example = "Bad Request")]
     pub title: &'static str,
     /// HTTP status.
+    #[schema(minimum = 400, maximum = 599, example = 400)]
     pub status: u16,
     /// Stable code, for programs.
+    #[schema(example = "invalid_argument")]
     pub code: &'static str,
     /// What is wrong with this request, for people.
+    #[schema(example = "scene.users[2].aoi: -1 is not valid; expected a number from 0 to 1000000")]
     pub detail: String,
     /// The field that is wrong, if one is.
+    #[schema(example = "scene.users[2].aoi")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub field: Option<String>,
 }

@@ -163,14 +163,11 @@ pub async fn run(args: PoliciesArgs) -> anyhow::Result<()> {
 }
 
 async fn list(client: &Client) -> anyhow::Result<(Value, String)> {
-    let (mut all, mut token) = (Vec::new(), String::new());
-    loop {
+    let (mut all, mut next) = (Vec::new(), Some(String::new()));
+    while let Some(token) = next {
         let mut page = client.get(&format!("/v1/policies{}", query(&[("page_token", Some(token))]))).await?;
-        token = page["next_page_token"].as_str().unwrap_or_default().to_owned();
         all.extend(page["policies"].as_array_mut().map(std::mem::take).unwrap_or_default());
-        if token.is_empty() {
-            break;
-        }
+        next = page["next_page_token"].as_str().filter(|token| !token.is_empty()).map(str::to_owned);
     }
     let rows = all.iter().map(|p| {
         let fleet = |size: &Value| if size.is_null() { "any".to_owned() } else { text(size) };

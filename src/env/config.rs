@@ -1,14 +1,16 @@
 //! The environment's configuration (spec 1): names, units, defaults, limits.
 
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
+use super::schema::Weight;
 use crate::invalid::{Invalid, in_range};
 
 /// A point in the plane, in units of the square's side.
 pub type Point = [f64; 2];
 
 /// What happens at the border of the unit square.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Boundary {
     /// Each coordinate is clamped to [0, 1].
@@ -43,34 +45,44 @@ pub enum Layout {
 }
 
 /// Everything that fixes an environment but the episode's seed (spec 1). Lengths are in units of the square's side.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields, default)]
+#[schema(as = Environment, default)]
 pub struct EnvConfig {
     /// M, the number of UAVs.
+    #[schema(minimum = 1, maximum = 4096)]
     pub uavs: usize,
     /// N, the number of users.
+    #[schema(minimum = 1, maximum = 65536)]
     pub users: usize,
     /// K, slots per episode.
+    #[schema(minimum = 1, maximum = 10000)]
     pub slots: usize,
     /// v, distance flown per slot.
+    #[schema(minimum = 0, maximum = 1)]
     pub speed: f64,
     /// t, range within which a user's data is collected.
+    #[schema(minimum = 0, maximum = 2)]
     pub transmission_range: f64,
     /// d, range within which nodes see each other; at least t.
+    #[schema(minimum = 1e-6, maximum = 2)]
     pub detection_range: f64,
     /// Adds a ninth action that stays in place.
     pub hover: bool,
     /// Rule at the border.
     pub boundary: Boundary,
     /// Factor of the reward -`reward_scale` * mean AoI; absent: 1/K.
+    #[schema(minimum = 1e-9, maximum = 1e9)]
     pub reward_scale: Option<f64>,
     /// UAV positions at slot 0.
     pub start: Start,
     /// User positions at slot 0.
     pub layout: Layout,
     /// Weight of each user in the reward and the mean AoI (scaled to mean 1); absent: all equal.
+    #[schema(value_type = Option<Vec<Weight>>)]
     pub weights: Option<Vec<f64>>,
     /// Distance a user walks per slot, in a direction that turns a little each slot; 0: users stay.
+    #[schema(minimum = 0, maximum = 1)]
     pub user_speed: f64,
 }
 

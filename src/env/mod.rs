@@ -4,6 +4,7 @@ mod batch;
 mod config;
 mod episode;
 mod metrics;
+mod schema;
 mod walk;
 
 pub use batch::{BatchEnv, StepError};

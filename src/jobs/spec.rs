@@ -96,8 +96,8 @@ fn check_labels(labels: &BTreeMap<String, String>) -> Result<(), Invalid> {
     }
     for (key, value) in labels {
         check_name("labels", key)?;
-        if value.len() > 255 || value.chars().any(char::is_control) {
-            let expected = "at most 255 bytes without control characters";
+        if value.chars().count() > 255 || value.chars().any(char::is_control) {
+            let expected = "at most 255 characters, none of them a control character";
             return Err(Invalid::new(format!("labels.{key}"), format!("{value:?}"), expected));
         }
     }

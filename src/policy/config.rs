@@ -1,6 +1,7 @@
 //! The agent's architecture as configuration (spec 2 and 3).
 
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
 /// The graph layer of an agent (spec 3).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -17,7 +18,7 @@ pub enum Gnn {
 }
 
 /// How messages are aggregated over neighbours.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Aggregation {
     /// Divided by the number of neighbours.
@@ -27,7 +28,7 @@ pub enum Aggregation {
 }
 
 /// What a node is told of what it sees.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Observation {
     /// One fixed place per entity, width 2M + 3N (spec 2.1); ties a checkpoint to (M, N).
@@ -37,7 +38,7 @@ pub enum Observation {
 }
 
 /// What tells UAVs with equal observations apart (spec 2.4).
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Identity {
     /// One-hot index, M wide.

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use bytes::Bytes;
+use tracing::level_filters::LevelFilter;
 
 use super::sequences::{self, Sequence};
 use super::{App, Error};
@@ -214,7 +215,7 @@ pub(super) async fn slot_of(fleet: &Fleet, seen: Seen, policy: &Arc<LoadedPolicy
 
 /// Tells the span of the request what it is about, if anybody reads it.
 fn note(field: &'static str, value: &dyn std::fmt::Display) {
-    if tracing::enabled!(target: "qedgix::request", tracing::Level::DEBUG) {
+    if LevelFilter::current() >= LevelFilter::DEBUG {
         tracing::Span::current().record(field, tracing::field::display(value));
     }
 }

@@ -3,6 +3,7 @@
 use serde_json::Value;
 use uuid::Uuid;
 
+use super::worker::is_metric_name;
 use super::{App, Error, policies};
 use crate::invalid::{Invalid, in_range};
 use crate::jobs::spec;
@@ -73,7 +74,7 @@ pub async fn get(app: &App, id: &str) -> Result<Job, Error> {
 /// A limit over 1000, or a cursor that no page gave.
 pub async fn list(app: &App, state: Option<JobState>, limit: u32, cursor: Option<&str>) -> Result<Page<Job>, Error> {
     let limit = page_size(limit, 100, 1000)?;
-    let before = cursor.map(|c| c.parse().map_err(|_| bad_cursor(c))).transpose()?;
+    let before = cursor.map(|c| number(c).ok_or_else(|| bad_cursor(c))).transpose()?;
     let items = app.store.jobs(state, before, limit + 1).await?;
     Ok(page(items, limit, |job| job.number.to_string()))
 }
@@ -131,8 +132,8 @@ pub async fn metrics(
 
 fn parse_metric_cursor(cursor: &str) -> Option<MetricCursor> {
     let (name, step) = cursor.rsplit_once('@')?;
-    let step = step.parse().ok().filter(|&step: &u64| i64::try_from(step).is_ok())?;
-    Some(MetricCursor { name: name.to_owned(), step })
+    let step = number(step)? as u64;
+    Some(MetricCursor { name: name.to_owned(), step }).filter(|_| is_metric_name(name))
 }
 
 /// Checkpoints of a job, without their bytes, oldest first.
@@ -166,6 +167,12 @@ pub async fn logs(app: &App, id: &str) -> Result<Vec<Attempt>, Error> {
         }
     }
     Ok(attempts)
+}
+
+/// A number in digits, as cursors have them.
+pub(super) fn number(text: &str) -> Option<i64> {
+    let digits = !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
+    text.parse().ok().filter(|_| digits)
 }
 
 fn page_size(limit: u32, default: u32, most: u32) -> Result<u32, Invalid> {

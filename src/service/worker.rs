@@ -122,14 +122,18 @@ pub async fn report(app: &App, lease: Lease, metrics: &[Metric], step: u64) -> R
     in_range("metrics", metrics.len(), 0..=MOST_METRICS)?;
     check_step("step", step)?;
     for (i, metric) in metrics.iter().enumerate() {
-        let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '/' | '.');
-        if metric.name.is_empty() || metric.name.len() > 63 || !metric.name.chars().all(allowed) {
+        if !is_metric_name(&metric.name) {
             let expected = "1 to 63 letters, digits, '_', '-', '/' and '.'";
             return Err(Invalid::new(format!("metrics[{i}].name"), format!("{:?}", metric.name), expected).into());
         }
         check_step(&format!("metrics[{i}].step"), metric.step)?;
     }
     must_live(app.store.report(lease, metrics, step, app.clock.now()).await?, lease)
+}
+
+pub(super) fn is_metric_name(name: &str) -> bool {
+    let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '/' | '.');
+    (1..=63).contains(&name.len()) && name.chars().all(allowed)
 }
 
 fn check_step(field: &str, step: u64) -> Result<(), Invalid> {

@@ -16,7 +16,7 @@ pub struct Fleet {
 }
 
 impl Fleet {
-    /// Longest id, in bytes.
+    /// Longest id, in characters.
     pub const LONGEST_ID: usize = 128;
 
     /// The canonical order of ids.

@@ -33,7 +33,7 @@ impl FromStr for PolicySpec {
 
     fn from_str(text: &str) -> Result<Self, Invalid> {
         let wrong = || {
-            let expected = "NAME, NAME@ALIAS or NAME:VERSION, names of up to 64 letters, digits, '.', '_', '-'";
+            let expected = "NAME, NAME@ALIAS or NAME:VERSION, names of up to 64 letters, digits, '.', '_', '-', the first no '.'";
             Invalid::new("policy", format!("{text:?}"), expected)
         };
         let (name, which) = if let Some((name, alias)) = text.split_once('@') {
@@ -64,13 +64,14 @@ impl fmt::Display for PolicySpec {
 /// Checks the name of a policy or alias.
 ///
 /// # Errors
-/// Empty, too long, or a character other than ASCII letters, digits, `.`, `_`, `-`; `field` is named.
+/// Empty, too long, a character other than ASCII letters, digits, `.`, `_`, `-`, or a `.` first, which paths do not keep;
+/// `field` is named.
 pub fn check_name(field: &str, name: &str) -> Result<(), Invalid> {
     let allowed = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-');
-    if !name.is_empty() && name.len() <= LONGEST && name.bytes().all(allowed) {
+    if !name.is_empty() && name.len() <= LONGEST && name.bytes().all(allowed) && !name.starts_with('.') {
         return Ok(());
     }
-    let expected = format!("1 to {LONGEST} letters, digits, '.', '_' or '-'");
+    let expected = format!("1 to {LONGEST} letters, digits, '.', '_' or '-', the first no '.'");
     Err(Invalid::new(field, format!("{name:?}"), expected))
 }
 
@@ -109,7 +110,25 @@ mod tests {
         assert_eq!(parse("sweep"), Ok(Which::Newest));
         assert_eq!(parse("sweep@prod"), Ok(Which::Alias("prod".into())));
         assert_eq!(parse("sweep:12"), Ok(Which::Version(12)));
-        for wrong in ["", "a b", "a:", "a:0", "a:+1", "a:-1", "a:x", "a@", "@b", ":1", "a@b:1", "a:1@b", "é", &"x".repeat(65)] {
+        for wrong in [
+            "",
+            "a b",
+            "a:",
+            "a:0",
+            "a:+1",
+            "a:-1",
+            "a:x",
+            "a@",
+            "@b",
+            ":1",
+            "a@b:1",
+            "a:1@b",
+            ".a",
+            "..",
+            "a@.b",
+            "é",
+            &"x".repeat(65),
+        ] {
             assert!(parse(wrong).is_err(), "{wrong:?}");
         }
         for text in ["sweep", "sweep@prod", "sweep:12"] {

@@ -64,7 +64,7 @@ mod tests {
     #[test]
     fn control_characters_are_escaped() {
         let mut line = Harmless(String::new());
-        write!(line, "a\nb{}{}é\u{9b}", "\x1b[31m", "c\r\n").unwrap();
+        line.write_str("a\nb\x1b[31mc\r\né\u{9b}").unwrap();
         assert_eq!(line.0, "a\\nb\\u{1b}[31mc\\r\\né\\u{9b}");
     }
 }

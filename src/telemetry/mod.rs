@@ -6,7 +6,8 @@ mod traces;
 
 use std::io::IsTerminal;
 
-use tracing_subscriber::filter::{LevelFilter, Targets};
+use tracing::{Level, Metadata};
+use tracing_subscriber::filter::{LevelFilter, filter_fn};
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer, Registry, fmt};
@@ -35,7 +36,7 @@ pub fn logs(logs: Logs, traces: Option<&Traces>) {
     let filter = filter.add_directive(access.parse().expect("a directive"));
     let lines = fmt::layer().with_writer(std::io::stderr);
     let lines: Box<dyn Layer<Registry> + Send + Sync> = if logs.json {
-        lines.json().boxed()
+        lines.json().with_span_list(false).boxed()
     } else {
         lines.with_ansi(std::io::stderr().is_terminal()).fmt_fields(lines::Fields).boxed()
     };
@@ -43,8 +44,9 @@ pub fn logs(logs: Logs, traces: Option<&Traces>) {
         // One filter for all: what is off is found out without asking any layer.
         None => tracing_subscriber::registry().with(lines).with(filter).try_init(),
         Some(traces) => {
-            let requests = Targets::new().with_target(REQUESTS, LevelFilter::DEBUG);
-            let spans = traces.layer().with_filter(requests);
+            // The spans of requests, and what went wrong in them.
+            let wanted = |m: &Metadata<'_>| m.target() == REQUESTS && (m.is_span() || *m.level() <= Level::WARN);
+            let spans = traces.layer().with_filter(filter_fn(wanted).with_max_level_hint(LevelFilter::DEBUG));
             tracing_subscriber::registry().with(lines.with_filter(filter)).with(spans).try_init()
         }
     };

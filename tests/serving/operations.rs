@@ -31,6 +31,12 @@ async fn small_packets_are_sent_at_once_on_both_listeners() {
     }
 
     let server = Server::start().await;
+    let myself = pidfd_open(getpid(), PidfdFlags::empty());
+    let allowed = myself.is_ok_and(|myself| pidfd_getfd(&myself, 0, PidfdGetfdFlags::empty()).is_ok());
+    if !allowed {
+        eprintln!("this system does not let a process look at its own files: nothing is tested");
+        return;
+    }
     for (address, hello) in [
         (server.endpoints.grpc, &b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0"[..]),
         (server.endpoints.http, b"GET /livez HTTP/1.1\r\nhost: here\r\n\r\n"),

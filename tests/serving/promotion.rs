@@ -85,7 +85,7 @@ async fn an_alias_is_set_moved_and_deleted_and_that_is_remembered() {
     }
     for (path, body, status) in [
         ("/v1/policies/mine/aliases/a:b", r#"{"version": 1}"#, 400),
-        ("/v1/policies/sweep/aliases/live", r#"{"version": 1}"#, 400),
+        ("/v1/policies/sweep/aliases/live", r#"{"version": 1}"#, 409),
         ("/v1/policies/nobody/aliases/live", r#"{"version": 1}"#, 404),
         ("/v1/policies/mine/aliases/live", r#"{"version": -1}"#, 422),
         ("/v1/policies/mine/aliases/live", r#"{"versoin": 1}"#, 422),

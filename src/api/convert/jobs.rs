@@ -5,13 +5,17 @@ use std::collections::BTreeMap;
 use jiff::Timestamp;
 use serde::Serialize;
 use serde_json::Value;
+use utoipa::openapi::RefOr;
+use utoipa::openapi::schema::{Object, ObjectBuilder, OneOfBuilder, Schema, SchemaType, Type};
+use utoipa::{PartialSchema, ToSchema};
 use uuid::Uuid;
 
 use super::response::timestamp;
 use super::structs::to_struct;
+use crate::env::EnvConfig;
 use crate::invalid::Invalid;
 use crate::jobs::Directive;
-use crate::recipe::TrainConfig;
+use crate::recipe::{Algorithm, Preset, TrainConfig, Training};
 use crate::service::worker::Finish;
 use crate::store::{
     Attempt, Checkpoint, CheckpointKind, Job, JobId, JobKind, JobSpec, JobState, Metric, MetricRow, NewCheckpoint, Outcome,
@@ -19,47 +23,138 @@ use crate::store::{
 };
 use crate::wire::v1;
 
+/// What may be asked of a job; all of it is optional.
+// `jobs::spec` reads it, for both transports; a test holds the two together.
+#[derive(Debug, ToSchema)]
+#[serde(deny_unknown_fields)]
+#[schema(example = json!({"name": "my-policy", "algorithm": "qedgix", "training": {"steps": 20_000}, "seed": 1}))]
+#[allow(dead_code, reason = "it documents what is read field by field")]
+pub struct JobRequest {
+    kind: Option<Only>,
+    /// Of the job, and of the policy that it publishes.
+    #[schema(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$")]
+    name: Option<String>,
+    /// For people.
+    #[schema(schema_with = labels)]
+    labels: Option<BTreeMap<String, String>>,
+    /// Cores it may use.
+    #[schema(minimum = 1)]
+    threads: Option<usize>,
+    /// Higher goes first.
+    #[schema(minimum = -100, maximum = 100)]
+    priority: Option<i64>,
+    /// `qedgix` unless said otherwise.
+    #[schema(value_type = Option<Algorithm>)]
+    algorithm: Option<Algorithm>,
+    /// What everything starts from that is not said: `practical` unless said otherwise.
+    preset: Option<Preset>,
+    /// Fields over those of the preset; the letters of the paper are understood, too.
+    environment: Option<EnvConfig>,
+    /// Fields over those of the preset.
+    #[schema(schema_with = some_of_training)]
+    training: Option<Training>,
+    /// Fixes every metric and weight.
+    #[schema(minimum = 0, maximum = 9007199254740991_u64)]
+    seed: Option<u64>,
+}
+
+/// The kinds of jobs that this version runs.
+#[derive(Debug, ToSchema)]
+#[schema(as = JobKind, rename_all = "lowercase")]
+#[allow(dead_code, reason = "it documents what is read as a JobKind")]
+enum Only {
+    Train,
+}
+
+fn labels() -> Object {
+    let text = |pattern| ObjectBuilder::new().schema_type(Type::String).pattern(Some(pattern));
+    ObjectBuilder::new()
+        .schema_type(SchemaType::from_iter([Type::Object, Type::Null]))
+        .property_names(Some(text("^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$")))
+        .additional_properties(Some(text("^[^\\u0000-\\u001f\\u007f-\\u009f]{0,255}$")))
+        .max_properties(Some(32))
+        .build()
+}
+
+/// [`Training`] with none of its fields required, or null.
+fn some_of_training() -> RefOr<Schema> {
+    let mut schema = Training::schema();
+    if let RefOr::T(Schema::Object(object)) = &mut schema {
+        object.required.clear();
+    }
+    let null = ObjectBuilder::new().schema_type(Type::Null);
+    OneOfBuilder::new().item(schema).item(null).into()
+}
+
 /// What a job does, in the fields it was submitted in.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = JobSpec)]
 pub struct SpecView<'a> {
+    #[schema(value_type = Only)]
     kind: JobKind,
+    #[schema(required = true)]
     name: &'a Option<String>,
     labels: &'a BTreeMap<String, String>,
     threads: usize,
     priority: i64,
-    /// `algorithm`, `preset`, `environment`, `training`, `seed`.
-    #[serde(flatten)]
-    config: &'a TrainConfig,
+    algorithm: Algorithm,
+    preset: Preset,
+    environment: &'a EnvConfig,
+    training: &'a Training,
+    seed: u64,
 }
 
 impl<'a> From<&'a JobSpec> for SpecView<'a> {
     fn from(spec: &'a JobSpec) -> Self {
         let JobSpec { kind, name, labels, threads, priority, config } = spec;
-        Self { kind: *kind, name, labels, threads: *threads, priority: *priority, config }
+        let TrainConfig { algorithm, preset, environment, training, seed } = config;
+        Self {
+            kind: *kind,
+            name,
+            labels,
+            threads: *threads,
+            priority: *priority,
+            algorithm: *algorithm,
+            preset: *preset,
+            environment,
+            training,
+            seed: *seed,
+        }
     }
 }
 
 /// A job as REST shows it.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Job)]
 pub struct JobView<'a> {
+    #[schema(value_type = Uuid)]
     id: JobId,
     state: JobState,
+    /// What a running job was asked for and has not done yet.
+    #[schema(required = true)]
     wanted: Option<Wanted>,
+    /// Why it failed, or what became of its last attempt.
+    #[schema(required = true)]
     reason: &'a Option<String>,
     progress: Progress,
     attempts: u32,
     failures: u32,
+    /// NAME:VERSION of the policy it was published as.
+    #[schema(required = true)]
     policy: &'a Option<String>,
     last_event_id: u64,
     created_at: Timestamp,
+    #[schema(required = true)]
     started_at: Option<Timestamp>,
+    #[schema(required = true)]
     ended_at: Option<Timestamp>,
     #[serde(flatten)]
     spec: SpecView<'a>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
 struct Progress {
+    /// Environment steps done, and in all.
     step: u64,
     steps: u64,
 }
@@ -85,10 +180,14 @@ impl<'a> From<&'a Job> for JobView<'a> {
 }
 
 /// A metric as REST shows it.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = MetricRow)]
 pub struct MetricView {
     name: String,
+    /// Environment steps.
     step: u64,
+    /// Null where it was not a finite number.
+    #[schema(required = true)]
     value: Option<f64>,
     at: Timestamp,
 }
@@ -101,16 +200,24 @@ impl From<MetricRow> for MetricView {
 }
 
 /// A checkpoint as REST shows it.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Checkpoint)]
 pub struct CheckpointView {
     id: Uuid,
+    #[schema(value_type = Uuid)]
     job: JobId,
     kind: CheckpointKind,
     attempt: u32,
+    /// Environment steps it was taken at.
     step: u64,
+    #[schema(pattern = "^[0-9a-f]{64}$")]
     sha256: String,
+    /// Bytes.
     size: u64,
+    /// Figures it was taken at.
     metrics: BTreeMap<String, f64>,
+    /// The job's resolved training configuration.
+    #[schema(value_type = Object)]
     config: Value,
     created_at: Timestamp,
 }
@@ -123,13 +230,18 @@ impl From<Checkpoint> for CheckpointView {
 }
 
 /// An attempt as REST shows it.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Attempt)]
 pub struct AttemptView {
     attempt: u32,
     started_at: Timestamp,
+    #[schema(required = true)]
     ended_at: Option<Timestamp>,
+    #[schema(required = true)]
     outcome: Option<Outcome>,
+    #[schema(required = true)]
     reason: Option<String>,
+    /// Last output of its worker.
     log: String,
 }
 

@@ -46,10 +46,10 @@ fn aoi(field: impl Fn() -> String, value: f64) -> Result<f32, Invalid> {
 
 fn name(field: &str, id: &str) -> Result<(), Invalid> {
     let longest = crate::serving::Fleet::LONGEST_ID;
-    if !id.is_empty() && id.len() <= longest {
+    if !id.is_empty() && id.chars().count() <= longest {
         return Ok(());
     }
-    Err(Invalid::new(field, format!("{id:?}"), format!("1 to {longest} bytes")))
+    Err(Invalid::new(field, format!("{id:?}"), format!("1 to {longest} characters")))
 }
 
 #[cfg(test)]

@@ -10,6 +10,7 @@ use std::time::Instant;
 use axum::http::{HeaderMap, header};
 use bytes::Bytes;
 use http_body::{Frame, SizeHint};
+use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 use tonic::body::Body;
 use tonic::{Code, Status};
 use tracing::Span;
@@ -24,6 +25,8 @@ pub(super) struct Shared {
     pub(super) meters: Meters,
     pub(super) ids: Ids,
     pub(super) valve: Valve,
+    /// Cancelled when the server closes.
+    pub(super) closing: CancellationToken,
 }
 
 /// A call. It ends once: with a status, or cancelled when it is dropped before.
@@ -65,11 +68,7 @@ impl Call {
         method.handles().seconds.record(seconds);
         let verdict = match code {
             Code::Internal | Code::Unknown | Code::DataLoss => Verdict::Fault,
-            Code::ResourceExhausted
-            | Code::Unavailable
-            | Code::DeadlineExceeded
-            | Code::Unauthenticated
-            | Code::PermissionDenied => Verdict::Refused,
+            Code::ResourceExhausted | Code::DeadlineExceeded | Code::Unauthenticated | Code::PermissionDenied => Verdict::Refused,
             _ => Verdict::Settled,
         };
         let ending = Ending { method: &method.path, id: &self.id, code: code_name(code), seconds, verdict, detail };
@@ -95,17 +94,20 @@ pub(super) fn in_line(status: &Status) -> Option<Status> {
     }))
 }
 
-/// The body of a request of many messages.
+/// The body of a request of many messages. It ends when the server closes, however long its caller would go on, and with it
+/// the stream that answers it.
 pub(super) struct Question {
     body: Body,
     frames: Frames,
     shared: Arc<Shared>,
     method: usize,
+    closing: Pin<Box<WaitForCancellationFutureOwned>>,
 }
 
 impl Question {
     pub(super) fn new(body: Body, shared: Arc<Shared>, method: usize) -> Self {
-        Self { body, frames: Frames::default(), shared, method }
+        let closing = Box::pin(shared.closing.clone().cancelled_owned());
+        Self { body, frames: Frames::default(), shared, method, closing }
     }
 }
 
@@ -116,7 +118,9 @@ impl http_body::Body for Question {
     type Error = Status;
 
     fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Polled {
-        let frame = ready!(Pin::new(&mut self.body).poll_frame(context));
+        let Poll::Ready(frame) = Pin::new(&mut self.body).poll_frame(context) else {
+            return self.closing.as_mut().poll(context).map(|()| None);
+        };
         if let Some(piece) = frame.as_ref().and_then(|frame| frame.as_ref().ok()?.data_ref()) {
             let messages = self.frames.count(piece);
             self.shared.meters.method(self.method).handles().received.increment(messages);
@@ -190,16 +194,13 @@ impl http_body::Body for Answer {
         let inside = this.call.span.enter();
         let polled = catch_unwind(AssertUnwindSafe(|| Pin::new(&mut this.body).poll_frame(context)));
         drop(inside);
-        let frame = match polled {
-            Ok(polled) => ready!(polled),
-            Err(_) => {
-                this.body = Body::empty();
-                let status = Status::from(Error::internal("a stream panicked"));
-                this.call.end(status.code(), &"a stream panicked");
-                return Poll::Ready(Some(Ok(Frame::trailers(trailers_of(status)))));
-            }
+        let Ok(polled) = polled else {
+            this.body = Body::empty();
+            let status = Status::from(Error::internal("a stream panicked"));
+            this.call.end(status.code(), &"a stream panicked");
+            return Poll::Ready(Some(Ok(Frame::trailers(trailers_of(status)))));
         };
-        Poll::Ready(match frame {
+        Poll::Ready(match ready!(polled) {
             Some(Ok(frame)) => Some(Ok(match frame.into_trailers() {
                 Ok(trailers) => Frame::trailers(this.ended(trailers)),
                 Err(frame) => {
@@ -227,5 +228,34 @@ impl http_body::Body for Answer {
 
     fn size_hint(&self) -> SizeHint {
         self.body.size_hint()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use http_body::Body as _;
+
+    struct Panics;
+
+    impl http_body::Body for Panics {
+        type Data = Bytes;
+        type Error = Status;
+
+        fn poll_frame(self: Pin<&mut Self>, _: &mut Context<'_>) -> Polled {
+            panic!("a stream of the tests panics")
+        }
+    }
+
+    #[test]
+    fn a_stream_that_panics_ends_with_a_status() {
+        let shared = Shared { meters: Meters::new(&[]), ids: Ids::new(), valve: Valve::new(), closing: CancellationToken::new() };
+        let id = shared.ids.of(&HeaderMap::new());
+        let mut answer = Answer::new(Body::new(Panics), Call::begin(Arc::new(shared), 0, id, Span::none()));
+        let mut context = Context::from_waker(std::task::Waker::noop());
+        let Poll::Ready(Some(Ok(frame))) = Pin::new(&mut answer).poll_frame(&mut context) else { panic!("no frame") };
+        let status = Status::from_header_map(frame.trailers_ref().unwrap()).unwrap();
+        assert_eq!((status.code(), status.message()), (Code::Internal, "internal error"));
+        assert!(answer.call.over && matches!(Pin::new(&mut answer).poll_frame(&mut context), Poll::Ready(None)));
     }
 }

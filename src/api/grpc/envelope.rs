@@ -13,6 +13,7 @@ use std::time::Instant;
 use axum::http::{Request, Response};
 use pin_project_lite::pin_project;
 use tokio::time::Sleep;
+use tokio_util::sync::CancellationToken;
 use tonic::Status;
 use tonic::body::Body;
 use tower::Service;
@@ -31,9 +32,9 @@ pub struct Envelope<S> {
 }
 
 impl<S> Envelope<S> {
-    /// Around services with the methods of these descriptor sets.
-    pub(super) fn new(inner: S, descriptors: &[&[u8]]) -> Self {
-        let shared = Shared { meters: Meters::new(descriptors), ids: Ids::new(), valve: Valve::new() };
+    /// Around services with the methods of these descriptor sets, until `closing` is cancelled.
+    pub(super) fn new(inner: S, descriptors: &[&[u8]], closing: CancellationToken) -> Self {
+        let shared = Shared { meters: Meters::new(descriptors), ids: Ids::new(), valve: Valve::new(), closing };
         Self { inner, shared: Arc::new(shared) }
     }
 }

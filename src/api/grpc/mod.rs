@@ -14,6 +14,7 @@ mod worker;
 
 use std::sync::Arc;
 
+use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
 
 use deadline::deadline;
@@ -39,11 +40,11 @@ const BUILT_IN: &str = "the descriptors are built into the program";
 /// Services behind the gate, and what happens around every call.
 pub type Services = Envelope<Gate<Routes>>;
 
-/// All services. A message larger than `max_message` bytes is refused.
+/// All services. A message larger than `max_message` bytes is refused; streams end when `closing` is cancelled.
 ///
 /// # Panics
 /// When a descriptor set built into the program does not decode; a test would have failed before.
-pub fn services(app: &Arc<App>, health: &Health, max_message: usize) -> Services {
+pub fn services(app: &Arc<App>, health: &Health, max_message: usize, closing: CancellationToken) -> Services {
     let reflection = || {
         let builder = tonic_reflection::server::Builder::configure().register_encoded_file_descriptor_set(DESCRIPTORS);
         builder.register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
@@ -58,23 +59,23 @@ pub fn services(app: &Arc<App>, health: &Health, max_message: usize) -> Services
         .add_service(health.server())
         .add_service(reflection().build_v1().expect(BUILT_IN))
         .add_service(reflection().build_v1alpha().expect(BUILT_IN));
-    within(app, routes.routes())
+    within(app, routes.routes(), closing)
 }
 
 /// What workers need and nothing else, for an address of their own.
 ///
 /// # Panics
 /// As [`services`].
-pub fn worker_services(app: &Arc<App>, max_message: usize) -> Services {
-    within(app, Routes::new(workers(app, max_message)))
+pub fn worker_services(app: &Arc<App>, max_message: usize, closing: CancellationToken) -> Services {
+    within(app, Routes::new(workers(app, max_message)), closing)
 }
 
 fn workers(app: &Arc<App>, max_message: usize) -> WorkerServiceServer<impl WorkerService> {
     worker::service(app.clone()).max_decoding_message_size(max_message.max(worker::LARGEST_MESSAGE))
 }
 
-fn within(app: &Arc<App>, routes: Routes) -> Services {
+fn within(app: &Arc<App>, routes: Routes, closing: CancellationToken) -> Services {
     use tonic_reflection::pb::{v1, v1alpha};
-    let sets = [DESCRIPTORS, tonic_health::pb::FILE_DESCRIPTOR_SET, v1::FILE_DESCRIPTOR_SET, v1alpha::FILE_DESCRIPTOR_SET];
-    Envelope::new(Gate::new(routes.prepare(), app.clone()), &sets)
+    let known = [DESCRIPTORS, tonic_health::pb::FILE_DESCRIPTOR_SET, v1::FILE_DESCRIPTOR_SET, v1alpha::FILE_DESCRIPTOR_SET];
+    Envelope::new(Gate::new(routes.prepare(), app.clone()), &known, closing)
 }

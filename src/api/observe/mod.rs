@@ -29,6 +29,8 @@ const QUIET: &[&str] = &[
     "Heartbeat",
     "/v1/act",
     "/v1/environments/{id}/step",
+    "/v2/models/{model}/infer",
+    "/v2/models/{model}/versions/{version}/infer",
     "/livez",
     "/readyz",
     "/metrics",
@@ -147,9 +149,9 @@ impl Extractor for Headers<'_> {
 /// What became of a request, for who runs the server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Verdict {
-    /// Answered, or the caller's mistake.
+    /// Answered, or the caller's mistake, or a server that drains, which says so itself.
     Settled,
-    /// Turned away: a limit, no right to ask, too late, draining.
+    /// Turned away: a limit, no right to ask, too late.
     Refused,
     /// A fault of the server.
     Fault,
@@ -184,6 +186,7 @@ pub(super) fn tell(ending: &Ending<'_>, span: &Span, valve: &Valve) {
         }
         Verdict::Refused => {
             if let Some(muted) = valve.pass() {
+                let muted = (muted > 0).then_some(muted);
                 tracing::warn!(target: "qedgix::request", %method, request_id = %id, code, seconds, detail = %detail, muted, "refused");
             }
         }

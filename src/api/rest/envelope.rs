@@ -85,8 +85,9 @@ fn verdict(status: StatusCode) -> Verdict {
         | StatusCode::FORBIDDEN
         | StatusCode::PAYLOAD_TOO_LARGE
         | StatusCode::TOO_MANY_REQUESTS
-        | StatusCode::SERVICE_UNAVAILABLE
         | StatusCode::GATEWAY_TIMEOUT => Verdict::Refused,
+        // A server that drains is no news.
+        StatusCode::SERVICE_UNAVAILABLE => Verdict::Settled,
         status if status.is_server_error() => Verdict::Fault,
         _ => Verdict::Settled,
     }

@@ -10,8 +10,12 @@ use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use futures::{StreamExt, TryStreamExt};
 use serde::Deserialize;
+use utoipa::IntoParams;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
 
 use super::extract::{Path, Query};
+use super::openapi::{BadRequest, Draining, NotFound};
 use crate::api::convert::events::EventView;
 use crate::api::errors::log_internal;
 use crate::api::gate::Opener;
@@ -19,9 +23,16 @@ use crate::invalid::Invalid;
 use crate::service::{App, Error, events};
 use crate::store::JobEvent;
 
-#[derive(Deserialize)]
+/// The route.
+pub(super) fn router() -> OpenApiRouter<Arc<App>> {
+    OpenApiRouter::new().routes(routes!(follow))
+}
+
+#[derive(Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
-pub(super) struct FollowQuery {
+#[into_params(parameter_in = Query)]
+struct FollowQuery {
+    /// Events behind this one; 0: from the first.
     #[serde(default)]
     after: u64,
 }
@@ -31,9 +42,27 @@ const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
 /// Proxies are asked not to collect events before they pass them on.
 const UNBUFFERED: (HeaderName, HeaderValue) = (HeaderName::from_static("x-accel-buffering"), HeaderValue::from_static("no"));
 
-/// Follows a job behind the last event that the caller has seen. The stream ends when the job has, when the server drains, or
-/// on a fault; a caller that comes back for more than there will ever be is told so by 204, which ends its trying.
-pub(super) async fn follow(
+/// Follow a job behind the last event that the caller has seen
+///
+/// The stream ends when the job has, when the server drains, or on a fault; a caller that comes back for more than there will
+/// ever be is told so by 204, which ends its trying.
+#[utoipa::path(
+    get,
+    path = "/v1/jobs/{id}/events",
+    operation_id = "followJob",
+    tag = "jobs",
+    params(
+        ("id" = Uuid, Path, description = "Id of the job."),
+        FollowQuery,
+        ("last-event-id" = Option<u64>, Header, description = "Instead of `after`: the last event that was seen.", nullable = false)
+    ),
+    responses(
+        (status = 200, description = "Events as they happen.", body = String, content_type = "text/event-stream"),
+        (status = 204, description = "The job has ended, and its last event was seen."),
+        BadRequest, NotFound, Draining
+    )
+)]
+async fn follow(
     State(app): State<Arc<App>>,
     Path(id): Path<String>,
     Query(query): Query<FollowQuery>,

@@ -8,6 +8,7 @@ use bytes::Bytes;
 use futures::StreamExt;
 use serde::de::DeserializeOwned;
 
+use super::strict::Strict;
 use crate::invalid::Invalid;
 use crate::service::Error;
 
@@ -113,7 +114,7 @@ async fn discard(mut parts: BodyDataStream) {
 /// [`Error::Invalid`] where it is not JSON, [`Error::Schema`] with the path where it does not fit `T`.
 pub fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, Error> {
     let mut deserializer = serde_json::Deserializer::from_slice(body);
-    let document = serde_path_to_error::deserialize(&mut deserializer).map_err(|e| {
+    let document = serde_path_to_error::deserialize(Strict(&mut deserializer)).map_err(|e| {
         let path = e.path().to_string();
         let e = e.into_inner();
         if e.is_data() {

@@ -2,16 +2,20 @@
 
 use std::sync::Arc;
 
-use axum::Router;
 use axum::extract::State;
 use axum::http::{HeaderMap, HeaderName, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use axum::routing::{get, post};
 use serde::{Deserialize, Serialize};
-use serde_json::{Value, json};
+use serde_json::Value;
+use utoipa::{IntoParams, ToSchema};
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+use uuid::Uuid;
 
 use super::extract::{Json, Path, Query};
-use crate::api::convert::jobs::{AttemptView, CheckpointView, JobView, MetricView, to_csv};
+use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
+use super::schemas;
+use crate::api::convert::jobs::{AttemptView, CheckpointView, JobRequest, JobView, MetricView, to_csv};
 use crate::invalid::Invalid;
 use crate::service::{App, Error, jobs};
 use crate::store::{Job, JobState, Verb};
@@ -19,23 +23,52 @@ use crate::store::{Job, JobState, Verb};
 type Shared = State<Arc<App>>;
 
 /// The routes.
-pub fn router() -> Router<Arc<App>> {
-    Router::new()
-        .route("/v1/jobs", post(submit).get(list))
-        .route("/v1/jobs/{id}", get(one).delete(delete))
-        .route("/v1/jobs/{id}/cancel", post(cancel))
-        .route("/v1/jobs/{id}/pause", post(pause))
-        .route("/v1/jobs/{id}/resume", post(resume))
-        .route("/v1/jobs/{id}/metrics", get(metrics))
-        .route("/v1/jobs/{id}/checkpoints", get(checkpoints))
-        .route("/v1/jobs/{id}/logs", get(logs))
-        .route("/v1/checkpoints/{id}", get(checkpoint))
+pub(super) fn router() -> OpenApiRouter<Arc<App>> {
+    OpenApiRouter::new()
+        .routes(routes!(submit, list))
+        .routes(routes!(one, delete))
+        .routes(routes!(cancel))
+        .routes(routes!(pause))
+        .routes(routes!(resume))
+        .routes(routes!(metrics))
+        .routes(routes!(checkpoints))
+        .routes(routes!(logs))
+        .routes(routes!(checkpoint))
 }
 
-fn show(job: &Job) -> Response {
-    axum::Json(JobView::from(job)).into_response()
+/// A job in a path.
+#[derive(IntoParams)]
+#[into_params(parameter_in = Path)]
+#[expect(dead_code, reason = "read as text; this is its documentation")]
+struct Id {
+    /// Id of the job.
+    #[param(example = "01a202d1-93be-769e-80f7-75eef9496f12")]
+    id: Uuid,
 }
 
+/// Put a job into the queue; what is answered is on the disk
+#[utoipa::path(
+    post,
+    path = "/v1/jobs",
+    operation_id = "submitJob",
+    tag = "jobs",
+    params((
+        "idempotency-key" = Option<String>, Header,
+        description = "The same key with the same job is the same job, however often it is sent: 1 to 255 printable characters.",
+        min_length = 1, max_length = 255, pattern = "^[ -~]*$", nullable = false
+    )),
+    request_body = JobRequest,
+    responses(
+        (
+            status = 201, description = "It is in the queue, or was already: the same answer.", body = JobView<'_>,
+            headers(
+                ("location", description = "Where it is."),
+                ("idempotency-replayed", description = "`true` if the key was used before.")
+            )
+        ),
+        BadBody, Conflict, Draining
+    )
+)]
 async fn submit(State(app): Shared, headers: HeaderMap, Json(document): Json<Value>) -> Result<Response, Error> {
     const KEY: HeaderName = HeaderName::from_static("idempotency-key");
     let key = match headers.get(KEY) {
@@ -49,49 +82,120 @@ async fn submit(State(app): Shared, headers: HeaderMap, Json(document): Json<Val
     let location = (header::LOCATION, format!("/v1/jobs/{}", job.id));
     let replayed = (HeaderName::from_static("idempotency-replayed"), (!new).to_string());
     // The same answer as the first time: who repeats a request did not see it.
-    Ok((StatusCode::CREATED, [location, replayed], show(&job)).into_response())
+    Ok((StatusCode::CREATED, [location, replayed], shown(&job)).into_response())
 }
 
-#[derive(Deserialize)]
+fn shown(job: &Job) -> Response {
+    axum::Json(JobView::from(job)).into_response()
+}
+
+#[derive(Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
 struct ListQuery {
-    state: Option<String>,
+    /// Only those in this state.
+    #[param(nullable = false)]
+    state: Option<JobState>,
+    /// At most this many; 0: 100.
     #[serde(default)]
+    #[param(maximum = 1000)]
     limit: u32,
+    /// `next_cursor` of the former page.
+    #[param(value_type = schemas::Number, inline, required = false)]
     cursor: Option<String>,
 }
 
+#[derive(Serialize, ToSchema)]
+#[schema(as = JobPage)]
+struct Jobs<'a> {
+    jobs: Vec<JobView<'a>>,
+    /// Null on the last page.
+    #[schema(required = true)]
+    next_cursor: Option<String>,
+}
+
+/// Jobs, newest first
+#[utoipa::path(
+    get,
+    path = "/v1/jobs",
+    operation_id = "listJobs",
+    tag = "jobs",
+    params(ListQuery),
+    responses((status = 200, description = "A page of them.", body = Jobs<'_>), BadRequest)
+)]
 async fn list(State(app): Shared, Query(query): Query<ListQuery>) -> Result<Response, Error> {
-    let state = query
-        .state
-        .map(|name| JobState::parse(&name).ok_or_else(|| Invalid::new("state", format!("{name:?}"), JobState::NAMES.join(", "))));
-    let page = jobs::list(&app, state.transpose()?, query.limit, query.cursor.as_deref()).await?;
-    let jobs: Vec<JobView<'_>> = page.items.iter().map(Into::into).collect();
-    Ok(axum::Json(json!({"jobs": jobs, "next_cursor": page.next})).into_response())
+    let page = jobs::list(&app, query.state, query.limit, query.cursor.as_deref()).await?;
+    let jobs = page.items.iter().map(Into::into).collect();
+    Ok(axum::Json(Jobs { jobs, next_cursor: page.next }).into_response())
 }
 
+/// One job
+#[utoipa::path(
+    get,
+    path = "/v1/jobs/{id}",
+    operation_id = "getJob",
+    tag = "jobs",
+    params(Id),
+    responses((status = 200, description = "As it stands.", body = JobView<'_>), BadRequest, NotFound)
+)]
 async fn one(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    Ok(show(&jobs::get(&app, &id).await?))
+    Ok(shown(&jobs::get(&app, &id).await?))
 }
 
+/// Forget a job that has ended
+#[utoipa::path(
+    delete,
+    path = "/v1/jobs/{id}",
+    operation_id = "deleteJob",
+    tag = "jobs",
+    params(Id),
+    responses((status = 204, description = "It is forgotten."), BadRequest, NotFound, Conflict)
+)]
 async fn delete(State(app): Shared, Path(id): Path<String>) -> Result<StatusCode, Error> {
     jobs::change(&app, &id, Verb::Delete).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 
+/// End a job; a running one is cancelled as soon as its worker has stopped
+#[utoipa::path(
+    post,
+    path = "/v1/jobs/{id}/cancel",
+    operation_id = "cancelJob",
+    tag = "jobs",
+    params(Id),
+    responses((status = 200, description = "As it stands now.", body = JobView<'_>), BadRequest, NotFound, Conflict)
+)]
 async fn cancel(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    Ok(show(&jobs::change(&app, &id, Verb::Cancel).await?))
+    Ok(shown(&jobs::change(&app, &id, Verb::Cancel).await?))
 }
 
+/// Take a job off the machine; a running one is snapshotted first
+#[utoipa::path(
+    post,
+    path = "/v1/jobs/{id}/pause",
+    operation_id = "pauseJob",
+    tag = "jobs",
+    params(Id),
+    responses((status = 200, description = "As it stands now.", body = JobView<'_>), BadRequest, NotFound, Conflict)
+)]
 async fn pause(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    Ok(show(&jobs::change(&app, &id, Verb::Pause).await?))
+    Ok(shown(&jobs::change(&app, &id, Verb::Pause).await?))
 }
 
+/// Put a paused job back into the queue, to go on where it was
+#[utoipa::path(
+    post,
+    path = "/v1/jobs/{id}/resume",
+    operation_id = "resumeJob",
+    tag = "jobs",
+    params(Id),
+    responses((status = 200, description = "As it stands now.", body = JobView<'_>), BadRequest, NotFound, Conflict, Draining)
+)]
 async fn resume(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    Ok(show(&jobs::change(&app, &id, Verb::Resume).await?))
+    Ok(shown(&jobs::change(&app, &id, Verb::Resume).await?))
 }
 
-#[derive(Clone, Copy, Default, Deserialize)]
+#[derive(Clone, Copy, Default, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 enum Format {
     #[default]
@@ -99,27 +203,59 @@ enum Format {
     Csv,
 }
 
-#[derive(Deserialize)]
+#[derive(Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
 struct MetricsQuery {
+    /// Only this metric.
+    #[param(nullable = false, example = "eval/mean_aoi")]
     name: Option<String>,
     #[serde(default)]
+    #[param(inline)]
     format: Format,
+    /// At most this many rows; 0: 10 000, or all of them as CSV.
     #[serde(default)]
+    #[param(maximum = 100_000)]
     limit: u32,
+    /// Where the former page says the next one begins.
+    #[param(value_type = schemas::MetricCursor, inline, required = false)]
     cursor: Option<String>,
 }
 
 /// Behind which the next page begins, for formats without a place for it.
 const NEXT_CURSOR: HeaderName = HeaderName::from_static("qedgix-next-cursor");
 
+#[derive(Serialize, ToSchema)]
+#[schema(as = MetricPage)]
+struct Metrics {
+    metrics: Vec<MetricView>,
+    /// Null on the last page.
+    #[schema(required = true)]
+    next_cursor: Option<String>,
+}
+
+/// Figures that a job has reported, by name and step
+#[utoipa::path(
+    get,
+    path = "/v1/jobs/{id}/metrics",
+    operation_id = "listJobMetrics",
+    tag = "jobs",
+    params(Id, MetricsQuery),
+    responses(
+        (
+            status = 200, description = "A page of rows; as CSV, `qedgix-next-cursor` says where the next one begins.",
+            content((Metrics = "application/json"), (String = "text/csv"))
+        ),
+        BadRequest, NotFound
+    )
+)]
 async fn metrics(State(app): Shared, Path(id): Path<String>, Query(query): Query<MetricsQuery>) -> Result<Response, Error> {
     let MetricsQuery { name, format, limit, cursor } = query;
     let mut page = jobs::metrics(&app, &id, name.as_deref(), limit, cursor.as_deref()).await?;
     match format {
         Format::Json => {
-            let rows: Vec<MetricView> = page.items.into_iter().map(Into::into).collect();
-            Ok(axum::Json(json!({"metrics": rows, "next_cursor": page.next})).into_response())
+            let metrics = page.items.into_iter().map(Into::into).collect();
+            Ok(axum::Json(Metrics { metrics, next_cursor: page.next }).into_response())
         }
         Format::Csv => {
             // A table is wanted whole, unless a limit says otherwise.
@@ -139,19 +275,63 @@ async fn metrics(State(app): Shared, Path(id): Path<String>, Query(query): Query
     }
 }
 
-fn all<T: Serialize>(name: &str, items: impl IntoIterator<Item = impl Into<T>>) -> Response {
-    let items: Vec<T> = items.into_iter().map(Into::into).collect();
-    axum::Json(json!({name: items})).into_response()
+#[derive(Serialize, ToSchema)]
+struct Checkpoints {
+    checkpoints: Vec<CheckpointView>,
 }
 
-async fn checkpoints(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    Ok(all::<CheckpointView>("checkpoints", jobs::checkpoints(&app, &id).await?))
+/// Checkpoints of a job, oldest first
+#[utoipa::path(
+    get,
+    path = "/v1/jobs/{id}/checkpoints",
+    operation_id = "listCheckpoints",
+    tag = "jobs",
+    params(Id),
+    responses((status = 200, description = "The best and the last.", body = Checkpoints), BadRequest, NotFound)
+)]
+async fn checkpoints(State(app): Shared, Path(id): Path<String>) -> Result<axum::Json<Checkpoints>, Error> {
+    let checkpoints = jobs::checkpoints(&app, &id).await?.into_iter().map(Into::into).collect();
+    Ok(axum::Json(Checkpoints { checkpoints }))
 }
 
-async fn logs(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    Ok(all::<AttemptView>("attempts", jobs::logs(&app, &id).await?))
+#[derive(Serialize, ToSchema)]
+struct Attempts {
+    attempts: Vec<AttemptView>,
 }
 
+/// Attempts at a job with the last output of their workers, oldest first
+#[utoipa::path(
+    get,
+    path = "/v1/jobs/{id}/logs",
+    operation_id = "listJobLogs",
+    tag = "jobs",
+    params(Id),
+    responses((status = 200, description = "All of them.", body = Attempts), BadRequest, NotFound)
+)]
+async fn logs(State(app): Shared, Path(id): Path<String>) -> Result<axum::Json<Attempts>, Error> {
+    let attempts = jobs::logs(&app, &id).await?.into_iter().map(Into::into).collect();
+    Ok(axum::Json(Attempts { attempts }))
+}
+
+/// A checkpoint, as safetensors
+#[utoipa::path(
+    get,
+    path = "/v1/checkpoints/{id}",
+    operation_id = "getCheckpoint",
+    tag = "jobs",
+    params(("id" = Uuid, Path, description = "Id of the checkpoint.", example = "01a202d1-93be-769e-80f7-75eef9496f12")),
+    responses(
+        (
+            status = 200, description = "Its bytes.", body = inline(schemas::Bytes), content_type = "application/octet-stream",
+            headers(
+                ("etag", description = "SHA-256 of the bytes, in quotes."),
+                ("qedgix-sha256", description = "SHA-256 of the bytes."),
+                ("content-disposition", description = "A name for the file.")
+            )
+        ),
+        BadRequest, NotFound
+    )
+)]
 async fn checkpoint(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
     let (checkpoint, bytes) = jobs::checkpoint(&app, &id).await?;
     let headers = [

@@ -1,25 +1,37 @@
 //! Graphs and scenes as JSON, in both directions: what an environment shows is what `/v1/act` reads.
 
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
+use super::schemas;
 use crate::wire::v1;
 
-#[derive(Debug, Deserialize, Serialize)]
+/// What each node detects. Edges follow from detections, in both directions: what one side alone reports is mirrored; what both
+/// report has to agree.
+#[derive(Debug, Deserialize, Serialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Graph {
+    #[schema(min_items = 1, max_items = 20000)]
     nodes: Vec<Node>,
 }
 
-#[derive(Debug, Deserialize, Serialize)]
+#[derive(Debug, Deserialize, Serialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 struct Node {
+    /// Unique in the graph, the same for the same entity in every slot.
+    #[schema(min_length = 1, max_length = 128)]
     id: String,
+    #[schema(value_type = schemas::NodeKind)]
     kind: Kind,
+    /// What is within this node's detection range. For users it may be left out: it is then derived from the UAVs'.
     #[serde(default)]
     detections: Vec<Detection>,
+    /// A UAV's own position, needed by policies that say so.
     #[serde(skip_serializing_if = "Option::is_none")]
     position: Option<Position>,
+    /// A user's own AoI, in slots; where left out, it is taken from who detects the user.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 0, maximum = 1e6)]
     aoi: Option<f64>,
 }
 
@@ -31,45 +43,62 @@ enum Kind {
     User,
 }
 
-#[derive(Debug, Deserialize, Serialize)]
+#[derive(Debug, Deserialize, Serialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 struct Detection {
     target_id: String,
+    /// Target position minus own position, in units of the square's side.
     rel_x: f64,
     rel_y: f64,
+    /// AoI in slots; required if the target is a user, absent if it is a UAV.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 0, maximum = 1e6)]
     aoi: Option<f64>,
 }
 
-#[derive(Debug, Deserialize, Serialize)]
+/// A position in units of the square's side.
+#[derive(Debug, Deserialize, Serialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 struct Position {
+    #[schema(minimum = -1e4, maximum = 1e4)]
     x: f64,
+    #[schema(minimum = -1e4, maximum = 1e4)]
     y: f64,
 }
 
-#[derive(Debug, Deserialize, Serialize)]
+/// Everything at absolute positions; the server derives who sees whom.
+#[derive(Debug, Deserialize, Serialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Scene {
+    #[schema(min_items = 1, max_items = 20000)]
     uavs: Vec<Uav>,
     #[serde(default)]
+    #[schema(max_items = 20000)]
     users: Vec<User>,
 }
 
-#[derive(Debug, Deserialize, Serialize)]
+#[derive(Debug, Deserialize, Serialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 struct Uav {
+    #[schema(min_length = 1, max_length = 128)]
     id: String,
+    #[schema(minimum = -1e4, maximum = 1e4)]
     x: f64,
+    #[schema(minimum = -1e4, maximum = 1e4)]
     y: f64,
 }
 
-#[derive(Debug, Deserialize, Serialize)]
+#[derive(Debug, Deserialize, Serialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 struct User {
+    #[schema(min_length = 1, max_length = 128)]
     id: String,
+    #[schema(minimum = -1e4, maximum = 1e4)]
     x: f64,
+    #[schema(minimum = -1e4, maximum = 1e4)]
     y: f64,
+    /// AoI in slots.
+    #[schema(minimum = 0, maximum = 1e6)]
     aoi: f64,
 }
 

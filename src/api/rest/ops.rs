@@ -1,64 +1,91 @@
-//! What operators ask: probes, metrics, and where things are.
+//! What operators ask: probes, metrics, where things are, and the description of it all.
 
 use std::sync::Arc;
 
-use axum::Json;
 use axum::extract::State;
 use axum::http::header;
-use axum::response::IntoResponse;
-use serde_json::{Value, json};
+use axum::response::{Html, IntoResponse, Response};
+use axum::{Extension, Json};
+use serde::Serialize;
+use utoipa::ToSchema;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
 
+use super::extract::Path;
+use super::openapi::{BadRequest, Description, Draining, Fault, NotFound};
+use super::schemas;
 use crate::service::{App, Error, operations};
 
-/// Where things are.
-pub(super) async fn index() -> Json<Value> {
-    Json(json!({
-        "name": "qedgix",
-        "version": env!("CARGO_PKG_VERSION"),
-        "endpoints": [
-            "POST /v1/act",
-            "GET|POST /v1/sessions",
-            "GET|DELETE /v1/sessions/{id}",
-            "GET /v1/policies",
-            "GET /v1/policies/{policy}",
-            "GET|POST /v1/environments",
-            "GET|DELETE /v1/environments/{id}",
-            "POST /v1/environments/{id}/reset",
-            "POST /v1/environments/{id}/step",
-            "GET|POST /v1/jobs",
-            "GET|DELETE /v1/jobs/{id}",
-            "GET /v1/jobs/{id}/events",
-            "GET /v2",
-            "GET /v2/health/live",
-            "GET /v2/health/ready",
-            "GET /v2/models/{model}",
-            "GET /v2/models/{model}/ready",
-            "GET /v2/models/{model}/config",
-            "POST /v2/models/{model}/infer",
-            "POST /v2/repository/index",
-            "POST /v2/repository/models/{model}/load",
-            "POST /v2/repository/models/{model}/unload",
-            "GET /livez",
-            "GET /readyz",
-            "GET /metrics",
-        ],
-    }))
+/// The routes.
+pub(super) fn router() -> OpenApiRouter<Arc<App>> {
+    OpenApiRouter::new()
+        .routes(routes!(index))
+        .routes(routes!(live))
+        .routes(routes!(ready))
+        .routes(routes!(metrics))
+        .routes(routes!(openapi))
+        .routes(routes!(docs))
+        .routes(routes!(docs_file))
 }
 
-/// The process answers.
-pub(super) async fn live() -> &'static str {
+#[derive(Serialize, ToSchema)]
+#[schema(as = Server)]
+struct Index {
+    name: &'static str,
+    version: &'static str,
+    /// Methods and paths.
+    #[schema(value_type = Vec<String>)]
+    endpoints: Arc<[String]>,
+}
+
+/// What this is and where things are
+#[utoipa::path(
+    get,
+    path = "/",
+    operation_id = "index",
+    tag = "operations",
+    responses((status = 200, description = "This.", body = Index))
+)]
+async fn index(Extension(description): Extension<Description>) -> Json<Index> {
+    Json(Index { name: "qedgix", version: env!("CARGO_PKG_VERSION"), endpoints: description.operations })
+}
+
+/// Whether the process answers
+#[utoipa::path(
+    get,
+    path = "/livez",
+    operation_id = "live",
+    tag = "operations",
+    responses((status = 200, description = "It does.", body = String, content_type = "text/plain"))
+)]
+async fn live() -> &'static str {
     "ok\n"
 }
 
-/// The server can do its work.
-pub(super) async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Error> {
+/// Whether the server can do its work
+#[utoipa::path(
+    get,
+    path = "/readyz",
+    operation_id = "ready",
+    tag = "operations",
+    responses((status = 200, description = "It can.", body = String, content_type = "text/plain"), Fault, Draining)
+)]
+async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Error> {
     app.ready().await?;
     Ok("ok\n")
 }
 
-/// Prometheus text. What is there is counted when it is asked for.
-pub(super) async fn metrics(render: fn() -> String, app: &App) -> impl IntoResponse + use<> {
-    let figures = operations::figures(app).await;
+/// Metrics for Prometheus
+#[utoipa::path(
+    get,
+    path = "/metrics",
+    operation_id = "metrics",
+    tag = "operations",
+    responses((status = 200, description = "Text, version 0.0.4.", body = String, content_type = "text/plain"))
+)]
+async fn metrics(State(app): State<Arc<App>>, Extension(render): Extension<fn() -> String>) -> impl IntoResponse {
+    // What is there is counted when it is asked for.
+    let figures = operations::figures(&app).await;
     for (name, value) in [
         ("qedgix_sessions", figures.sessions),
         ("qedgix_environments", figures.environments),
@@ -74,4 +101,64 @@ pub(super) async fn metrics(render: fn() -> String, app: &App) -> impl IntoRespo
         metrics::gauge!("qedgix_jobs", "state" => state.as_str()).set(jobs as f64);
     }
     ([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], render())
+}
+
+/// This document
+#[utoipa::path(
+    get,
+    path = "/openapi.json",
+    operation_id = "openapi",
+    tag = "operations",
+    responses((status = 200, description = "OpenAPI 3.1.", body = Object))
+)]
+async fn openapi(Extension(description): Extension<Description>) -> impl IntoResponse {
+    ([(header::CONTENT_TYPE, "application/json")], description.document)
+}
+
+/// The page that shows the document. Its parts are files of the viewer, which is built into the program.
+const PAGE: &str = r#"<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Qedgix</title>
+<link rel="icon" href="docs/favicon-32x32.png">
+<link rel="stylesheet" href="docs/swagger-ui.css">
+<div id="swagger-ui"></div>
+<script src="docs/swagger-ui-bundle.js"></script>
+<script src="docs/swagger-ui-standalone-preset.js"></script>
+<script src="docs/swagger-initializer.js"></script>
+</html>
+"#;
+
+/// This document, to be browsed
+#[utoipa::path(
+    get,
+    path = "/docs",
+    operation_id = "docs",
+    tag = "operations",
+    responses((status = 200, description = "A page.", body = String, content_type = "text/html"))
+)]
+async fn docs() -> Html<&'static str> {
+    Html(PAGE)
+}
+
+/// A file of the page
+#[utoipa::path(
+    get,
+    path = "/docs/{file}",
+    operation_id = "docsFile",
+    tag = "operations",
+    params(("file" = String, Path, description = "Name of the file.", example = "swagger-ui.css")),
+    responses(
+        (status = 200, description = "Its content, of the type that its name says.", content(
+            (String = "text/css"), (String = "text/javascript"), (String = "text/html"), (inline(schemas::Bytes) = "image/png")
+        )),
+        BadRequest, NotFound, Fault
+    )
+)]
+async fn docs_file(Path(file): Path<String>) -> Result<Response, Error> {
+    let config = utoipa_swagger_ui::Config::new(["openapi.json"]).validator_url("none");
+    let found = utoipa_swagger_ui::serve(&file, Arc::new(config)).map_err(|e| Error::internal(e.to_string()))?;
+    let found = found.ok_or_else(|| Error::not_found("file", file))?;
+    Ok(([(header::CONTENT_TYPE, found.content_type)], found.bytes.into_owned()).into_response())
 }

@@ -5,13 +5,17 @@ use std::sync::Arc;
 use axum::extract::{Request, State};
 use axum::http::{StatusCode, header};
 use axum::response::IntoResponse;
-use axum::routing::{get, post, put};
-use axum::{Extension, Json, Router};
+use axum::{Extension, Json};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use tokio::sync::Semaphore;
+use utoipa::{IntoParams, ToSchema};
+use utoipa_axum::router::{OpenApiRouter, UtoipaMethodRouterExt};
+use utoipa_axum::routes;
 
 use super::extract::{self, MaxBody, Path, Query};
+use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
+use super::schemas;
 use super::wording::Policy;
 use crate::service::keys::Caller;
 use crate::service::{App, Error, policies};
@@ -27,40 +31,107 @@ const LARGEST: usize = 64 << 20;
 const AT_ONCE: usize = 4;
 
 /// The routes.
-pub fn router() -> Router<Arc<App>> {
+pub(super) fn router() -> OpenApiRouter<Arc<App>> {
     let room = Extension(Arc::new(Semaphore::new(AT_ONCE)));
-    Router::new()
-        .route("/v1/policies", get(list))
-        .route("/v1/policies/{policy}", get(one))
-        .route("/v1/policies/{policy}/versions", post(upload).layer(room))
-        .route("/v1/policies/{policy}/export", get(export))
-        .route("/v1/policies/{policy}/load", post(load))
-        .route("/v1/policies/{policy}/unload", post(unload))
-        .route("/v1/policies/{policy}/aliases", get(aliases))
-        .route("/v1/policies/{policy}/aliases/{alias}", put(set_alias).delete(delete_alias))
-        .route("/v1/policies/{policy}/history", get(history))
+    OpenApiRouter::new()
+        .routes(routes!(list))
+        .routes(routes!(one))
+        .routes(routes!(upload).layer(room))
+        .routes(routes!(export))
+        .routes(routes!(load))
+        .routes(routes!(unload))
+        .routes(routes!(aliases))
+        .routes(routes!(set_alias, delete_alias))
+        .routes(routes!(history))
 }
 
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
 pub(super) struct Paging {
+    /// At most this many; 0: 100.
     #[serde(default)]
+    #[param(maximum = 1000)]
     pub page_size: u32,
+    /// `next_page_token` of the former page.
     #[serde(default)]
     pub page_token: String,
 }
 
-#[derive(Debug, Serialize)]
+/// A policy in a path.
+#[derive(IntoParams)]
+#[into_params(parameter_in = Path)]
+#[expect(dead_code, reason = "read as text; this is its documentation")]
+struct Spec {
+    /// NAME (its newest version), NAME@ALIAS or NAME:VERSION.
+    #[param(value_type = schemas::PolicySpec, inline, example = "qedgix")]
+    policy: String,
+}
+
+/// Versions in a path.
+#[derive(IntoParams)]
+#[into_params(parameter_in = Path)]
+#[expect(dead_code, reason = "read as text; this is its documentation")]
+struct Versions {
+    /// NAME for all its versions, or NAME:VERSION.
+    #[param(value_type = schemas::Versions, inline, example = "qedgix")]
+    policy: String,
+}
+
+/// A policy's name in a path.
+#[derive(IntoParams)]
+#[into_params(parameter_in = Path)]
+#[expect(dead_code, reason = "read as text; this is its documentation")]
+struct Name {
+    /// NAME of the policy.
+    #[param(value_type = schemas::Name, inline, example = "qedgix")]
+    policy: String,
+}
+
+/// An alias in a path.
+#[derive(IntoParams)]
+#[into_params(parameter_in = Path)]
+#[expect(dead_code, reason = "read as text; this is its documentation")]
+struct AliasOf {
+    /// NAME of the policy.
+    #[param(value_type = schemas::Name, inline, example = "qedgix")]
+    policy: String,
+    /// The alias.
+    #[param(value_type = schemas::Name, inline, example = "live")]
+    alias: String,
+}
+
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = PolicyPage)]
 struct Page {
     policies: Vec<Policy>,
+    /// Empty on the last page.
     next_page_token: String,
 }
 
+/// Policies in order of names, each in its newest version
+#[utoipa::path(
+    get,
+    path = "/v1/policies",
+    operation_id = "listPolicies",
+    tag = "policies",
+    params(Paging),
+    responses((status = 200, description = "A page of them.", body = Page), BadRequest)
+)]
 async fn list(State(app): Shared, Query(paging): Query<Paging>) -> Result<Json<Page>, Error> {
     let (page, next) = policies::list(&app, paging.page_size, &paging.page_token)?;
     Ok(Json(Page { policies: page.into_iter().map(shown).collect(), next_page_token: next.unwrap_or_default() }))
 }
 
+/// One policy version
+#[utoipa::path(
+    get,
+    path = "/v1/policies/{policy}",
+    operation_id = "getPolicy",
+    tag = "policies",
+    params(Spec),
+    responses((status = 200, description = "What is known of it.", body = Policy), BadRequest, NotFound)
+)]
 async fn one(State(app): Shared, Path(policy): Path<String>) -> Result<Json<Policy>, Error> {
     let spec: PolicySpec = policy.parse()?;
     Ok(Json(shown(policies::get(&app, &spec)?)))
@@ -70,16 +141,21 @@ fn shown(described: Described) -> Policy {
     v1::Policy::from(described).into()
 }
 
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
 struct UploadQuery {
+    /// An alias that shall mean the version.
+    #[param(value_type = schemas::Name, inline, required = false)]
     alias: Option<String>,
 }
 
 /// A checkpoint of a training job.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
+#[schema(as = CheckpointOfJob)]
 struct OfJob {
+    /// Its id, as `GET /v1/jobs/{id}/checkpoints` tells it.
     checkpoint_id: String,
 }
 
@@ -88,6 +164,25 @@ fn by(caller: Option<Extension<Caller>>) -> Option<String> {
     caller.map(|Extension(caller)| caller.id().to_owned())
 }
 
+/// Publish a checkpoint as the next version of a policy
+///
+/// Equal bytes under the same name are the version that they already are.
+#[utoipa::path(
+    post,
+    path = "/v1/policies/{policy}/versions",
+    operation_id = "uploadPolicy",
+    tag = "policies",
+    params(Name, UploadQuery),
+    request_body(
+        description = "A checkpoint as safetensors, or one of a training job.",
+        content((inline(schemas::Bytes) = "application/octet-stream"), (OfJob = "application/json"))
+    ),
+    responses(
+        (status = 201, description = "A new version.", body = Policy, headers(("location", description = "Where it is."))),
+        (status = 200, description = "A version that was there.", body = Policy, headers(("location", description = "Where it is."))),
+        BadBody, NotFound, Conflict, Draining
+    )
+)]
 async fn upload(
     State(app): Shared,
     Path(name): Path<String>,
@@ -116,6 +211,21 @@ async fn upload(
     Ok((if new { StatusCode::CREATED } else { StatusCode::OK }, location, Json(shown(described))))
 }
 
+/// The checkpoint of a policy version, as safetensors
+#[utoipa::path(
+    get,
+    path = "/v1/policies/{policy}/export",
+    operation_id = "exportPolicy",
+    tag = "policies",
+    params(Spec),
+    responses(
+        (
+            status = 200, description = "The bytes that were published.", body = inline(schemas::Bytes), content_type = "application/octet-stream",
+            headers(("etag", description = "SHA-256 of the bytes."), ("content-disposition", description = "A name for the file."))
+        ),
+        BadRequest, NotFound, Conflict
+    )
+)]
 async fn export(State(app): Shared, Path(policy): Path<String>) -> Result<impl IntoResponse, Error> {
     let (reference, bytes) = policies::export(&app, &policy.parse()?).await?;
     let file = format!("{}-{}.safetensors", reference.name, reference.version);
@@ -127,47 +237,99 @@ async fn export(State(app): Shared, Path(policy): Path<String>) -> Result<impl I
     Ok((headers, bytes))
 }
 
+/// Load all versions of a policy, or one
+#[utoipa::path(
+    post,
+    path = "/v1/policies/{policy}/load",
+    operation_id = "loadPolicy",
+    tag = "policies",
+    params(Versions),
+    responses((status = 200, description = "Loaded.", body = Policy), BadRequest, NotFound)
+)]
 async fn load(State(app): Shared, Path(policy): Path<String>) -> Result<Json<Policy>, Error> {
     policies::load_policy(&app, &policy).await?;
     one(State(app), Path(policy)).await
 }
 
+/// Unload all versions of a policy, or one; sessions that fly them go on
+///
+/// Whatever else means them is refused with `policy_unloaded` until they are loaded, restarts included.
+#[utoipa::path(
+    post,
+    path = "/v1/policies/{policy}/unload",
+    operation_id = "unloadPolicy",
+    tag = "policies",
+    params(Versions),
+    responses((status = 200, description = "Unloaded.", body = Policy), BadRequest, NotFound)
+)]
 async fn unload(State(app): Shared, Path(policy): Path<String>) -> Result<Json<Policy>, Error> {
     policies::unload_policy(&app, &policy).await?;
     one(State(app), Path(policy)).await
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
 struct Alias {
     alias: String,
+    #[schema(minimum = 1)]
     version: u64,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
 struct Aliases {
     aliases: Vec<Alias>,
 }
 
+/// Aliases of a policy
+#[utoipa::path(
+    get,
+    path = "/v1/policies/{policy}/aliases",
+    operation_id = "listAliases",
+    tag = "policies",
+    params(Name),
+    responses((status = 200, description = "All of them.", body = Aliases), BadRequest, NotFound)
+)]
 async fn aliases(State(app): Shared, Path(policy): Path<String>) -> Result<Json<Aliases>, Error> {
     let all = policies::aliases(&app, &policy)?.into_iter();
     Ok(Json(Aliases { aliases: all.map(|(alias, version)| Alias { alias, version }).collect() }))
 }
 
 /// Which version an alias shall mean, and what it must mean now for that.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
+#[schema(example = json!({"version": 1}))]
 struct SetAlias {
+    /// The version that it shall mean.
     version: u64,
+    /// What it must mean now for anything to happen: a version, or 0 for nothing.
     expected: Option<u64>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = MovedAlias)]
 struct Moved {
     alias: String,
+    /// The version that it means.
+    #[schema(minimum = 1)]
     version: u64,
+    /// What it meant before.
+    #[schema(required = true, minimum = 1)]
     previous: Option<u64>,
 }
 
+/// Let an alias mean a version, for all requests at once
+#[utoipa::path(
+    put,
+    path = "/v1/policies/{policy}/aliases/{alias}",
+    operation_id = "setAlias",
+    tag = "policies",
+    params(AliasOf),
+    request_body = SetAlias,
+    responses(
+        (status = 201, description = "It is new.", body = Moved),
+        (status = 200, description = "It has moved.", body = Moved),
+        BadBody, NotFound, Conflict
+    )
+)]
 async fn set_alias(
     State(app): Shared,
     Path((name, alias)): Path<(String, String)>,
@@ -180,12 +342,24 @@ async fn set_alias(
     Ok((status, Json(Moved { alias, version, previous })))
 }
 
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
 struct Expected {
+    /// The version that it must mean now for anything to happen.
+    #[param(nullable = false)]
     expected: Option<u64>,
 }
 
+/// Delete an alias
+#[utoipa::path(
+    delete,
+    path = "/v1/policies/{policy}/aliases/{alias}",
+    operation_id = "deleteAlias",
+    tag = "policies",
+    params(AliasOf, Expected),
+    responses((status = 204, description = "It means nothing any more."), BadRequest, NotFound, Conflict)
+)]
 async fn delete_alias(
     State(app): Shared,
     Path((name, alias)): Path<(String, String)>,
@@ -196,23 +370,37 @@ async fn delete_alias(
     Ok(StatusCode::NO_CONTENT)
 }
 
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
 struct HistoryQuery {
+    /// Only this alias.
+    #[param(value_type = schemas::Name, inline, required = false)]
     alias: Option<String>,
+    /// At most this many; 0: 100.
     #[serde(default)]
+    #[param(maximum = 1000)]
     page_size: u32,
+    /// `next_page_token` of the former page.
     #[serde(default)]
+    #[param(value_type = schemas::NumberToken, inline, required = false)]
     page_token: String,
 }
 
 /// A move of an alias.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = AliasMove)]
 struct Move {
     alias: String,
+    /// What it means since then; null: nothing, it was deleted.
+    #[schema(required = true, minimum = 1)]
     version: Option<u64>,
+    /// What it meant before; null: nothing, it was new.
+    #[schema(required = true, minimum = 1)]
     previous: Option<u64>,
     at: Timestamp,
+    /// Who moved it, where that is known.
+    #[schema(required = true)]
     by: Option<String>,
 }
 
@@ -223,12 +411,23 @@ impl From<Promotion> for Move {
     }
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = AliasHistory)]
 struct History {
     history: Vec<Move>,
+    /// Empty on the last page.
     next_page_token: String,
 }
 
+/// Where the aliases of a policy have been, newest first
+#[utoipa::path(
+    get,
+    path = "/v1/policies/{policy}/history",
+    operation_id = "listAliasMoves",
+    tag = "policies",
+    params(Name, HistoryQuery),
+    responses((status = 200, description = "A page of moves.", body = History), BadRequest, NotFound)
+)]
 async fn history(
     State(app): Shared,
     Path(policy): Path<String>,

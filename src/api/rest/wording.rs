@@ -7,11 +7,14 @@ use bytes::Bytes;
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::Value;
+use utoipa::ToSchema;
 
+use super::schemas;
 use crate::wire::v1;
 
 /// Bytes, written in base64.
-#[derive(Debug)]
+#[derive(Debug, ToSchema)]
+#[schema(value_type = schemas::Base64Text)]
 pub(super) struct Base64(pub(super) Bytes);
 
 impl<'de> Deserialize<'de> for Base64 {
@@ -28,71 +31,136 @@ impl Serialize for Base64 {
     }
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
 pub(super) struct ActReply {
+    /// One per UAV, in the order of the request.
     actions: Vec<Action>,
+    #[schema(value_type = PolicyRef)]
     policy: Option<PolicyRef>,
+    /// The step that was answered.
     step: u64,
+    /// Memory for the next slot, for callers that keep it.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
     recurrent_state: Option<Base64>,
+    #[schema(value_type = Timings)]
     timings: Option<Timings>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
 struct Action {
     uav_id: String,
+    /// Heading h of 45 h degrees; 8 hovers, where the policy may.
+    #[schema(maximum = 8)]
     heading_index: u32,
+    /// Degrees counter-clockwise from +x; absent when hovering.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
     heading_deg: Option<f64>,
+    /// Value of each heading, on request, for policies that have values.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     q_values: Vec<f32>,
 }
 
-#[derive(Debug, Serialize)]
+/// Exactly one version of one policy.
+#[derive(Debug, Serialize, ToSchema)]
 struct PolicyRef {
     name: String,
+    #[schema(minimum = 1)]
     version: u64,
+    /// SHA-256 of the checkpoint.
+    #[schema(value_type = schemas::Sha256)]
     digest: String,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
 struct Timings {
+    /// Waiting for the engine.
+    #[schema(value_type = schemas::Seconds)]
     queue: Option<String>,
+    /// Computing.
+    #[schema(value_type = schemas::Seconds)]
     compute: Option<String>,
+    /// Fleets computed together.
     batch_size: u32,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Session {
     #[serde(rename = "session_id")]
     id: String,
+    #[schema(value_type = PolicyRef)]
     policy: Option<PolicyRef>,
+    /// Slots answered in the current run.
     steps: u64,
+    #[schema(value_type = String, format = DateTime)]
     opened_at: Option<String>,
+    /// Idle time after which it ends by itself.
+    #[schema(value_type = schemas::Seconds)]
     ttl: Option<String>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Policy {
+    #[schema(value_type = PolicyRef)]
     r#ref: Option<PolicyRef>,
+    #[schema(value_type = PolicyKind)]
     kind: &'static str,
     description: String,
+    /// Fleet sizes it serves; absent: any.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
     uavs: Option<u32>,
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
     users: Option<u32>,
+    /// 8, or 9 with hovering.
+    #[schema(minimum = 8, maximum = 9)]
     headings: u32,
+    #[schema(value_type = Needs)]
     needs: &'static str,
+    /// In units of the square's side.
     detection_range: f64,
+    /// Aliases that mean this version.
     aliases: Vec<String>,
+    /// All versions of this name.
     versions: Vec<u64>,
+    /// Whether this version can be asked.
     loaded: bool,
+    /// Those of `versions` that can be asked.
     loaded_versions: Vec<u64>,
+    /// Resolved training configuration of a checkpoint.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Object)]
     config: Option<Value>,
+    /// Figures a checkpoint was taken at.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Object)]
     metrics: Option<Value>,
+    #[schema(value_type = String, format = DateTime)]
     created_at: Option<String>,
+}
+
+/// Where a policy comes from, as the protocol writes it.
+#[derive(ToSchema)]
+#[expect(dead_code, clippy::enum_variant_names, reason = "written by the protocol's types; this is their documentation")]
+enum PolicyKind {
+    #[schema(rename = "POLICY_KIND_CHECKPOINT")]
+    Checkpoint,
+    #[schema(rename = "POLICY_KIND_BASELINE")]
+    Baseline,
+}
+
+/// What a policy must be told: detections; UAVs' own positions, too; a scene.
+#[derive(ToSchema)]
+#[expect(dead_code, reason = "written by the protocol's types; this is their documentation")]
+enum Needs {
+    #[schema(rename = "NEEDS_DETECTIONS")]
+    Detections,
+    #[schema(rename = "NEEDS_OWN_POSITIONS")]
+    OwnPositions,
+    #[schema(rename = "NEEDS_FULL_SCENE")]
+    FullScene,
 }
 
 impl From<v1::ActResponse> for ActReply {

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::{Shelf, in_turn};
 use crate::invalid::Invalid;
-use crate::service::jobs::Page;
+use crate::service::jobs::{Page, number};
 use crate::service::sessions::page_size;
 use crate::service::{App, Error};
 use crate::serving::{Kind, PolicyRef, PolicySpec, Registry, Which, check_name};
@@ -48,7 +48,8 @@ pub async fn set_alias(app: &App, target: Target, version: u64) -> Result<Option
         let spec = PolicySpec { name: name.clone(), which: Which::Version(version) };
         let found = registry.describe(&spec)?;
         if found.about.kind == Kind::Baseline {
-            return Err(Invalid::new("policy", name, "a policy with versions: a baseline has one, and needs no alias").into());
+            let message = format!("{name} is a baseline: it has one version and needs no alias");
+            return Err(Error::Precondition { code: "no_checkpoint", message });
         }
         check_expected(&registry, &target)?;
         check_alias(&registry, name, alias)?;
@@ -92,10 +93,13 @@ pub async fn delete_alias(app: &App, target: Target) -> Result<(), Error> {
 /// There is no such policy, a page size out of range, a token that no page gave.
 pub async fn history(app: &App, name: &str, alias: Option<&str>, size: u32, token: &str) -> Result<Page<Promotion>, Error> {
     check_name("policy", name)?;
+    if let Some(alias) = alias {
+        check_name("alias", alias)?;
+    }
     app.registry.aliases(name)?;
     let limit = page_size(size)?;
     let wrong = || Invalid::new("page_token", format!("{token:?}"), "the next_page_token of the former page");
-    let before = if token.is_empty() { None } else { Some(token.parse().map_err(|_| wrong())?) };
+    let before = if token.is_empty() { None } else { Some(number(token).ok_or_else(wrong)?) };
     let mut items = app.store.promotions(PromotionFilter { name, alias, before }, limit as u32 + 1).await?;
     let more = items.len() > limit;
     items.truncate(limit);

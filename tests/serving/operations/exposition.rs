@@ -50,12 +50,12 @@ fn parse(text: &str) -> BTreeMap<String, Family> {
             let (name, help) = help.split_once(' ').unwrap();
             let family = families.entry(name.to_owned()).or_default();
             assert!(family.help.is_empty() && family.kind.is_empty(), "{line}");
-            family.help = help.to_owned();
+            help.clone_into(&mut family.help);
         } else if let Some(kind) = line.strip_prefix("# TYPE ") {
             let (name, kind) = kind.split_once(' ').unwrap();
             let family = families.entry(name.to_owned()).or_default();
             assert!(family.kind.is_empty() && family.samples.is_empty(), "{line}");
-            family.kind = kind.to_owned();
+            kind.clone_into(&mut family.kind);
         } else {
             let sample = sample(line);
             let base = ["_bucket", "_sum", "_count"].iter().find_map(|suffix| {

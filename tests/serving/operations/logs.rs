@@ -1,5 +1,6 @@
 //! Logs: every line is what was asked for, and a request is found by its id.
 
+use qedgix::wire::v1::ListJobsRequest;
 use reqwest::{Client, StatusCode};
 use serde_json::{Value, json};
 use sqlx::Connection;
@@ -81,7 +82,7 @@ async fn without_it_slots_leave_no_trace_and_faults_and_refusals_do() {
     let problem = broken.text().await.unwrap();
     assert!(problem.contains("internal error") && !problem.contains("no such table"), "{problem}");
     let mut jobs = qedgix::wire::v1::job_service_client::JobServiceClient::new(binary.channel().await);
-    let status = jobs.list_jobs(named(Default::default(), "broken-grpc")).await.unwrap_err();
+    let status = jobs.list_jobs(named(ListJobsRequest::default(), "broken-grpc")).await.unwrap_err();
     assert_eq!((status.code(), status.message()), (tonic::Code::Internal, "internal error"));
     sqlx::query("ALTER TABLE elsewhere RENAME TO jobs").execute(&mut database).await.unwrap();
 

@@ -8,6 +8,7 @@ use tonic::Code;
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
+use tonic_reflection::pb::v1::server_reflection_client::ServerReflectionClient;
 
 use super::super::binary::Binary;
 use super::super::harness::*;
@@ -59,6 +60,10 @@ async fn streams_end_and_what_is_in_flight_is_answered() {
     assert_eq!(states.message().await.unwrap().unwrap().status(), ServingStatus::Serving);
     let (asking, requests) = mpsc::unbounded_channel();
     let mut answers = binary.policies().await.act_stream(UnboundedReceiverStream::new(requests)).await.unwrap().into_inner();
+    // The crate's own service knows nothing of draining.
+    let mut reflection = ServerReflectionClient::new(binary.channel().await);
+    let (_wondering, wonders) = mpsc::unbounded_channel();
+    let mut described = reflection.server_reflection_info(UnboundedReceiverStream::new(wonders)).await.unwrap().into_inner();
     // Nothing was ever asked over this one.
     let idle = tokio::net::TcpStream::connect(binary.http.trim_start_matches("http://")).await.unwrap();
     let act = in_flight(&binary).await;
@@ -67,6 +72,7 @@ async fn streams_end_and_what_is_in_flight_is_answered() {
     assert_eq!(soon(states.message()).await.unwrap().unwrap().status(), ServingStatus::NotServing);
     assert!(soon(states.message()).await.unwrap().is_none());
     assert!(soon(answers.message()).await.unwrap().is_none(), "the stream ends, though its caller would go on");
+    assert!(soon(described.message()).await.unwrap().is_none());
     let told = soon(async {
         loop {
             if let Err(status) = watch.message().await {

@@ -1,0 +1,226 @@
+//! The OpenAPI document: what handlers do not say about themselves. Paths, parameters and bodies are derived from the handlers
+//! and their types; this file owns what is common to all, and the answers that are problems.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use bytes::Bytes;
+use serde_json::{Map, Value, json};
+use utoipa::openapi::header::HeaderBuilder;
+use utoipa::openapi::security::{ApiKey, ApiKeyValue, HttpAuthScheme, HttpBuilder, SecurityRequirement, SecurityScheme};
+use utoipa::openapi::{Content, OpenApi, Ref, RefOr, Response, ResponseBuilder};
+use utoipa::{IntoResponses, OpenApi as _};
+
+use crate::api::errors::Problem;
+use crate::policy::baselines;
+
+/// The document without paths, to which routers add theirs.
+#[derive(utoipa::OpenApi)]
+#[openapi(
+    info(
+        title = "Qedgix",
+        description = "Serves and trains policies that fly fleets of UAVs for fresh data (Age of Information).\n\n\
+            Every error is a problem of RFC 9457 with a stable `code`. Every answer has an `x-request-id`, the caller's own if \
+            the request had one. Unknown fields are errors, in bodies and in queries of `/v1`. The same use cases are served \
+            over gRPC by `qedgix.v1`."
+    ),
+    tags(
+        (name = "act", description = "One slot of one fleet: what is seen in, a heading per UAV out."),
+        (name = "sessions", description = "Fleets whose memory the server keeps."),
+        (name = "policies", description = "Who decides: versions, aliases, checkpoints."),
+        (name = "environments", description = "Hosted environments for learners elsewhere."),
+        (name = "jobs", description = "Training, run later by worker processes."),
+        (name = "operations", description = "Probes, metrics, this document."),
+    ),
+    components(schemas(Problem)),
+)]
+struct Common;
+
+/// The document without paths.
+pub(super) fn document() -> OpenApi {
+    let mut document = Common::openapi();
+    let components = document.components.get_or_insert_default();
+    let bearer = HttpBuilder::new().scheme(HttpAuthScheme::Bearer).description(Some("An API key."));
+    components.responses.extend(problems().map(|(name, response)| (name.to_owned(), response.into())));
+    components.add_security_scheme("bearer", SecurityScheme::Http(bearer.build()));
+    let key = ApiKeyValue::with_description("x-api-key", "The same API key, in a header of its own.");
+    components.add_security_scheme("api_key", SecurityScheme::ApiKey(ApiKey::Header(key)));
+    // A server without keys asks nobody who they are.
+    let none = SecurityRequirement::default();
+    let [bearer, key] = ["bearer", "api_key"].map(|scheme| SecurityRequirement::new::<_, [&str; 0], &str>(scheme, []));
+    document.security = Some(vec![none, bearer, key]);
+    document
+}
+
+/// The document as it is served, and a list of what it describes.
+#[derive(Clone)]
+pub(super) struct Description {
+    /// JSON.
+    pub document: Bytes,
+    /// `GET /v1/jobs`, ...
+    pub operations: Arc<[String]>,
+}
+
+impl Description {
+    /// Of the document of all routes, on a server that gives jobs this many cores.
+    pub(super) fn new(document: &OpenApi, cpu_budget: usize) -> Self {
+        let document = finished(document, cpu_budget);
+        let paths = document["paths"].as_object().into_iter().flatten();
+        let operations = paths.flat_map(|(path, item)| {
+            let verbs = item.as_object().into_iter().flat_map(Map::keys);
+            verbs.map(move |verb| format!("{} {path}", verb.to_uppercase()))
+        });
+        Self { operations: operations.collect(), document: document.to_string().into() }
+    }
+}
+
+/// The document with what holds for every operation, and the limits of this server.
+fn finished(document: &OpenApi, cpu_budget: usize) -> Value {
+    let mut document = serde_json::to_value(document).expect("the document is plain data");
+    let everywhere = [Unauthorized::responses(), Forbidden::responses(), TooMany::responses(), Fault::responses()];
+    let everywhere: BTreeMap<_, _> = everywhere.into_iter().flatten().collect();
+    let paths = document["paths"].as_object_mut().into_iter().flatten().filter(|(path, _)| path.starts_with("/v1"));
+    for operation in paths.filter_map(|(_, item)| item.as_object_mut()).flat_map(Map::values_mut) {
+        let Some(responses) = operation["responses"].as_object_mut() else { continue };
+        for (status, response) in &everywhere {
+            responses.entry(status).or_insert_with(|| json!(response));
+        }
+    }
+    let schemas = &mut document["components"]["schemas"];
+    schemas["JobRequest"]["properties"]["threads"]["maximum"] = cpu_budget.into();
+    let taken = json!({"enum": baselines::LIST.iter().map(|baseline| baseline.name).collect::<Vec<_>>()});
+    schemas["JobRequest"]["properties"]["name"]["not"] = taken.clone();
+    let one_of =
+        |one: &str, other: &str| json!({"required": [one], "properties": {one: {"type": "object"}, other: {"type": "null"}}});
+    schemas["ActRequest"]["oneOf"] = json!([one_of("graph", "scene"), one_of("scene", "graph")]);
+    schemas["ActRequest"]["anyOf"] =
+        json!(["session_id", "recurrent_state"].map(|none| json!({"properties": {none: {"type": "null"}}})));
+    document["paths"]["/v1/policies/{policy}/versions"]["post"]["parameters"][0]["schema"]["not"] = taken;
+    for link in &LINKS {
+        link.add(&mut document);
+    }
+    integers(&mut document);
+    document
+}
+
+/// What an operation's answer is good for: other operations, by their ids.
+struct Link {
+    of: (&'static str, &'static str, &'static str),
+    /// What it is called in their paths, and where it is in the answer.
+    parameter: (&'static str, &'static str),
+    operations: &'static [&'static str],
+}
+
+const LINKS: [Link; 5] = [
+    Link {
+        of: ("/v1/sessions", "post", "201"),
+        parameter: ("id", "$response.body#/session_id"),
+        operations: &["getSession", "closeSession"],
+    },
+    Link {
+        of: ("/v1/environments", "post", "201"),
+        parameter: ("id", "$response.body#/environment_id"),
+        operations: &["getEnvironment", "resetEnvironment", "stepEnvironment", "deleteEnvironment"],
+    },
+    Link {
+        of: ("/v1/jobs", "post", "201"),
+        parameter: ("id", "$response.body#/id"),
+        operations: &[
+            "getJob",
+            "pauseJob",
+            "resumeJob",
+            "cancelJob",
+            "deleteJob",
+            "listJobMetrics",
+            "listCheckpoints",
+            "listJobLogs",
+        ],
+    },
+    Link {
+        of: ("/v1/jobs/{id}/checkpoints", "get", "200"),
+        parameter: ("id", "$response.body#/checkpoints/0/id"),
+        operations: &["getCheckpoint"],
+    },
+    Link {
+        of: ("/v1/policies/{policy}/versions", "post", "201"),
+        parameter: ("policy", "$response.body#/ref/name"),
+        operations: &["getPolicy", "exportPolicy", "setAlias", "listAliases", "listAliasMoves", "unloadPolicy", "loadPolicy"],
+    },
+];
+
+impl Link {
+    fn add(&self, document: &mut Value) {
+        let (path, verb, status) = self.of;
+        let (parameter, source) = self.parameter;
+        let link = |id: &&str| ((*id).to_owned(), json!({"operationId": id, "parameters": {parameter: source}}));
+        let links: Map<String, Value> = self.operations.iter().map(link).collect();
+        document["paths"][path][verb]["responses"][status]["links"] = links.into();
+    }
+}
+
+/// The formats int32 and int64 are signed; what is not has its bounds instead.
+fn integers(schema: &mut Value) {
+    match schema {
+        Value::Object(fields) => {
+            let bits = fields.get("format").and_then(Value::as_str).and_then(|format| format.strip_prefix("int"));
+            let unsigned = fields.get("minimum").and_then(Value::as_f64).is_some_and(|minimum| minimum >= 0.0);
+            if let Some(bits) = bits.filter(|_| unsigned) {
+                let most = if bits == "32" { u64::from(u32::MAX) } else { u64::MAX };
+                fields.entry("maximum").or_insert_with(|| most.into());
+                fields.remove("format");
+            }
+            fields.values_mut().for_each(integers);
+        }
+        Value::Array(items) => items.iter_mut().for_each(integers),
+        _ => {}
+    }
+}
+
+/// Answers that are problems, each a type to be named among the responses of an operation, and all of them as components.
+macro_rules! problems {
+    ($($name:ident = $status:literal $(with $header:literal)? : $text:literal;)+) => {
+        $(
+            #[doc = $text]
+            pub(super) struct $name;
+
+            impl IntoResponses for $name {
+                fn responses() -> BTreeMap<String, RefOr<Response>> {
+                    BTreeMap::from([(stringify!($status).to_owned(), Ref::from_response_name(stringify!($name)).into())])
+                }
+            }
+        )+
+
+        fn problems() -> [(&'static str, Response); [$($status),+].len()] {
+            [$((stringify!($name), problem($text)$(.header($header, HeaderBuilder::new().build()))?.build())),+]
+        }
+    };
+}
+
+problems! {
+    BadRequest = 400: "Malformed or inconsistent input; `field` says which, if it is one.";
+    Unauthorized = 401: "The server asks for an API key, and this is none.";
+    Forbidden = 403: "The API key does not allow this.";
+    NotFound = 404: "There is no such thing.";
+    Conflict = 409: "Not in a state for this, or it exists already and differs; `code` says what.";
+    TooLarge = 413: "The body is over the limit.";
+    UnsupportedMediaType = 415: "A body of this content type is not read here.";
+    Unprocessable = 422: "JSON that does not fit the schema; `detail` says where.";
+    TooMany = 429 with "retry-after": "Too much at once; try again later.";
+    Fault = 500: "A fault of the server.";
+    Draining = 503 with "retry-after": "The server is shutting down.";
+}
+
+/// What can be wrong with a JSON body.
+pub(super) struct BadBody;
+
+impl IntoResponses for BadBody {
+    fn responses() -> BTreeMap<String, RefOr<Response>> {
+        let all = [BadRequest::responses(), TooLarge::responses(), UnsupportedMediaType::responses(), Unprocessable::responses()];
+        all.into_iter().flatten().collect()
+    }
+}
+
+fn problem(description: &str) -> ResponseBuilder {
+    let content = Content::new(Some(Ref::from_schema_name("Problem")));
+    ResponseBuilder::new().description(description).content("application/problem+json", content)
+}
