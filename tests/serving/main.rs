@@ -9,6 +9,7 @@ mod harness;
 mod large;
 mod limits;
 mod load;
+mod openapi;
 mod policies;
 mod promotion;
 mod published;
