@@ -5,8 +5,12 @@ use std::path::{Path, PathBuf};
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     println!("cargo:rerun-if-changed=proto");
     println!("cargo:rerun-if-changed=migrations");
-    let mut files: Vec<PathBuf> =
-        std::fs::read_dir("proto/qedgix/v1")?.map(|entry| Ok(entry?.path())).collect::<std::io::Result<_>>()?;
+    let mut files: Vec<PathBuf> = Vec::new();
+    for dir in ["proto/inference", "proto/qedgix/v1"] {
+        for entry in std::fs::read_dir(dir)? {
+            files.push(entry?.path());
+        }
+    }
     files.sort();
     let descriptors = protox::compile(files, ["proto"])?;
     let out = std::env::var("OUT_DIR")?;

@@ -36,6 +36,10 @@ pub struct Config {
     pub environment_memory: usize,
     /// Largest gRPC message and HTTP body, in bytes.
     pub max_message_size: usize,
+    /// Most streams of jobs' events that are open at a time.
+    pub max_watchers: usize,
+    /// Silence after which a stream of events over HTTP gives a sign of life.
+    pub heartbeat: Duration,
     /// The engine that computes headings.
     pub engine: EngineConfig,
     /// Time that requests in flight are given when the server stops.
@@ -62,6 +66,8 @@ impl Config {
             max_environments: 1024,
             environment_memory: 1 << 30,
             max_message_size: 4 << 20,
+            max_watchers: 256,
+            heartbeat: Duration::from_secs(15),
             engine: EngineConfig { threads: cores.min(4), queue: 4096, max_batch: 64, max_batch_delay: Duration::ZERO },
             drain_timeout: Duration::from_secs(20),
             insecure: false,
@@ -82,6 +88,8 @@ impl Config {
         in_range("--max-environments", self.max_environments, 1..=100_000_000)?;
         in_range("--environment-memory", self.environment_memory, 1 << 20..=1 << 40)?;
         in_range("--max-message-size", self.max_message_size, 1024..=1 << 30)?;
+        in_range("--max-watchers", self.max_watchers, 1..=100_000)?;
+        in_range("--event-heartbeat (seconds)", self.heartbeat.as_secs_f64(), 0.001..=3600.0)?;
         in_range("--engine-threads", self.engine.threads, 1..=1024)?;
         in_range("--engine-queue", self.engine.queue, 1..=10_000_000)?;
         in_range("--max-batch", self.engine.max_batch, 1..=65_536)?;

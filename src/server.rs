@@ -1,8 +1,8 @@
 //! Listeners, background work, shutdown: one process on one data directory.
 //!
-//! Shutdown in order: readiness goes off and new work is refused; training jobs are snapshotted and queued; requests in
-//! flight are answered; then the listeners are
-//! gone and the data directory is free for another server.
+//! Shutdown in order: readiness goes off, watchers of health are told and new work is refused; training jobs are snapshotted
+//! and queued; streams end and requests in flight are answered; then the listeners are gone and the data directory is free for
+//! another server.
 
 use std::fs::{File, TryLockError};
 use std::future::Future;
@@ -15,14 +15,12 @@ use axum::serve::ListenerExt;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tonic::transport::server::TcpIncoming;
-use tonic_health::ServingStatus;
-use tonic_health::server::{HealthReporter, HealthService};
 
 use crate::api::{grpc, rest};
 use crate::config::Config;
 use crate::invalid::Invalid;
 use crate::jobs::{Jobs, LocalProcess, Settings};
-use crate::service::{App, Draining, policies};
+use crate::service::{App, Draining, Watchers, operations, policies};
 use crate::serving::{Clock, Engine, Environments, EnvironmentsConfig, Limits, Sessions};
 use crate::store::{self, Store};
 use crate::telemetry;
@@ -183,6 +181,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         sessions: Sessions::new(sessions, clock.clone()),
         environments: Environments::new(environments, clock.clone()),
         engine: Engine::start(config.engine).map_err(Error::Engine)?,
+        watchers: Watchers::new(config.max_watchers, config.heartbeat),
         clock,
         draining: Draining::default(),
     };
@@ -202,30 +201,25 @@ pub async fn run(
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Error> {
     let endpoints = listeners.endpoints().map_err(Error::Rest)?;
-    let metrics = telemetry::metrics();
-    let health = HealthReporter::new();
-    let report = async |status| {
-        for service in ["", grpc::SERVICES[0]].iter().chain(&grpc::SERVICES[1..]) {
-            health.set_service_status(*service, status).await;
-        }
-    };
-    report(ServingStatus::Serving).await;
+    telemetry::metrics();
     let stop = CancellationToken::new();
+    let health = grpc::Health::new(stop.clone());
+    health.report(operations::vitals(&app).await);
 
-    let health_server = tonic_health::pb::health_server::HealthServer::new(HealthService::from_health_reporter(health.clone()));
     let serve_grpc = transport()
-        .layer(tower::util::MapRequestLayer::new(grpc::stamp))
-        .add_routes(grpc::routes(&app, health_server, config.max_message_size))
+        .layer(grpc::envelope(stop.clone()))
+        .add_routes(grpc::routes(&app, &health, config.max_message_size))
         .serve_with_incoming_shutdown(incoming(listeners.grpc), stop.clone().cancelled_owned());
     let http = listeners.http.tap_io(|stream| {
         // Only latency is lost where it cannot be set.
         let _ = stream.set_nodelay(true);
     });
-    let router = rest::router(app.clone(), metrics.clone(), config.max_message_size);
+    let router = rest::router(app.clone(), telemetry::render, config.max_message_size);
     let serve_rest = axum::serve(http, router).with_graceful_shutdown(stop.clone().cancelled_owned());
 
     let scheduling = tokio::spawn(app.jobs.clone().run(format!("http://{}", from_here(endpoints.grpc))));
-    let housekeeping = tokio::spawn(housekeeping(app.clone(), metrics, config.session_ttl.min(config.environment_ttl)));
+    let housekeeping = tokio::spawn(housekeeping(app.clone(), config.session_ttl.min(config.environment_ttl)));
+    let monitoring = tokio::spawn(health.clone().follow(app.clone()));
     data.publish(endpoints)?;
     tracing::info!(grpc = %endpoints.grpc, http = %endpoints.http, policies = app.registry.len(), "serving");
 
@@ -233,7 +227,7 @@ pub async fn run(
         shutdown.await;
         tracing::info!("draining");
         app.draining.begin();
-        report(ServingStatus::NotServing).await;
+        health.drain();
         // Workers send their snapshots, so they are waited for while everything still answers.
         app.jobs.drain(config.drain_timeout + Duration::from_secs(5)).await;
         stop.cancel();
@@ -249,6 +243,7 @@ pub async fn run(
     };
     scheduling.abort();
     housekeeping.abort();
+    monitoring.abort();
     data.withdraw();
     tracing::info!("stopped");
     served
@@ -280,12 +275,17 @@ fn from_here(mut addr: SocketAddr) -> SocketAddr {
 }
 
 /// What has to be done now and then, however quiet it is.
-async fn housekeeping(app: Arc<App>, metrics: metrics_exporter_prometheus::PrometheusHandle, ttl: Duration) {
-    let pause = (ttl / 4).clamp(Duration::from_secs(1), Duration::from_secs(30));
+async fn housekeeping(app: Arc<App>, ttl: Duration) {
+    let mut sweep = tokio::time::interval((ttl / 4).clamp(Duration::from_secs(1), Duration::from_secs(30)));
+    // Times that were recorded wait in memory until they are put into their buckets.
+    let mut upkeep = tokio::time::interval(Duration::from_secs(5));
     loop {
-        tokio::time::sleep(pause).await;
-        app.sessions.sweep();
-        app.environments.table().sweep();
-        metrics.run_upkeep();
+        tokio::select! {
+            _ = sweep.tick() => {
+                app.sessions.sweep();
+                app.environments.table().sweep();
+            }
+            _ = upkeep.tick() => telemetry::metrics().run_upkeep(),
+        }
     }
 }

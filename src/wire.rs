@@ -7,5 +7,10 @@ pub mod v1 {
     tonic::include_proto!("qedgix.v1");
 }
 
+/// `inference`, the Open Inference Protocol.
+pub mod oip {
+    tonic::include_proto!("inference");
+}
+
 /// All protocol files as a `FileDescriptorSet`, for reflection.
 pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));

@@ -43,7 +43,7 @@ slot() {
 }
 
 services=$("$grpcurl" --plaintext "$address" list)
-for name in "$service" qedgix.v1.EnvironmentService grpc.health.v1.Health; do
+for name in "$service" qedgix.v1.EnvironmentService inference.GRPCInferenceService grpc.health.v1.Health; do
     grep -qxF "$name" <<<"$services" || fail "the list of services lacks $name: $services"
 done
 

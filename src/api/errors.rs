@@ -37,21 +37,31 @@ pub fn retry_after_seconds(error: &Error) -> Option<u64> {
     }
 }
 
-fn log_internal(error: &Error) {
+/// Logs a fault that no other line will tell about: part of an answer, or of a stream that has begun.
+pub(super) fn log_internal(error: &Error) {
     if let Error::Internal(cause) = error {
         tracing::error!(error = %cause, "internal error");
     }
 }
 
+/// The status with which a stream that has begun ends.
+pub(super) fn in_stream(error: Error) -> Status {
+    log_internal(&error);
+    error.into()
+}
+
+/// The cause of a fault is the status's source: it is logged when the call ends, and not sent.
 impl From<Error> for Status {
     fn from(error: Error) -> Self {
-        log_internal(&error);
         let mut status = Self::new(row(&error).0, error.to_string());
         if let Ok(code) = error.code().parse() {
             status.metadata_mut().insert("qedgix-code", code);
         }
         if let Some(seconds) = retry_after_seconds(&error) {
             status.metadata_mut().insert("retry-after", seconds.into());
+        }
+        if let Error::Internal(cause) = error {
+            status.set_source(cause.into());
         }
         status
     }
@@ -64,7 +74,7 @@ pub fn act_error(error: &Error) -> crate::wire::v1::ActError {
 }
 
 /// RFC 9457 problem details.
-#[derive(Debug, Serialize, ToSchema)]
+#[derive(Clone, Debug, Serialize, ToSchema)]
 pub struct Problem {
     /// `about:blank`: the title says it all.
     #[schema(example = "about:blank")]
@@ -102,15 +112,20 @@ impl Problem {
 impl IntoResponse for Problem {
     fn into_response(self) -> Response {
         let status = StatusCode::from_u16(self.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
-        let mut response = (status, Json(self)).into_response();
+        let mut response = (status, Json(&self)).into_response();
+        // For those who say it in other words.
+        response.extensions_mut().insert(self);
         response.headers_mut().insert(header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
         response
     }
 }
 
+/// What an error response is about, for the log.
+#[derive(Clone, Debug)]
+pub(super) struct Failure(pub(super) String);
+
 impl IntoResponse for Error {
     fn into_response(self) -> Response {
-        log_internal(&self);
         let mut problem = Problem::new(row(&self).1, self.code(), self.to_string());
         if let Self::Invalid(e) = &self {
             problem.field = Some(e.field.clone());
@@ -119,6 +134,11 @@ impl IntoResponse for Error {
         if let Some(seconds) = retry_after_seconds(&self) {
             response.headers_mut().insert(header::RETRY_AFTER, seconds.into());
         }
+        let detail = match &self {
+            Self::Internal(cause) => cause.to_string(),
+            error => error.to_string(),
+        };
+        response.extensions_mut().insert(Failure(detail));
         response
     }
 }

@@ -10,7 +10,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use crate::config::Config;
 use crate::server::{self, DataDir, Listeners};
 use crate::serving::{Clock, EngineConfig};
-use crate::telemetry;
+use crate::telemetry::{self, Logs, Traces};
 
 /// Flags of `serve`.
 #[derive(Args, Debug)]
@@ -58,6 +58,12 @@ pub struct ServeArgs {
     /// Threads that compute headings [default: all cores, at most 4]
     #[arg(long, env = "QEDGIX_ENGINE_THREADS", value_name = "THREADS")]
     engine_threads: Option<usize>,
+    /// Streams of jobs' events that may be open at a time; more are refused
+    #[arg(long, env = "QEDGIX_MAX_WATCHERS", default_value_t = 256, value_name = "STREAMS")]
+    max_watchers: usize,
+    /// Silence after which a stream of events over HTTP gives a sign of life
+    #[arg(long, env = "QEDGIX_EVENT_HEARTBEAT", default_value = "15s", value_parser = duration)]
+    event_heartbeat: Duration,
     /// Fleets that may wait to be computed; more are refused
     #[arg(long, env = "QEDGIX_ENGINE_QUEUE", default_value_t = 4096, value_name = "FLEETS")]
     engine_queue: usize,
@@ -76,6 +82,12 @@ pub struct ServeArgs {
     /// How logs are written to standard error
     #[arg(long, env = "QEDGIX_LOG_FORMAT", default_value = "text", value_enum)]
     log_format: LogFormat,
+    /// Log every request, however it went, under the target qedgix::access
+    #[arg(long, env = "QEDGIX_ACCESS_LOG")]
+    access_log: bool,
+    /// Export traces by OTLP over gRPC to this collector, as http://127.0.0.1:4317 [default: no traces]
+    #[arg(long, env = "QEDGIX_OTLP_ENDPOINT", value_name = "URL")]
+    otlp_endpoint: Option<String>,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -84,31 +96,54 @@ enum LogFormat {
     Json,
 }
 
-/// Serves until ctrl-c or SIGTERM.
+/// Serves until ctrl-c or SIGTERM, then drains; a second one ends the process at once.
 ///
 /// # Errors
 /// A setting that cannot be used, an address or data directory that is taken, a database that cannot be read.
 pub async fn run(args: ServeArgs) -> anyhow::Result<()> {
-    telemetry::logs(matches!(args.log_format, LogFormat::Json));
+    let traces = args.otlp_endpoint.as_deref().map(Traces::start).transpose()?;
+    let logs = Logs { json: matches!(args.log_format, LogFormat::Json), access: args.access_log };
+    telemetry::logs(logs, traces.as_ref());
     let config = args.config();
     config.validate()?;
     let data = DataDir::take(&config.data_dir)?;
     let listeners = Listeners::bind(&config).await?;
     // Signals are caught before anybody is told that the server is there.
-    let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    let shutdown = told_to_stop()?;
     let app = server::open(&config, &data, Clock::system()).await?;
     let endpoints = listeners.endpoints()?;
     println!("qedgix {}", env!("CARGO_PKG_VERSION"));
     println!("gRPC  {}", endpoints.grpc);
     println!("REST  http://{}", endpoints.http);
     println!("data  {}", config.data_dir.display());
-    let shutdown = async move {
+    let served = server::run(&config, &data, app, listeners, shutdown).await;
+    if let Some(traces) = traces {
+        traces.end(config.drain_timeout.min(LAST_SPANS)).await;
+    }
+    Ok(served?)
+}
+
+/// Time that the last spans are given to reach their collector.
+const LAST_SPANS: Duration = Duration::from_secs(5);
+
+/// Resolves on the first ctrl-c or SIGTERM. The second one ends the process, whatever is still being done: what was
+/// acknowledged is on the disk, and workers end with the server.
+fn told_to_stop() -> std::io::Result<impl Future<Output = ()>> {
+    let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    let mut next = async move || {
         tokio::select! {
-            _ = interrupt.recv() => {}
-            _ = terminate.recv() => {}
+            _ = interrupt.recv() => 130,
+            _ = terminate.recv() => 143,
         }
     };
-    Ok(server::run(&config, &data, app, listeners, shutdown).await?)
+    Ok(async move {
+        next().await;
+        tokio::spawn(async move {
+            let code = next().await;
+            tracing::warn!("told to stop again; ending at once");
+            std::process::exit(code);
+        });
+    })
 }
 
 impl ServeArgs {
@@ -126,6 +161,8 @@ impl ServeArgs {
             max_environments: self.max_environments,
             environment_memory: self.environment_memory,
             max_message_size: self.max_message_size,
+            max_watchers: self.max_watchers,
+            heartbeat: self.event_heartbeat,
             engine: EngineConfig {
                 threads: self.engine_threads.unwrap_or(default.engine.threads),
                 queue: self.engine_queue,

@@ -35,7 +35,7 @@ fn try_run(args: &WorkerArgs) -> anyhow::Result<()> {
     if args.tethered {
         worker::tether()?;
     }
-    telemetry::logs(false);
+    telemetry::logs(telemetry::Logs::default(), None);
     let variable =
         |name: &str| std::env::var(name).map_err(|e| anyhow::anyhow!("{name}: {e}; a server starts its workers itself"));
     let assignment = Assignment {

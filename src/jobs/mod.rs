@@ -15,7 +15,7 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use sha2::{Digest, Sha256};
-use tokio::sync::Notify;
+use tokio::sync::{Notify, watch};
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
@@ -79,6 +79,8 @@ struct Inner {
     /// Rung when an attempt has left `running`.
     left: Notify,
     draining: CancellationToken,
+    /// Whether the queue could be read when it was last looked at.
+    able: watch::Sender<bool>,
     /// By job number. A job stays here until its worker's process has ended, whatever its state says.
     running: Mutex<HashMap<i64, Running>>,
 }
@@ -109,6 +111,7 @@ impl Jobs {
             wake: Notify::new(),
             left: Notify::new(),
             draining: CancellationToken::new(),
+            able: watch::Sender::new(true),
             running: Mutex::default(),
         })))
     }
@@ -121,6 +124,16 @@ impl Jobs {
     /// Whether nothing is started any more.
     pub fn draining(&self) -> bool {
         self.0.draining.is_cancelled()
+    }
+
+    /// Whether the queue could be read when it was last looked at, and when that changes.
+    pub fn able(&self) -> watch::Receiver<bool> {
+        self.0.able.subscribe()
+    }
+
+    /// Threads that running jobs use.
+    pub fn threads_busy(&self) -> usize {
+        scheduler::used(&self.running())
     }
 
     /// Says that the queue, or what is wanted of job number `job`, has changed.

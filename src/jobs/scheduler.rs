@@ -29,7 +29,7 @@ enum Killed {
 /// The database, or the system's source of random numbers.
 type Fault = Box<dyn std::error::Error + Send + Sync>;
 
-fn used(all: &HashMap<i64, Running>) -> usize {
+pub(super) fn used(all: &HashMap<i64, Running>) -> usize {
     all.values().map(|running| running.threads).sum()
 }
 
@@ -38,7 +38,9 @@ impl Jobs {
     pub async fn run(self, server: String) {
         while !self.draining() {
             let wake = self.0.wake.notified();
-            if let Err(e) = self.start_all(&server).await {
+            let started = self.start_all(&server).await;
+            self.0.able.send_replace(started.is_ok());
+            if let Err(e) = started {
                 tracing::error!(error = e, "the queue could not be read; trying again");
                 tokio::time::sleep(Duration::from_secs(1)).await;
                 continue;
@@ -94,14 +96,11 @@ impl Jobs {
             heard: Arc::new(Mutex::new(Instant::now())),
         };
         all.insert(job.number, running.clone());
-        metrics::gauge!("qedgix_job_threads").set(used(&all) as f64);
         Some(running)
     }
 
     fn release(&self, job: i64) {
-        let mut all = self.running();
-        all.remove(&job);
-        metrics::gauge!("qedgix_job_threads").set(used(&all) as f64);
+        self.running().remove(&job);
     }
 
     async fn begin(&self, job: &Job) -> Result<Option<(Lease, String)>, Fault> {

@@ -4,12 +4,14 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use bytes::Bytes;
+use tracing::level_filters::LevelFilter;
 
+use super::sequences::{self, Sequence};
 use super::{App, Error};
 use crate::invalid::Invalid;
 use crate::policy::Slot;
 use crate::serving::{
-    Answered, Fleet, HeldState, LoadedPolicy, Observation, Outcome, PolicySpec, Seen, Session, Task, Timings, Turn, Which,
+    Answered, Fleet, HeldState, LoadedPolicy, Observation, Outcome, PolicySpec, Room, Seen, Session, Task, Timings, Turn, Which,
 };
 
 /// Observations of more nodes are prepared away from the threads that serve connections.
@@ -37,6 +39,8 @@ pub struct Request {
 pub enum Memory {
     /// The server, in this session.
     Session(String),
+    /// The server, in a session that begins and ends with requests like this one.
+    Sequence(Sequence),
     /// The caller: the bytes of the last answer, empty at slot 0.
     Held(Bytes),
 }
@@ -70,16 +74,14 @@ pub async fn act(app: &App, request: Request, deadline: Option<Instant>) -> Resu
     app.admit()?;
     match &request.memory {
         Memory::Session(id) => {
+            note("session", id);
             let session = app.sessions.get(id)?;
-            let answer = in_session(app, &session, request, deadline);
-            match deadline {
-                None => answer.await,
-                // The engine watches its own queue; this is for the wait behind another slot of the same session.
-                Some(deadline) => {
-                    let passed = || Error::Deadline("behind another slot of the session");
-                    tokio::time::timeout_at(deadline.into(), answer).await.unwrap_or_else(|_| Err(passed()))
-                }
-            }
+            within(deadline, in_session(app, &session, request, deadline)).await
+        }
+        Memory::Sequence(sequence) => {
+            let sequence = sequence.clone();
+            // Boxed, so that what it holds makes no other request larger.
+            within(deadline, Box::pin(sequences::act(app, &sequence, request, deadline))).await
         }
         Memory::Held(state) => {
             let state = state.clone();
@@ -88,21 +90,48 @@ pub async fn act(app: &App, request: Request, deadline: Option<Instant>) -> Resu
     }
 }
 
-async fn in_session(app: &App, session: &Session, request: Request, deadline: Option<Instant>) -> Result<Answer, Error> {
-    let policy = session.policy().clone();
+/// The engine watches its own queue; this is for the wait behind another slot of the same session.
+async fn within(deadline: Option<Instant>, answer: impl Future<Output = Result<Answer, Error>>) -> Result<Answer, Error> {
+    let Some(deadline) = deadline else { return answer.await };
+    let passed = || Error::Deadline("behind another slot of the session");
+    tokio::time::timeout_at(deadline.into(), answer).await.unwrap_or_else(|_| Err(passed()))
+}
+
+pub(super) async fn in_session(
+    app: &App,
+    session: &Session,
+    request: Request,
+    deadline: Option<Instant>,
+) -> Result<Answer, Error> {
     if let Some(spec) = &request.policy {
-        check_pinned(&policy, spec)?;
+        check_pinned(session.policy(), spec)?;
     }
     if let Some(seed) = request.seed {
         return Err(Invalid::new("seed", seed, "nothing: a session is given its seed when it is opened").into());
     }
-    let Observation { fleet, uav_order: order, seen } = request.observation;
-    let slot = slot_of(&fleet, seen, &policy).await?;
-    let answered = match session.turn(&fleet, request.step, request.run_id.as_deref()).await? {
+    let Observation { fleet, uav_order, seen } = request.observation;
+    let slot = slot_of(&fleet, seen, session.policy()).await?;
+    let turn = TurnRequest { fleet, uav_order, slot, step: request.step, run_id: request.run_id };
+    advance(app, session, turn, deadline).await
+}
+
+/// A slot that its policy can decide.
+pub(super) struct TurnRequest {
+    pub(super) fleet: Fleet,
+    pub(super) uav_order: Vec<u32>,
+    pub(super) slot: Slot,
+    pub(super) step: Option<u64>,
+    pub(super) run_id: Option<String>,
+}
+
+pub(super) async fn advance(app: &App, session: &Session, turn: TurnRequest, deadline: Option<Instant>) -> Result<Answer, Error> {
+    let policy = session.policy().clone();
+    let TurnRequest { fleet, uav_order: order, slot, step, run_id } = turn;
+    let answered = match session.turn(&fleet, step, run_id.as_deref()).await? {
         Turn::Repeat(answered) => answered,
         Turn::Next(mut turn) => {
-            let memory = std::mem::take(&mut turn.memory);
-            let outcome = compute(app, Task { policy: policy.clone(), slot, step: turn.step, memory }, deadline).await?;
+            let (memory, room) = (std::mem::take(&mut turn.memory), std::mem::take(&mut turn.room));
+            let outcome = compute(app, Task::new(policy.clone(), slot, turn.step, memory, room), deadline).await?;
             turn.commit(outcome)
         }
     };
@@ -133,7 +162,7 @@ async fn with_held_state(app: &App, state: &[u8], request: Request, deadline: Op
         policy.policy.start(slot.uavs(), slot.users(), request.seed.unwrap_or(0), &mut memory);
         memory
     };
-    let outcome = compute(app, Task { policy: policy.clone(), slot, step, memory }, deadline).await?;
+    let outcome = compute(app, Task::new(policy.clone(), slot, step, memory, Room::default()), deadline).await?;
     let next = HeldState::new(policy.reference.digest, step.saturating_add(1), &fleet, outcome.memory);
     let (headings, q_values, timings) = (outcome.headings, outcome.q_values, outcome.timings);
     Ok(Answer { policy, uavs: fleet.uavs, order, step, headings, q_values, state: Some(next.encode()), timings })
@@ -174,7 +203,7 @@ fn memory_of(held: HeldState, fleet: &Fleet, policy: &LoadedPolicy) -> Result<Ve
     Ok(held.memory)
 }
 
-async fn slot_of(fleet: &Fleet, seen: Seen, policy: &Arc<LoadedPolicy>) -> Result<Slot, Error> {
+pub(super) async fn slot_of(fleet: &Fleet, seen: Seen, policy: &Arc<LoadedPolicy>) -> Result<Slot, Error> {
     let (uavs, users) = (fleet.uavs.len(), fleet.users.len());
     if uavs + users < LARGE {
         return Ok(seen.into_slot((uavs, users), &*policy.policy)?);
@@ -184,6 +213,14 @@ async fn slot_of(fleet: &Fleet, seen: Seen, policy: &Arc<LoadedPolicy>) -> Resul
     Ok(prepared.await.map_err(Error::internal)??)
 }
 
+/// Tells the span of the request what it is about, if anybody reads it.
+fn note(field: &'static str, value: &dyn std::fmt::Display) {
+    if LevelFilter::current() >= LevelFilter::DEBUG {
+        tracing::Span::current().record(field, tracing::field::display(value));
+    }
+}
+
 async fn compute(app: &App, task: Task, deadline: Option<Instant>) -> Result<Outcome, Error> {
+    note("policy", &task.policy().reference);
     Ok(app.engine.run(task, deadline).await?)
 }

@@ -3,14 +3,18 @@
 pub mod act;
 pub mod environments;
 mod error;
+pub mod events;
 pub mod jobs;
+pub mod operations;
 pub mod policies;
+pub mod sequences;
 pub mod sessions;
 pub mod worker;
 
 use std::sync::Arc;
 
 pub use error::Error;
+pub use events::Watchers;
 use tokio_util::sync::CancellationToken;
 
 use crate::jobs::Jobs;
@@ -31,6 +35,8 @@ pub struct App {
     pub environments: Environments,
     /// Where headings are computed.
     pub engine: Engine,
+    /// Who follows a job.
+    pub watchers: Watchers,
     /// The time of day.
     pub clock: Clock,
     /// Whether the server is shutting down.
@@ -65,18 +71,6 @@ impl App {
     /// [`Error::Draining`].
     pub fn admit(&self) -> Result<(), Error> {
         if self.draining.begun() { Err(Error::Draining) } else { Ok(()) }
-    }
-
-    /// Checks that the server can do its work: the database answers, there is something to serve, and it is not draining.
-    ///
-    /// # Errors
-    /// The first of these that is not the case.
-    pub async fn ready(&self) -> Result<(), Error> {
-        self.admit()?;
-        if self.registry.is_empty() {
-            return Err(Error::internal("no policy is loaded"));
-        }
-        Ok(self.store.ping().await?)
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use super::sequences::PREFIX;
 use super::{App, Error};
 use crate::invalid::{Invalid, in_range};
 use crate::serving::{Entry, Opened, PolicySpec, SessionInfo, Table};
@@ -12,6 +13,10 @@ use crate::serving::{Entry, Opened, PolicySpec, SessionInfo, Table};
 /// An unknown policy, a name that is taken, a fenced run, too many sessions, draining.
 pub async fn open(app: &App, policy: &PolicySpec, how: Opened) -> Result<SessionInfo, Error> {
     app.admit()?;
+    if let Some(id) = how.id.as_deref().filter(|id| id.starts_with(PREFIX)) {
+        let expected = format!("another name: those that begin with {PREFIX:?} belong to the Open Inference Protocol");
+        return Err(Invalid::new("session_id", format!("{id:?}"), expected).into());
+    }
     let policy = app.registry.resolve(policy)?;
     Ok(app.sessions.open(policy, how).await?)
 }

@@ -10,6 +10,7 @@ mod environments;
 mod error;
 mod fleet;
 mod memory;
+mod meters;
 mod observation;
 mod reference;
 mod registry;
@@ -17,7 +18,7 @@ mod sessions;
 mod table;
 
 pub use clock::Clock;
-pub use engine::{Engine, EngineConfig, Outcome, Task, Timings};
+pub use engine::{Engine, EngineConfig, Outcome, Room, Task, Timings};
 pub use environments::{
     Blueprint, CopyState, Environment, EnvironmentInfo, Environments, EnvironmentsConfig, Finished, Flight, Progress, Reset,
     Sight, State,
@@ -25,7 +26,7 @@ pub use environments::{
 pub use error::Error;
 pub use fleet::Fleet;
 pub use memory::HeldState;
-pub use observation::{Graph, MAX_DETECTIONS, MAX_NODES, Observation, Seen, Sighting};
+pub use observation::{Graph, GraphForm, MAX_DETECTIONS, MAX_NODES, Observation, Seen, Sighting};
 pub use reference::{PolicyRef, PolicySpec, Which, check_name};
 pub use registry::{About, Described, Kind, LoadedPolicy, Registry};
 pub use sessions::{Answered, Opened, Session, SessionInfo, Sessions, Turn};

@@ -57,6 +57,18 @@ pub struct Graph {
     pub left_out: Vec<bool>,
     /// Place of each node in the request's list.
     pub places: Vec<u32>,
+    /// How the request is made, for what is said about it.
+    pub form: GraphForm,
+}
+
+/// How a caller writes a graph down.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum GraphForm {
+    /// Nodes, each with a list of detections.
+    #[default]
+    Nodes,
+    /// A list of edges; the place of a detection is in that list.
+    Edges,
 }
 
 /// Node `target` seen at `rel`.
@@ -66,7 +78,7 @@ pub struct Sighting {
     pub target: u32,
     /// Target position - own position.
     pub rel: Point,
-    /// Place in the request's list of detections of the node that reported it.
+    /// Place in the request's list of detections of the node that reported it, or in its list of edges.
     pub place: u32,
     /// Whether it was reported by the target and mirrored.
     pub mirrored: bool,
@@ -134,7 +146,10 @@ impl Graph {
         if needs == Needs::OwnPositions
             && let Some(i) = self.positions.iter().position(Option::is_none)
         {
-            let field = format!("graph.nodes[{}].position", self.places[i]);
+            let field = match self.form {
+                GraphForm::Nodes => format!("graph.nodes[{}].position", self.places[i]),
+                GraphForm::Edges => "uav_positions".into(),
+            };
             return Err(Invalid::new(field, "nothing", "the UAV's own position, which this policy needs"));
         }
         self.check_range(range)?;
@@ -159,13 +174,21 @@ impl Graph {
         Ok(Slot::from_flat_detections(positions, uavs, self.aoi, offsets, detections))
     }
 
+    /// What the relative coordinates of a detection of `node` are called.
+    pub fn rel_field(&self, node: usize, place: u32) -> String {
+        match self.form {
+            GraphForm::Nodes => format!("graph.nodes[{}].detections[{place}].rel", self.places[node]),
+            GraphForm::Edges => format!("edge_relative[{place}]"),
+        }
+    }
+
     /// A detection beyond the range is a mistake in units, or a sensor that the policy was not trained with.
     fn check_range(&self, range: f64) -> Result<(), Invalid> {
         for (node, list) in self.detections.iter().enumerate() {
             for sighting in list.iter().filter(|s| !s.mirrored) {
                 if !within(&sighting.rel, range * RANGE_TOLERANCE) {
                     let [x, y] = sighting.rel;
-                    let field = format!("graph.nodes[{}].detections[{}].rel", self.places[node], sighting.place);
+                    let field = self.rel_field(node, sighting.place);
                     let expected = format!("coordinates within the policy's detection range of {range}");
                     return Err(Invalid::new(field, format!("({x}, {y})"), expected));
                 }
@@ -187,6 +210,11 @@ impl Graph {
         if !self.left_out.contains(&true) {
             return Ok(derived);
         }
+        // A pair of users that both left out their lists is looked at once, from the one that comes first.
+        let mut silent = vec![0_u64; users.div_ceil(64)];
+        for j in (0..users).filter(|&j| self.left_out[j]) {
+            silent[j / 64] |= 1 << (j % 64);
+        }
         let views: Vec<View> = self.detections[..uavs].iter().map(|list| View::of(list, uavs, users)).collect();
         let mut known = vec![0_u64; users.div_ceil(64)];
         let mut found = vec![0_u64; known.len()];
@@ -199,6 +227,10 @@ impl Graph {
             for user in others.chain([j]) {
                 known[user / 64] |= 1 << (user % 64);
             }
+            for (known, silent) in known.iter_mut().zip(&silent[..j / 64]) {
+                *known |= silent;
+            }
+            known[j / 64] |= silent[j / 64] & ((1 << (j % 64)) - 1);
             for to_uav in seen.iter().take_while(|s| (s.target as usize) < uavs) {
                 let View { bits, first, rel: list } = &views[to_uav.target as usize];
                 for (word, (known, &bits)) in known.iter_mut().zip(bits).enumerate() {
@@ -221,14 +253,10 @@ impl Graph {
                     let k = word * 64 + rest.trailing_zeros() as usize;
                     rest &= rest - 1;
                     derived[j].push(Detection { target: (uavs + k) as u32, rel: rels[k] });
-                    // k derives j by itself if its list was left out too.
-                    if !self.left_out[k] {
-                        derived[k].push(Detection { target: (uavs + j) as u32, rel: rels[k].map(|x| -x) });
-                        total += 1;
-                    }
+                    derived[k].push(Detection { target: (uavs + j) as u32, rel: rels[k].map(|x| 0.0 - x) });
+                    total += 2;
                 }
             }
-            total += derived[j].len();
             if total > MAX_DETECTIONS {
                 return Err(crowded("graph"));
             }

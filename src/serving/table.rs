@@ -36,7 +36,15 @@ pub trait Entry {
 
     /// Its last use.
     fn used(&self) -> &LastUse;
+
+    /// Whether it is kept only for callers that repeat its last request; it goes after [`GRACE`], or when there is no room.
+    fn over(&self) -> bool {
+        false
+    }
 }
+
+/// How long what is over is kept for callers that missed its last answer.
+pub(super) const GRACE: Duration = Duration::from_secs(10);
 
 /// When something was used last, in milliseconds since the epoch.
 #[derive(Debug)]
@@ -51,9 +59,9 @@ impl LastUse {
         self.0.fetch_max(now.as_millisecond(), Ordering::Relaxed);
     }
 
-    fn idle_longer_than(&self, ttl: Duration, now: Timestamp) -> bool {
+    fn idle(&self, now: Timestamp) -> u128 {
         let idle = now.as_millisecond().saturating_sub(self.0.load(Ordering::Relaxed));
-        u128::try_from(idle).is_ok_and(|idle| idle > ttl.as_millis())
+        u128::try_from(idle).unwrap_or(0)
     }
 }
 
@@ -121,7 +129,7 @@ impl<T: Entry> Table<T> {
     }
 
     fn is_idle(&self, entry: &T, now: Timestamp) -> bool {
-        entry.used().idle_longer_than(self.limits.ttl, now)
+        entry.used().idle(now) > self.limits.ttl.as_millis()
     }
 
     /// Idle time after which entries expire.
@@ -144,16 +152,30 @@ impl<T: Entry> Table<T> {
         if let Some(existing) = names.open.get(id).filter(|entry| !self.is_idle(entry, now)) {
             return Ok(Found::Existing(existing.clone()));
         }
-        if names.open.len() >= self.limits.max {
-            self.sweep_names(&mut names, now);
+        self.insert(&mut names, id, now, make).map(Found::New)
+    }
+
+    /// The entry that `make` makes, from now on called `id`; whoever holds the one that was called so keeps it.
+    ///
+    /// # Errors
+    /// There are too many.
+    pub(super) fn replace(&self, id: &str, make: impl FnOnce() -> T) -> Result<Arc<T>, Error> {
+        let now = self.clock.now();
+        self.insert(&mut self.write(), id, now, make)
+    }
+
+    fn insert(&self, names: &mut Names<T>, id: &str, now: Timestamp, make: impl FnOnce() -> T) -> Result<Arc<T>, Error> {
+        let full = |names: &Names<T>| names.open.len() >= self.limits.max && !names.open.contains_key(id);
+        if full(names) {
+            self.sweep_names(names, now, Duration::ZERO);
         }
-        if names.open.len() >= self.limits.max {
+        if full(names) {
             return Err(Error::Busy(format!("{} {}s are open, the most this server holds", self.limits.max, T::WHAT)));
         }
         names.expired.remove(id);
         let entry = Arc::new(make());
         names.open.insert(id.to_owned(), entry.clone());
-        Ok(Found::New(entry))
+        Ok(entry)
     }
 
     /// The entry `id`; asking keeps it alive.
@@ -194,7 +216,7 @@ impl<T: Entry> Table<T> {
     pub fn list(&self, after: &str, limit: usize) -> (Vec<Arc<T>>, bool) {
         let now = self.clock.now();
         let names = self.read();
-        let alive = |entry: &&Arc<T>| entry.id() > after && !self.is_idle(entry, now);
+        let alive = |entry: &&Arc<T>| entry.id() > after && !entry.over() && !self.is_idle(entry, now);
         let mut entries: Vec<&Arc<T>> = names.open.values().filter(alive).collect();
         entries.sort_unstable_by(|a, b| a.id().cmp(b.id()));
         let more = entries.len() > limit;
@@ -214,10 +236,11 @@ impl<T: Entry> Table<T> {
     /// Forgets what is idle for too long.
     pub fn sweep(&self) {
         let now = self.clock.now();
-        self.sweep_names(&mut self.write(), now);
+        self.sweep_names(&mut self.write(), now, GRACE);
     }
 
-    fn sweep_names(&self, names: &mut Names<T>, now: Timestamp) {
+    fn sweep_names(&self, names: &mut Names<T>, now: Timestamp, grace: Duration) {
+        names.open.retain(|_, entry| !entry.over() || entry.used().idle(now) < grace.as_millis());
         // What somebody holds is in use, however long the slot in flight takes.
         let gone = |entry: &Arc<T>| Arc::strong_count(entry) == 1 && self.is_idle(entry, now);
         let gone: Vec<String> = names.open.iter().filter(|(_, entry)| gone(entry)).map(|(id, _)| id.clone()).collect();

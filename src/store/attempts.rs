@@ -154,6 +154,7 @@ impl Store {
         let to = JobState::Running;
         transition(&mut tx, Transition { job: lease.job, to, attempt: lease.attempt, reason: None, now }).await?;
         tx.commit().await?;
+        self.ring(lease.job);
         Ok(Some(lease))
     }
 
@@ -165,6 +166,7 @@ impl Store {
         let mut tx = self.write.begin().await?;
         let job = end(&mut tx, lease, ending, now).await?;
         tx.commit().await?;
+        self.ring(lease.job);
         Ok(job)
     }
 

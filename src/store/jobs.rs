@@ -156,6 +156,8 @@ pub struct Job {
     pub step: u64,
     /// `NAME:VERSION` it was published as.
     pub policy: Option<String>,
+    /// Number of its newest event.
+    pub last_event: u64,
     /// When it was submitted.
     pub created_at: Timestamp,
     /// When its first attempt began.
@@ -176,6 +178,7 @@ struct JobRow {
     failures: i64,
     step: i64,
     policy: Option<String>,
+    seq: i64,
     created_at: i64,
     started_at: Option<i64>,
     ended_at: Option<i64>,
@@ -196,6 +199,7 @@ impl TryFrom<JobRow> for Job {
             failures: row.failures as u32,
             step: row.step as u64,
             policy: row.policy,
+            last_event: row.seq as u64,
             created_at: timestamp(row.created_at)?,
             started_at: row.started_at.map(timestamp).transpose()?,
             ended_at: row.ended_at.map(timestamp).transpose()?,
@@ -265,11 +269,14 @@ pub(super) async fn transition(db: &mut SqliteConnection, t: Transition<'_>) -> 
     let now = t.now.as_millisecond();
     let ended = t.to.ended().then_some(now);
     let started = (t.to == JobState::Running).then_some(now);
-    let sql = "UPDATE jobs SET state = ?2, wanted = NULL, reason = ?3, ended_at = ?4, started_at = coalesce(started_at, ?5)
-               WHERE number = ?1";
-    sqlx::query(sql).bind(t.job).bind(t.to.as_str()).bind(t.reason).bind(ended).bind(started).execute(&mut *db).await?;
-    let sql = "INSERT INTO events (job, at, state, attempt, reason) VALUES (?, ?, ?, ?, ?)";
-    sqlx::query(sql).bind(t.job).bind(now).bind(t.to.as_str()).bind(t.attempt).bind(t.reason).execute(&mut *db).await?;
+    let state = t.to.as_str();
+    let sql = "UPDATE jobs SET state = ?2, wanted = NULL, reason = ?3, ended_at = ?4, started_at = coalesce(started_at, ?5),
+               seq = seq + 1 WHERE number = ?1 RETURNING seq";
+    let update = sqlx::query_scalar(sql).bind(t.job).bind(state).bind(t.reason).bind(ended).bind(started);
+    let seq: i64 = update.fetch_one(&mut *db).await?;
+    let sql = "INSERT INTO events (job, at, state, attempt, reason, seq) VALUES (?, ?, ?, ?, ?, ?)";
+    let insert = sqlx::query(sql).bind(t.job).bind(now).bind(state).bind(t.attempt).bind(t.reason).bind(seq);
+    insert.execute(&mut *db).await?;
     if t.to.ended() {
         sqlx::query("DELETE FROM snapshots WHERE job = ?").bind(t.job).execute(&mut *db).await?;
     }
@@ -329,6 +336,17 @@ impl Store {
         rows.into_iter().map(Job::try_from).collect()
     }
 
+    /// How many jobs there are in each state.
+    ///
+    /// # Errors
+    /// The database.
+    pub async fn job_counts(&self) -> Result<Vec<(JobState, u64)>> {
+        let sql = "SELECT state, count(*) FROM jobs GROUP BY state";
+        let rows: Vec<(String, i64)> = sqlx::query_as(sql).fetch_all(&self.read).await?;
+        let count = |name: &str| rows.iter().find(|(state, _)| state == name).map_or(0, |(_, count)| *count as u64);
+        JobState::NAMES.iter().map(|name| Ok((JobState::read(name)?, count(name)))).collect()
+    }
+
     /// The job whose turn it is: highest priority, then first come.
     ///
     /// # Errors
@@ -362,12 +380,14 @@ impl Store {
             (Verb::Delete, state, _) if state.ended() => {
                 sqlx::query("DELETE FROM jobs WHERE number = ?").bind(job.number).execute(&mut *tx).await?;
                 tx.commit().await?;
+                self.ring(job.number);
                 return Ok(Changed::Done(Box::new(job)));
             }
             _ => return Ok(Changed::Refused(Box::new(job))),
         }
         let job = known(&mut tx, id).await?;
         tx.commit().await?;
+        self.ring(job.number);
         Ok(Changed::Done(Box::new(job)))
     }
 }

@@ -49,8 +49,12 @@ impl Store {
         if !live(&mut tx, lease).await? {
             return Ok(false);
         }
-        let sql = "INSERT INTO metrics (job, name, step, value, at) VALUES (?, ?, ?, ?, ?)
-                   ON CONFLICT (job, name, step) DO UPDATE SET value = excluded.value, at = excluded.at";
+        let sql = "UPDATE jobs SET step = ?, seq = seq + 1 WHERE number = ? RETURNING seq";
+        let seq: i64 = sqlx::query_scalar(sql).bind(step as i64).bind(lease.job).fetch_one(&mut *tx).await?;
+        // What is told again as it was stays where it was told first.
+        let sql = "INSERT INTO metrics (job, name, step, value, at, seq) VALUES (?, ?, ?, ?, ?, ?)
+                   ON CONFLICT (job, name, step) DO UPDATE SET value = excluded.value, at = excluded.at, seq = excluded.seq
+                   WHERE value IS NOT excluded.value";
         for metric in metrics {
             sqlx::query(sql)
                 .bind(lease.job)
@@ -58,12 +62,12 @@ impl Store {
                 .bind(metric.step as i64)
                 .bind(metric.value.is_finite().then_some(metric.value))
                 .bind(now.as_millisecond())
+                .bind(seq)
                 .execute(&mut *tx)
                 .await?;
         }
-        let sql = "UPDATE jobs SET step = ? WHERE number = ?";
-        sqlx::query(sql).bind(step as i64).bind(lease.job).execute(&mut *tx).await?;
         tx.commit().await?;
+        self.ring(lease.job);
         Ok(true)
     }
 

@@ -2,6 +2,7 @@
 
 mod attempts;
 mod checkpoints;
+mod events;
 mod jobs;
 mod metrics;
 mod policies;
@@ -10,6 +11,7 @@ mod snapshots;
 
 pub use attempts::{Attempt, Ending, Lease, LeaseRecord, Outcome};
 pub use checkpoints::{Checkpoint, CheckpointKind, NewCheckpoint};
+pub use events::{Happened, JobEvent};
 pub use jobs::{Changed, Job, JobId, JobKind, JobSpec, JobState, NewJob, Submitted, Verb, Wanted};
 pub use metrics::{Metric, MetricCursor, MetricRow};
 pub use policies::{NewPolicyVersion, PolicyVersion, PublishedPolicy};
@@ -17,6 +19,7 @@ pub use promotions::{AliasMove, PolicyAlias, Promotion, PromotionFilter};
 pub use snapshots::{OpenSnapshot, Snapshot};
 
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
@@ -54,6 +57,7 @@ pub struct Store {
     read: SqlitePool,
     /// A single connection: writers queue here instead of meeting `SQLITE_BUSY`.
     write: SqlitePool,
+    bells: Arc<events::Bells>,
 }
 
 impl Store {
@@ -73,7 +77,7 @@ impl Store {
         let write = SqlitePoolOptions::new().max_connections(1).connect_with(options.clone()).await?;
         MIGRATIONS.run(&write).await?;
         let read = SqlitePoolOptions::new().max_connections(4).connect_with(options.read_only(true)).await?;
-        Ok(Self { read, write })
+        Ok(Self { read, write, bells: Arc::new(events::Bells::new()) })
     }
 }
 

@@ -12,7 +12,7 @@ use futures::future::BoxFuture;
 use qedgix::config::Config;
 use qedgix::jobs::{Executor, Exit, Jobs, Launch, Settings};
 use qedgix::server::{self, DataDir, Listeners};
-use qedgix::service::{App, Draining};
+use qedgix::service::{App, Draining, Watchers};
 use qedgix::serving::{Clock, Engine, EngineConfig, Environments, EnvironmentsConfig, Limits, Sessions};
 use qedgix::store::Store;
 use qedgix::wire::v1::job_service_client::JobServiceClient;
@@ -26,6 +26,9 @@ use tonic::transport::Channel;
 
 /// Longest that anything in these tests may take; only a failure ever waits for it.
 pub const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Streams of events that a server of these tests allows.
+pub const WATCHERS: usize = 4;
 
 /// A worker that the scheduler has started, played by the test.
 pub struct Worker {
@@ -142,7 +145,8 @@ impl Server {
         executor: Option<Arc<dyn Executor>>,
     ) -> Self {
         let free = SocketAddr::from(([127, 0, 0, 1], 0));
-        let config = Config { grpc_addr: free, http_addr: free, ..Config::new(data_dir) };
+        let (max_watchers, heartbeat) = (WATCHERS, Duration::from_millis(20));
+        let config = Config { grpc_addr: free, http_addr: free, max_watchers, heartbeat, ..Config::new(data_dir) };
         let data = DataDir::take(data_dir).unwrap();
         let listeners = Listeners::bind(&config).await.unwrap();
         let endpoints = listeners.endpoints().unwrap();
@@ -160,6 +164,7 @@ impl Server {
             sessions: Sessions::new(limits, clock.clone()),
             environments: Environments::new(EnvironmentsConfig { limits, memory: 1 << 20 }, clock.clone()),
             engine: Engine::start(EngineConfig { threads: 1, queue: 1, max_batch: 1, max_batch_delay: Duration::ZERO }).unwrap(),
+            watchers: Watchers::new(config.max_watchers, config.heartbeat),
             clock,
             draining: Draining::default(),
         });

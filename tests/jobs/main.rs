@@ -1,5 +1,6 @@
 //! Jobs from outside: submission over both transports, scheduling, the protocol of workers.
 
+mod events;
 mod harness;
 mod processes;
 mod protocol;

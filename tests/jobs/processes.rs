@@ -19,13 +19,13 @@ use super::harness::{Rest, Server, tiny, within};
 const POLL: Duration = Duration::from_millis(5);
 
 /// A `qedgix serve` on free ports; killed when dropped.
-struct Process {
+pub struct Process {
     child: Child,
-    rest: Rest,
+    pub rest: Rest,
 }
 
 impl Process {
-    async fn start(data_dir: &Path) -> Self {
+    pub async fn start(data_dir: &Path) -> Self {
         let endpoints = data_dir.join("endpoints.json");
         // What a killed server has left.
         let _ = std::fs::remove_file(&endpoints);
@@ -49,7 +49,7 @@ impl Process {
         Self { child, rest: Rest::new(format!("http://{}", endpoints["http"].as_str().unwrap())) }
     }
 
-    fn kill(&mut self) {
+    pub fn kill(&mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
     }

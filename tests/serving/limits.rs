@@ -11,7 +11,7 @@ use super::harness::*;
 
 /// Sends and receives messages as they are.
 #[derive(Default)]
-struct Raw;
+pub struct Raw;
 
 impl Codec for Raw {
     type Encode = Bytes;

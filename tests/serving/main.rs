@@ -3,15 +3,21 @@
 
 mod act;
 mod batch;
+mod binary;
 mod conversion;
 mod environments;
 mod harness;
+mod health;
+mod interleavings;
 mod large;
 mod limits;
 mod load;
+mod oip;
 mod openapi;
+mod operations;
 mod policies;
 mod promotion;
 mod published;
 mod rest;
 mod server;
+mod soak;

@@ -229,8 +229,8 @@ async fn probes_metrics_and_policies() {
     let text = rest.get("/metrics").await.1;
     let text = text.as_str().unwrap();
     for line in [
-        "qedgix_requests_total{transport=\"http\",method=\"POST /v1/act\",code=\"400\"}",
-        "qedgix_request_seconds_bucket",
+        "http_requests_total{method=\"POST\",route=\"/v1/act\",status=\"400\"}",
+        "http_request_duration_seconds_bucket",
         "qedgix_policy_versions",
     ] {
         assert!(text.contains(line), "{line} in {text}");

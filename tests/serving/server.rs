@@ -58,7 +58,7 @@ async fn new_work_is_refused_while_draining() {
 async fn health_tells_of_every_service() {
     let server = Server::start().await;
     let mut health = HealthClient::new(server.channel().await);
-    for service in ["", "qedgix.v1.PolicyService", "qedgix.v1.EnvironmentService"] {
+    for service in ["", "qedgix.v1.PolicyService", "qedgix.v1.EnvironmentService", "inference.GRPCInferenceService"] {
         let answer = health.check(HealthCheckRequest { service: service.into() }).await.unwrap().into_inner();
         assert_eq!(answer.status(), ServingStatus::Serving, "{service}");
     }
@@ -75,7 +75,9 @@ async fn reflection_in_both_versions() {
     let stream = client.server_reflection_info(tokio_stream::once(request)).await.unwrap();
     let answer = stream.into_inner().message().await.unwrap().unwrap().message_response.unwrap();
     let MessageResponse::ListServicesResponse(list) = answer else { panic!("not a list: {answer:?}") };
-    assert!(list.service.iter().any(|s| s.name == "qedgix.v1.PolicyService"), "{list:?}");
+    for name in ["qedgix.v1.PolicyService", "inference.GRPCInferenceService"] {
+        assert!(list.service.iter().any(|s| s.name == name), "{list:?}");
+    }
 
     let ask = v1alpha::server_reflection_request::MessageRequest::FileContainingSymbol("qedgix.v1.ActRequest".into());
     let request = v1alpha::ServerReflectionRequest { host: String::new(), message_request: Some(ask) };

@@ -8,7 +8,7 @@ use std::collections::HashMap;
 use super::fleet::{check_counts, check_nodes, distinct, index, request_order};
 use super::{Ids, aoi, finite, point};
 use crate::invalid::Invalid;
-use crate::serving::{Fleet, Graph, Observation, Seen, Sighting};
+use crate::serving::{Fleet, Graph, GraphForm, Observation, Seen, Sighting};
 use crate::wire::v1;
 
 /// Two reports of one pair may differ by this much: callers may compute in f32.
@@ -40,7 +40,7 @@ impl TryFrom<v1::Graph> for Observation {
         for (node, &place) in uav_places.iter().chain(&user_places).enumerate() {
             builder.node(node, place as usize, std::mem::take(&mut nodes[place as usize]), &by_id)?;
         }
-        let graph = builder.finish()?;
+        let graph = mirror(builder.graph)?;
         Ok(Self { uav_order: request_order(&uav_places), seen: Seen::Graph(graph), fleet: Fleet { uavs, users } })
     }
 }
@@ -59,6 +59,7 @@ impl Builder {
             detections: Vec::with_capacity(uavs + users),
             left_out: vec![false; users],
             places: Vec::with_capacity(uavs + users),
+            form: GraphForm::Nodes,
         };
         Self { graph, told: vec![false; users] }
     }
@@ -125,35 +126,33 @@ impl Builder {
         self.told[user] = true;
         Ok(())
     }
+}
 
-    /// Mirrors what one side reports, and compares what both do.
-    fn finish(mut self) -> Result<Graph, Invalid> {
-        let graph = &mut self.graph;
-        let mut mirrored = Vec::new();
-        for (node, list) in graph.detections.iter().enumerate() {
-            for sighting in list {
-                let back = [-sighting.rel[0], -sighting.rel[1]];
-                let other = &graph.detections[sighting.target as usize];
-                let Ok(at) = other.binary_search_by_key(&(node as u32), |s| s.target) else {
-                    let back = Sighting { target: node as u32, rel: back, place: 0, mirrored: true };
-                    mirrored.push((sighting.target as usize, back));
-                    continue;
-                };
-                let [x, y] = other[at].rel;
-                if (x - back[0]).abs() > AGREEMENT || (y - back[1]).abs() > AGREEMENT {
-                    let place = graph.places[sighting.target as usize];
-                    let field = format!("graph.nodes[{place}].detections[{}].rel", other[at].place);
-                    let expected = format!("about ({}, {}), the negation of what its target reports", back[0], back[1]);
-                    return Err(Invalid::new(field, format!("({x}, {y})"), expected));
-                }
+/// Mirrors what one side reports, and compares what both do. Lists come in ascending order of target.
+pub(super) fn mirror(mut graph: Graph) -> Result<Graph, Invalid> {
+    let mut mirrored = Vec::new();
+    for (node, list) in graph.detections.iter().enumerate() {
+        for sighting in list {
+            let back = [-sighting.rel[0], -sighting.rel[1]];
+            let other = &graph.detections[sighting.target as usize];
+            let Ok(at) = other.binary_search_by_key(&(node as u32), |s| s.target) else {
+                let back = Sighting { target: node as u32, rel: back, place: 0, mirrored: true };
+                mirrored.push((sighting.target as usize, back));
+                continue;
+            };
+            let [x, y] = other[at].rel;
+            if (x - back[0]).abs() > AGREEMENT || (y - back[1]).abs() > AGREEMENT {
+                let field = graph.rel_field(sighting.target as usize, other[at].place);
+                let expected = format!("about ({}, {}), the negation of what its target reports", back[0], back[1]);
+                return Err(Invalid::new(field, format!("({x}, {y})"), expected));
             }
         }
-        for (node, sighting) in mirrored {
-            graph.detections[node].push(sighting);
-        }
-        for list in &mut graph.detections {
-            list.sort_by_key(|s| s.target);
-        }
-        Ok(self.graph)
     }
+    for (node, sighting) in mirrored {
+        graph.detections[node].push(sighting);
+    }
+    for list in &mut graph.detections {
+        list.sort_by_key(|s| s.target);
+    }
+    Ok(graph)
 }

@@ -142,6 +142,7 @@ pub struct JobView<'a> {
     /// NAME:VERSION of the policy it was published as.
     #[schema(required = true)]
     policy: &'a Option<String>,
+    last_event_id: u64,
     created_at: Timestamp,
     #[schema(required = true)]
     started_at: Option<Timestamp>,
@@ -169,6 +170,7 @@ impl<'a> From<&'a Job> for JobView<'a> {
             attempts: job.attempts,
             failures: job.failures,
             policy: &job.policy,
+            last_event_id: job.last_event,
             created_at: job.created_at,
             started_at: job.started_at,
             ended_at: job.ended_at,
@@ -308,6 +310,7 @@ impl From<Job> for v1::Job {
             created_at: Some(timestamp(job.created_at)),
             started_at: job.started_at.map(timestamp),
             ended_at: job.ended_at.map(timestamp),
+            last_event_id: job.last_event,
         }
     }
 }

@@ -2,6 +2,7 @@
 //! depend on the policy is found here, with the path of the field.
 
 pub mod environments;
+pub mod events;
 mod fleet;
 mod graph;
 pub mod jobs;
@@ -9,6 +10,7 @@ pub mod request;
 pub mod response;
 mod scene;
 pub mod structs;
+pub mod tensors;
 
 use fleet::Ids;
 

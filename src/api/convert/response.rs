@@ -15,6 +15,11 @@ const DEGREES: f64 = 45.0;
 /// Headings of the compass; the ninth action hovers.
 const COMPASS: u8 = 8;
 
+/// The direction of a heading, in degrees counter-clockwise from +x; none when hovering.
+pub fn degrees(heading: u8) -> Option<f64> {
+    (heading < COMPASS).then(|| DEGREES * f64::from(heading))
+}
+
 /// The answer, with Q-values if `values` were asked for and the policy has them.
 pub fn act_response(answer: act::Answer, values: bool) -> v1::ActResponse {
     let act::Answer { policy, uavs, order, step, headings, q_values, state, timings } = answer;
@@ -29,7 +34,7 @@ pub fn act_response(answer: act::Answer, values: bool) -> v1::ActResponse {
             v1::Action {
                 uav_id: std::mem::take(&mut ids[uav]),
                 heading_index: u32::from(heading),
-                heading_deg: (heading < COMPASS).then(|| DEGREES * f64::from(heading)),
+                heading_deg: degrees(heading),
                 q_values: if values && q.iter().all(|q| q.is_finite()) { q.to_vec() } else { Vec::new() },
             }
         })

@@ -14,7 +14,7 @@ const TICK: Duration = Duration::from_millis(1);
 pub(super) struct Deadline(pub(super) Instant);
 
 /// Notes the deadline of a request; to be called as soon as its head is there.
-pub fn stamp<B>(mut request: Request<B>) -> Request<B> {
+pub(super) fn stamp<B>(mut request: Request<B>) -> Request<B> {
     let timeout = request.headers().get("grpc-timeout").and_then(|value| timeout(value.to_str().ok()?));
     if let Some(timeout) = timeout {
         request.extensions_mut().insert(Deadline(Instant::now() + timeout.saturating_sub(TICK)));

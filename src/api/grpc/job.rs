@@ -2,11 +2,13 @@
 
 use std::sync::Arc;
 
+use futures::stream::{BoxStream, StreamExt, TryStreamExt};
 use tonic::{Request, Response, Status};
 
 use crate::api::convert::jobs::state_filter;
 use crate::api::convert::structs::from_struct;
-use crate::service::{App, Error, jobs};
+use crate::api::errors::in_stream;
+use crate::service::{App, Error, events, jobs};
 use crate::store::Verb;
 use crate::wire::v1;
 use crate::wire::v1::job_service_server::{JobService, JobServiceServer};
@@ -70,5 +72,13 @@ impl JobService for Service {
         let page = jobs::metrics(&self.0, &id, given(&name), page_size, given(&page_token)).await?;
         let rows = page.items.into_iter().map(Into::into).collect();
         Ok(Response::new(v1::GetJobMetricsResponse { rows, next_page_token: page.next.unwrap_or_default() }))
+    }
+
+    type WatchJobStream = BoxStream<'static, Result<v1::JobEvent, Status>>;
+
+    async fn watch_job(&self, request: Request<v1::WatchJobRequest>) -> Answer<Self::WatchJobStream> {
+        let v1::WatchJobRequest { id, after } = request.into_inner();
+        let events = events::watch(&self.0, &id, after).await?.events();
+        Ok(Response::new(events.map_ok(Into::into).map_err(in_stream).boxed()))
     }
 }

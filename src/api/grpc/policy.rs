@@ -7,7 +7,7 @@ use futures::future::join_all;
 use futures::stream::{BoxStream, StreamExt};
 use tonic::{Request, Response, Status, Streaming};
 
-use super::deadline;
+use super::{deadline, stream};
 use crate::api::convert::{request::open_session, response::act_response};
 use crate::api::errors::act_error;
 use crate::invalid::in_range;
@@ -77,16 +77,10 @@ impl PolicyService for Handlers {
     async fn act_stream(&self, request: Request<Streaming<v1::ActRequest>>) -> Result<Response<Self::ActStreamStream>, Status> {
         let deadline = deadline(request.extensions());
         let app = self.0.clone();
-        let draining = app.clone();
-        // What was asked before the server drains is answered; then the stream ends, so that it does not hold up the end.
-        let requests = request.into_inner().take_until(async move { draining.draining.wait().await });
+        let requests = stream::requests(app.clone(), request.into_inner());
         let answers = requests.map(move |request| {
             let app = app.clone();
-            async move {
-                // A message that does not decode, or a caller that left: the stream is over.
-                let request = request?;
-                Ok(act_result(answer(&app, request, deadline).await))
-            }
+            async move { Ok(act_result(answer(&app, request?, deadline).await)) }
         });
         Ok(Response::new(answers.buffered(IN_FLIGHT).boxed()))
     }

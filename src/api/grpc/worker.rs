@@ -7,6 +7,7 @@ use futures::Stream;
 use tonic::metadata::MetadataMap;
 use tonic::{Request, Response, Status, Streaming};
 
+use crate::api::errors::in_stream;
 use crate::invalid::Invalid;
 use crate::service::worker::{self, Announced, CheckpointUpload, Credentials, SnapshotUpload};
 use crate::service::{App, Error};
@@ -62,7 +63,7 @@ impl WorkerService for Service {
         let chunks = futures::stream::try_unfold(0, move |number| {
             let (app, snapshot) = (Arc::clone(&app), snapshot.clone());
             async move {
-                let chunk = worker::snapshot_chunk(&app, &snapshot, number).await?;
+                let chunk = worker::snapshot_chunk(&app, &snapshot, number).await.map_err(in_stream)?;
                 Ok(chunk.map(|data| (v1::Chunk { data: data.into() }, number + 1)))
             }
         });

@@ -34,9 +34,26 @@ impl<S: Sync, T: DeserializeOwned> FromRequest<S> for Json<T> {
             Some(kind) if kind == "application/json" => {}
             kind => return Err(unsupported(kind, "application/json")),
         }
-        let MaxBody(limit) = request.extensions().get().copied().unwrap_or(MaxBody(4 << 20));
+        let limit = limit(&request);
         parse(&read(request, limit).await?).map(Self)
     }
+}
+
+/// A body as it comes, whatever it says it is.
+#[derive(Debug)]
+pub struct Raw(pub Bytes);
+
+impl<S: Sync> FromRequest<S> for Raw {
+    type Rejection = Error;
+
+    async fn from_request(request: Request, _: &S) -> Result<Self, Error> {
+        let limit = limit(&request);
+        read(request, limit).await.map(Self)
+    }
+}
+
+fn limit(request: &Request) -> usize {
+    request.extensions().get().map_or(4 << 20, |&MaxBody(limit)| limit)
 }
 
 /// What a body says it is, in lower case and without parameters.

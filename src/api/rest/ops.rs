@@ -6,7 +6,6 @@ use axum::extract::State;
 use axum::http::header;
 use axum::response::{Html, IntoResponse, Response};
 use axum::{Extension, Json};
-use metrics_exporter_prometheus::PrometheusHandle;
 use serde::Serialize;
 use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
@@ -15,7 +14,7 @@ use utoipa_axum::routes;
 use super::extract::Path;
 use super::openapi::{BadRequest, Description, Draining, Fault, NotFound};
 use super::schemas;
-use crate::service::{App, Error};
+use crate::service::{App, Error, operations};
 
 /// The routes.
 pub(super) fn router() -> OpenApiRouter<Arc<App>> {
@@ -84,11 +83,24 @@ async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Error> {
     tag = "operations",
     responses((status = 200, description = "Text, version 0.0.4.", body = String, content_type = "text/plain"))
 )]
-async fn metrics(State(app): State<Arc<App>>, Extension(handle): Extension<PrometheusHandle>) -> impl IntoResponse {
-    metrics::gauge!("qedgix_sessions").set(app.sessions.len() as f64);
-    metrics::gauge!("qedgix_environments").set(app.environments.table().len() as f64);
-    metrics::gauge!("qedgix_policy_versions").set(app.registry.len() as f64);
-    ([(header::CONTENT_TYPE, "text/plain; version=0.0.4")], handle.render())
+async fn metrics(State(app): State<Arc<App>>, Extension(render): Extension<fn() -> String>) -> impl IntoResponse {
+    // What is there is counted when it is asked for.
+    let figures = operations::figures(&app).await;
+    for (name, value) in [
+        ("qedgix_sessions", figures.sessions),
+        ("qedgix_environments", figures.environments),
+        ("qedgix_policy_versions", figures.policy_versions),
+        ("qedgix_engine_queue_depth", figures.engine_queue),
+        ("qedgix_training_threads_busy", figures.threads_busy),
+        ("qedgix_training_threads", figures.threads),
+        ("qedgix_job_watchers", figures.watchers),
+    ] {
+        metrics::gauge!(name).set(value as f64);
+    }
+    for (state, jobs) in figures.jobs {
+        metrics::gauge!("qedgix_jobs", "state" => state.as_str()).set(jobs as f64);
+    }
+    ([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], render())
 }
 
 /// This document

@@ -63,6 +63,21 @@ impl Sessions {
         Ok(session.info(self.ttl()))
     }
 
+    /// Begins session `id` pinned to `policy`, whether or not there is one of that name. Slots of the former one that are in
+    /// flight are answered.
+    ///
+    /// # Errors
+    /// There are too many sessions.
+    pub fn begin(&self, id: &str, policy: Arc<LoadedPolicy>, seed: Option<u64>) -> Result<Arc<Session>, Error> {
+        let how = Opened { seed, ..Opened::default() };
+        self.replace(id, || Session::new(id.to_owned(), policy, &how, self.clock().clone()))
+    }
+
+    /// Forgets a session that [`Sessions::begin`] began, unless another one was begun since.
+    pub fn discard(&self, session: &Arc<Session>) {
+        self.remove(session);
+    }
+
     /// What a caller is told of session `id`; asking keeps it alive.
     ///
     /// # Errors

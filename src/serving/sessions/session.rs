@@ -4,7 +4,7 @@
 use std::collections::VecDeque;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
 use jiff::Timestamp;
@@ -12,7 +12,7 @@ use tokio::sync::{Mutex, MutexGuard};
 
 use super::{Opened, SessionInfo};
 use crate::serving::table::{Entry, LastUse};
-use crate::serving::{Clock, Error, Fleet, LoadedPolicy, Outcome, Timings};
+use crate::serving::{Clock, Error, Fleet, LoadedPolicy, Outcome, Room, Timings};
 
 /// Former runs that a session remembers, to refuse them.
 const FORMER_RUNS: usize = 64;
@@ -27,12 +27,16 @@ pub struct Session {
     used: LastUse,
     /// Copy of `State::steps`, readable while a slot is in flight.
     steps: AtomicU64,
+    /// Copy of `State::finished`.
+    over: AtomicBool,
     state: Mutex<State>,
 }
 
 #[derive(Debug)]
 struct State {
     ended: bool,
+    /// Only the last step may be repeated.
+    finished: bool,
     run_id: Option<String>,
     /// Hashes of former runs, newest last.
     former: VecDeque<u64>,
@@ -43,6 +47,9 @@ struct State {
     fleet: Option<Fleet>,
     memory: Vec<f32>,
     last: Option<Answered>,
+    /// Room of slots before the last.
+    used_memory: Vec<f32>,
+    used: Room,
 }
 
 /// What a slot was answered with; headings and values in canonical order of UAVs.
@@ -79,6 +86,8 @@ pub struct NextTurn<'a> {
     pub step: u64,
     /// A copy of the memory before it.
     pub memory: Vec<f32>,
+    /// Room for the answer.
+    pub room: Room,
 }
 
 impl Session {
@@ -86,6 +95,7 @@ impl Session {
         let opened_at = clock.now();
         let state = State {
             ended: false,
+            finished: false,
             run_id: how.run_id.clone(),
             former: VecDeque::new(),
             seed: how.seed,
@@ -93,9 +103,12 @@ impl Session {
             fleet: None,
             memory: Vec::new(),
             last: None,
+            used_memory: Vec::new(),
+            used: Room::default(),
         };
         let used = LastUse::at(opened_at);
-        Self { id, policy, opened_at, clock, used, steps: AtomicU64::new(0), state: Mutex::new(state) }
+        let (steps, over) = (AtomicU64::new(0), AtomicBool::new(false));
+        Self { id, policy, opened_at, clock, used, steps, over, state: Mutex::new(state) }
     }
 
     /// The policy version it is pinned to.
@@ -111,8 +124,13 @@ impl Session {
     /// A step that is neither the last nor the next, a former run, other ids than in the run's first slot, or the session
     /// has ended.
     pub async fn turn<'a>(&'a self, fleet: &Fleet, step: Option<u64>, run_id: Option<&str>) -> Result<Turn<'a>, Error> {
-        let state = self.state.lock().await;
-        if state.ended {
+        let mut state = self.state.lock().await;
+        let missed = state.last.as_ref().filter(|last| state.finished && step == Some(last.step));
+        if let (Some(last), Some(known)) = (missed, &state.fleet) {
+            known.check_same(fleet)?;
+            return Ok(Turn::Repeat(last.clone()));
+        }
+        if state.ended || state.finished {
             return Err(Error::unknown(Self::WHAT, &self.id));
         }
         let new_run = state.judge_run(&self.id, run_id)?;
@@ -131,17 +149,19 @@ impl Session {
             return Err(wrong_step(&self.id, steps, step, new_run.is_some()));
         }
         let first = new_run.is_some() || state.fleet.is_none();
-        let memory = if first {
+        let mut memory = std::mem::take(&mut state.used_memory);
+        memory.clear();
+        if first {
             let run = new_run.as_deref().or(state.run_id.as_deref());
             let seed = state.seed.unwrap_or_else(|| hash(&(&self.id, run)));
             let (uavs, users) = (fleet.uavs.len(), fleet.users.len());
-            let mut memory = vec![0.0; self.policy.policy.memory_len(uavs, users)];
+            memory.resize(self.policy.policy.memory_len(uavs, users), 0.0);
             self.policy.policy.start(uavs, users, seed, &mut memory);
-            memory
         } else {
-            state.memory.clone()
-        };
-        Ok(Turn::Next(NextTurn { session: self, state, new_run, fleet: first.then(|| fleet.clone()), step, memory }))
+            memory.extend_from_slice(&state.memory);
+        }
+        let room = std::mem::take(&mut state.used);
+        Ok(Turn::Next(NextTurn { session: self, state, new_run, fleet: first.then(|| fleet.clone()), step, memory, room }))
     }
 
     /// What `OpenSession` with the name of this session does.
@@ -175,6 +195,12 @@ impl Session {
         self.state.lock().await.ended = true;
     }
 
+    /// No slot follows; the last one may be asked for again for a moment, by its step.
+    pub async fn finish(&self) {
+        self.state.lock().await.finished = true;
+        self.over.store(true, Ordering::Relaxed);
+    }
+
     /// What a caller is told of it.
     pub fn info(&self, ttl: Duration) -> SessionInfo {
         SessionInfo {
@@ -197,6 +223,10 @@ impl Entry for Session {
 
     fn used(&self) -> &LastUse {
         &self.used
+    }
+
+    fn over(&self) -> bool {
+        self.over.load(Ordering::Relaxed)
     }
 }
 
@@ -239,9 +269,11 @@ impl NextTurn<'_> {
         if let Some(fleet) = self.fleet.take() {
             state.fleet = Some(fleet);
         }
-        state.memory = outcome.memory;
+        state.used_memory = std::mem::replace(&mut state.memory, outcome.memory);
         state.steps = self.step + 1;
-        state.last = Some(answered.clone());
+        if let Some(Answered { headings, q_values, .. }) = state.last.replace(answered.clone()) {
+            state.used = Room { headings, q_values };
+        }
         self.session.steps.store(state.steps, Ordering::Relaxed);
         self.session.used.touch(self.session.clock.now());
         answered

@@ -1,0 +1,216 @@
+//! Tensors to [`Observation`]: a scene, or a graph as a list of edges.
+//!
+//! Nodes are numbered in the order of the request, UAVs from 0 and users after them.
+
+use super::{Datatype, Tensor};
+use crate::api::convert::fleet::{Ids, check_counts, distinct, request_order};
+use crate::api::convert::{aoi, finite, graph::mirror, point};
+use crate::env::Point;
+use crate::invalid::Invalid;
+use crate::serving::{Fleet, Graph, GraphForm, MAX_DETECTIONS, MAX_NODES, Observation, Seen, Sighting};
+
+/// Inputs of which observations are made: name, datatype in which they are described, and what each dimension counts.
+pub const INPUTS: [(&str, Datatype, &[Dimension]); 8] = [
+    ("uav_positions", Datatype::Fp32, &[Dimension::Uavs, Dimension::Two]),
+    ("user_positions", Datatype::Fp32, &[Dimension::Users, Dimension::Two]),
+    ("user_aoi", Datatype::Fp32, &[Dimension::Users]),
+    ("edge_index", Datatype::Int64, &[Dimension::Edges, Dimension::Two]),
+    ("edge_relative", Datatype::Fp32, &[Dimension::Edges, Dimension::Two]),
+    ("uav_count", Datatype::Int64, &[Dimension::One]),
+    ("uav_ids", Datatype::Bytes, &[Dimension::Uavs]),
+    ("user_ids", Datatype::Bytes, &[Dimension::Users]),
+];
+
+/// What a dimension of an input counts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Dimension {
+    /// One value.
+    One,
+    /// x and y, or from and to.
+    Two,
+    /// M.
+    Uavs,
+    /// N.
+    Users,
+    /// E.
+    Edges,
+}
+
+/// About how much work the tensors are: elements, as far as their shapes tell.
+pub fn weight(tensors: &[Tensor]) -> usize {
+    let of = |tensor: &Tensor| {
+        let sizes = tensor.shape.iter().map(|&size| usize::try_from(size).unwrap_or(0));
+        sizes.fold(1_usize, usize::saturating_mul)
+    };
+    tensors.iter().map(of).fold(0, usize::saturating_add)
+}
+
+/// Takes the observation out of `tensors`, in which no name occurs twice; what belongs to none stays.
+///
+/// # Errors
+/// A tensor that is missing, too many, of a wrong datatype or shape, or with a value that cannot be used.
+pub fn observation(tensors: &mut Vec<Tensor>) -> Result<Observation, Invalid> {
+    let mut take = |name: &str| {
+        let at = tensors.iter().position(|tensor| tensor.name == name)?;
+        Some(tensors.swap_remove(at))
+    };
+    let [uav_positions, user_positions, user_aoi, edge_index, edge_relative, uav_count, uav_ids, user_ids] =
+        INPUTS.map(|(name, ..)| take(name));
+    let missing = |name: &str, expected: &str| Invalid::new(name, "nothing", expected);
+    let user_aoi = user_aoi.ok_or_else(|| missing("user_aoi", "the AoI of each user in slots, [N]"))?;
+    let users = user_aoi.rows("[N]", &[], MAX_NODES)?;
+    let uavs = count_uavs(uav_positions.as_ref(), uav_count.as_ref(), uav_ids.as_ref())?;
+    check_counts("uavs and users", uavs, users)?;
+    let ages = user_aoi.numbers(users)?.into_iter().enumerate();
+    let ages = ages.map(|(j, value)| aoi(|| format!("user_aoi[{j}]"), value)).collect::<Result<Vec<f32>, _>>()?;
+    let own = uav_positions.map(|tensor| points(&tensor, "[M, 2]", uavs)).transpose()?;
+    let nodes = Nodes::new(uavs, users, uav_ids.as_ref(), user_ids.as_ref())?;
+    let seen = match (user_positions, edge_index, edge_relative) {
+        (Some(tensor), None, None) => {
+            let own = own.ok_or_else(|| missing("uav_positions", "the position of each UAV, [M, 2]"))?;
+            let all = points(&tensor, "[N, 2]", users)?;
+            let uavs = nodes.uavs.iter().map(|&place| own[place as usize]).collect();
+            Seen::Scene { uavs, users: nodes.of_users(&all), aoi: nodes.of_users(&ages) }
+        }
+        (None, Some(index), Some(relative)) => Seen::Graph(graph(&nodes, own.as_deref(), &ages, &index, &relative)?),
+        (None, None, None) => {
+            let expected = "the position of each user, [N, 2], or edge_index and edge_relative";
+            return Err(missing("user_positions", expected));
+        }
+        (None, None, Some(_)) => return Err(missing("edge_index", "the nodes of each edge, [E, 2]")),
+        (None, Some(_), None) => return Err(missing("edge_relative", "the relative coordinates of each edge, [E, 2]")),
+        (Some(_), ..) => {
+            let expected = "nothing beside edges: a request is a scene or a graph";
+            return Err(Invalid::new("user_positions", "a tensor", expected));
+        }
+    };
+    Ok(Observation { uav_order: request_order(&nodes.uavs), seen, fleet: nodes.fleet })
+}
+
+/// M, as everything says that tells it.
+fn count_uavs(positions: Option<&Tensor>, count: Option<&Tensor>, ids: Option<&Tensor>) -> Result<usize, Invalid> {
+    let told = |tensor: &Tensor| -> Result<usize, Invalid> {
+        tensor.rows("[1]", &[], 1)?;
+        let value = tensor.integers(1)?[0];
+        let fits = usize::try_from(value).ok().filter(|value| (1..=MAX_NODES).contains(value));
+        fits.ok_or_else(|| Invalid::new("uav_count", value, format!("a number from 1 to {MAX_NODES}")))
+    };
+    let told = [
+        positions.map(|tensor| Ok(("uav_positions", tensor.rows("[M, 2]", &[2], MAX_NODES)?))).transpose()?,
+        count.map(|tensor| Ok(("uav_count", told(tensor)?))).transpose()?,
+        ids.map(|tensor| Ok(("uav_ids", tensor.rows("[M]", &[], MAX_NODES)?))).transpose()?,
+    ];
+    let mut told = told.into_iter().flatten();
+    let Some((first, uavs)) = told.next() else {
+        return Err(Invalid::new("uav_positions", "nothing", "the position of each UAV, [M, 2], or uav_count or uav_ids"));
+    };
+    match told.find(|&(_, other)| other != uavs) {
+        Some((name, other)) => Err(Invalid::new(name, format!("{other} UAVs"), format!("{uavs}, as {first} says"))),
+        None => Ok(uavs),
+    }
+}
+
+fn points(tensor: &Tensor, expected: &str, count: usize) -> Result<Vec<Point>, Invalid> {
+    if tensor.rows(expected, &[2], MAX_NODES)? != count {
+        return Err(tensor.wrong_shape(&format!("[{count}, 2]")));
+    }
+    let values = tensor.numbers(2 * count)?;
+    let pairs = values.chunks_exact(2).enumerate();
+    pairs.map(|(i, pair)| point(|| format!("{}[{i}]", tensor.name), pair[0], pair[1])).collect()
+}
+
+/// The fleet, and where its nodes are in the request.
+struct Nodes {
+    fleet: Fleet,
+    /// Place of each UAV among the request's UAVs, in canonical order.
+    uavs: Vec<u32>,
+    /// The same of users.
+    users: Vec<u32>,
+}
+
+impl Nodes {
+    fn new(uavs: usize, users: usize, uav_ids: Option<&Tensor>, user_ids: Option<&Tensor>) -> Result<Self, Invalid> {
+        let (uav_ids, uavs) = ids(uav_ids, uavs, "[M]", "uav")?;
+        let (user_ids, users) = ids(user_ids, users, "[N]", "user")?;
+        distinct((&uav_ids, &uavs), (&user_ids, &users), |is_uav, place| {
+            format!("{}[{place}]", if is_uav { "uav_ids" } else { "user_ids" })
+        })?;
+        Ok(Self { fleet: Fleet { uavs: uav_ids, users: user_ids }, uavs, users })
+    }
+
+    /// Brings what is told of users into canonical order.
+    fn of_users<T: Copy>(&self, all: &[T]) -> Vec<T> {
+        self.users.iter().map(|&place| all[place as usize]).collect()
+    }
+
+    /// Canonical index of each node of the request.
+    fn canonical(&self) -> Vec<u32> {
+        let uavs = self.uavs.len() as u32;
+        let users = request_order(&self.users).into_iter().map(|user| uavs + user);
+        request_order(&self.uavs).into_iter().chain(users).collect()
+    }
+}
+
+/// Ids in canonical order with their places; `KIND-0`, `KIND-1`, ... where none are given, which are in order.
+fn ids(tensor: Option<&Tensor>, count: usize, expected: &str, kind: &str) -> Result<(Vec<String>, Vec<u32>), Invalid> {
+    let Some(tensor) = tensor else {
+        return Ok((0..count as u32).map(|i| (format!("{kind}-{i}"), i)).unzip());
+    };
+    if tensor.rows(expected, &[], MAX_NODES)? != count {
+        return Err(tensor.wrong_shape(&format!("[{count}]")));
+    }
+    let mut ids = Ids::with_capacity(count);
+    for (place, bytes) in tensor.byte_strings(count)?.into_iter().enumerate() {
+        let field = || format!("{}[{place}]", tensor.name);
+        let shown = || format!("{:?}", String::from_utf8_lossy(&bytes));
+        let id = std::str::from_utf8(&bytes).map_err(|_| Invalid::new(field(), shown(), "text in UTF-8"))?;
+        ids.push(field, id.to_owned(), place)?;
+    }
+    Ok(ids.sorted())
+}
+
+fn graph(nodes: &Nodes, own: Option<&[Point]>, ages: &[f32], index: &Tensor, relative: &Tensor) -> Result<Graph, Invalid> {
+    let (uavs, users) = (nodes.uavs.len(), nodes.users.len());
+    let edges = index.rows("[E, 2]", &[2], MAX_DETECTIONS)?;
+    if relative.rows("[E, 2]", &[2], MAX_DETECTIONS)? != edges {
+        return Err(relative.wrong_shape(&format!("[{edges}, 2], as edge_index")));
+    }
+    let ends = index.integers(2 * edges)?;
+    let relative = relative.numbers(2 * edges)?;
+    let canonical = nodes.canonical();
+    let node = |e: usize, value: i64| {
+        let known = usize::try_from(value).ok().and_then(|node| canonical.get(node)).copied();
+        let expected = || format!("nodes from 0 to {}: {uavs} UAVs, then {users} users", uavs + users - 1);
+        known.ok_or_else(|| Invalid::new(format!("edge_index[{e}]"), value, expected()))
+    };
+    let mut detections = vec![Vec::new(); uavs + users];
+    for (e, (ends, rel)) in ends.chunks_exact(2).zip(relative.chunks_exact(2)).enumerate() {
+        let (from, target) = (node(e, ends[0])?, node(e, ends[1])?);
+        if from == target {
+            return Err(Invalid::new(format!("edge_index[{e}]"), format!("{ends:?}"), "two different nodes"));
+        }
+        let part = |axis: usize| finite(|| format!("edge_relative[{e}][{axis}]"), rel[axis]);
+        let sighting = Sighting { target, rel: [part(0)?, part(1)?], place: e as u32, mirrored: false };
+        detections[from as usize].push(sighting);
+    }
+    for list in &mut detections {
+        list.sort_by_key(|sighting| sighting.target);
+        if let Some(pair) = list.windows(2).find(|pair| pair[0].target == pair[1].target) {
+            let (first, again) = (pair[0].place, pair[1].place as usize);
+            let ends = format!("{:?}", &ends[2 * again..2 * again + 2]);
+            return Err(Invalid::new(format!("edge_index[{again}]"), ends, format!("another edge than edge {first}")));
+        }
+    }
+    mirror(Graph {
+        positions: match own {
+            Some(own) => nodes.uavs.iter().map(|&place| Some(own[place as usize])).collect(),
+            None => vec![None; uavs],
+        },
+        aoi: nodes.of_users(ages),
+        left_out: detections[uavs..].iter().map(Vec::is_empty).collect(),
+        detections,
+        // Edges are named by their own places.
+        places: Vec::new(),
+        form: GraphForm::Edges,
+    })
+}

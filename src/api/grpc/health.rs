@@ -1,0 +1,202 @@
+//! `grpc.health.v1.Health`: a status per service that says whether its calls would be answered.
+//!
+//! As the protocol says, and not as `tonic-health`'s own service does: a watch of an unknown service stays open and tells
+//! when the service becomes known; a status that is set again is not sent again. While the server drains every service is
+//! `NOT_SERVING`; watches end when the server closes, so that they do not keep it.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use futures::stream::{BoxStream, StreamExt};
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+use tonic::{Request, Response, Status};
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_server::{Health as HealthService, HealthServer};
+use tonic_health::pb::{HealthCheckRequest, HealthCheckResponse};
+
+use super::SERVICES;
+use crate::service::operations::{Vitals, vitals, vitals_changed};
+use crate::service::{App, Error};
+use crate::wire::v1;
+
+/// Statuses by service; cheap to clone.
+#[derive(Clone, Debug)]
+pub struct Health {
+    statuses: Arc<watch::Sender<Statuses>>,
+    closing: CancellationToken,
+}
+
+#[derive(Clone, Debug, Default)]
+struct Statuses {
+    serving: BTreeMap<String, bool>,
+    draining: bool,
+}
+
+impl Statuses {
+    fn of(&self, service: &str) -> Option<ServingStatus> {
+        let serving = *self.serving.get(service)?;
+        Some(if serving && !self.draining { ServingStatus::Serving } else { ServingStatus::NotServing })
+    }
+}
+
+impl Health {
+    /// Knows no service yet. Watches end when `closing` is cancelled.
+    pub fn new(closing: CancellationToken) -> Self {
+        Self { statuses: Arc::new(watch::Sender::default()), closing }
+    }
+
+    /// Says whether `service` answers; the server as a whole is `""`.
+    pub fn set(&self, service: &str, serving: bool) {
+        self.statuses.send_if_modified(|statuses| statuses.serving.insert(service.to_owned(), serving) != Some(serving));
+    }
+
+    /// From now on nothing is served, whatever [`Health::set`] says.
+    pub fn drain(&self) {
+        self.statuses.send_modify(|statuses| statuses.draining = true);
+    }
+
+    /// Says which services answer while the server is in this state.
+    pub fn report(&self, vitals: Vitals) {
+        let Vitals { database, policies, scheduler } = vitals;
+        self.set("", database && policies);
+        for &service in SERVICES {
+            let serving = match service {
+                v1::environment_service_server::SERVICE_NAME => true,
+                v1::job_service_server::SERVICE_NAME => database && scheduler,
+                v1::worker_service_server::SERVICE_NAME => database,
+                // Those that ask policies.
+                _ => policies,
+            };
+            self.set(service, serving);
+        }
+    }
+
+    /// Reports the server's state again and again.
+    pub async fn follow(self, app: Arc<App>) {
+        loop {
+            vitals_changed(&app).await;
+            self.report(vitals(&app).await);
+        }
+    }
+
+    /// The service.
+    pub fn server(&self) -> HealthServer<impl HealthService> {
+        HealthServer::new(self.clone())
+    }
+}
+
+fn response(status: ServingStatus) -> HealthCheckResponse {
+    HealthCheckResponse { status: status.into() }
+}
+
+#[tonic::async_trait]
+impl HealthService for Health {
+    async fn check(&self, request: Request<HealthCheckRequest>) -> Result<Response<HealthCheckResponse>, Status> {
+        let service = request.into_inner().service;
+        let status = self.statuses.borrow().of(&service);
+        Ok(Response::new(response(status.ok_or_else(|| Error::not_found("service", service))?)))
+    }
+
+    type WatchStream = BoxStream<'static, Result<HealthCheckResponse, Status>>;
+
+    async fn watch(&self, request: Request<HealthCheckRequest>) -> Result<Response<Self::WatchStream>, Status> {
+        let service = request.into_inner().service;
+        let (statuses, closing) = (self.statuses.subscribe(), self.closing.clone());
+        let states = futures::stream::unfold((statuses, None), move |(mut statuses, told)| {
+            let (service, closing) = (service.clone(), closing.clone());
+            async move {
+                loop {
+                    let status = statuses.borrow_and_update().of(&service).unwrap_or(ServingStatus::ServiceUnknown);
+                    if told != Some(status) {
+                        return Some((Ok(response(status)), (statuses, Some(status))));
+                    }
+                    // The last word comes before the end.
+                    tokio::select! {
+                        biased;
+                        changed = statuses.changed() => changed.ok()?,
+                        () = closing.cancelled() => return None,
+                    }
+                }
+            }
+        });
+        Ok(Response::new(states.boxed()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    async fn watch(health: &Health, service: &str) -> BoxStream<'static, Result<HealthCheckResponse, Status>> {
+        let request = HealthCheckRequest { service: service.to_owned() };
+        HealthService::watch(health, Request::new(request)).await.unwrap().into_inner()
+    }
+
+    async fn next(states: &mut BoxStream<'static, Result<HealthCheckResponse, Status>>) -> Option<ServingStatus> {
+        states.next().await.map(|state| state.unwrap().status())
+    }
+
+    #[tokio::test]
+    async fn a_watch_tells_what_changes_and_nothing_twice() {
+        let closing = CancellationToken::new();
+        let health = Health::new(closing.clone());
+        let mut states = watch(&health, "a.Later").await;
+        assert_eq!(next(&mut states).await, Some(ServingStatus::ServiceUnknown));
+        for _ in 0..3 {
+            health.set("a.Later", true);
+            health.set("another", true);
+        }
+        assert_eq!(next(&mut states).await, Some(ServingStatus::Serving));
+        health.set("a.Later", false);
+        assert_eq!(next(&mut states).await, Some(ServingStatus::NotServing));
+        // What came and went between two looks is not told.
+        health.set("a.Later", true);
+        health.set("a.Later", false);
+        let mut later = Box::pin(next(&mut states));
+        assert!(futures::poll!(&mut later).is_pending());
+        health.set("a.Later", true);
+        assert_eq!(later.await, Some(ServingStatus::Serving));
+    }
+
+    #[tokio::test]
+    async fn a_server_that_drains_says_so_before_watches_end() {
+        let closing = CancellationToken::new();
+        let health = Health::new(closing.clone());
+        health.set("", true);
+        let (mut known, mut unknown) = (watch(&health, "").await, watch(&health, "nobody").await);
+        assert_eq!(next(&mut known).await, Some(ServingStatus::Serving));
+        assert_eq!(next(&mut unknown).await, Some(ServingStatus::ServiceUnknown));
+        health.drain();
+        closing.cancel();
+        health.set("", true);
+        assert_eq!(next(&mut known).await, Some(ServingStatus::NotServing));
+        assert_eq!(next(&mut known).await, None);
+        assert_eq!(next(&mut unknown).await, None);
+    }
+
+    #[test]
+    fn a_service_depends_on_what_it_needs() {
+        let health = Health::new(CancellationToken::new());
+        let of = |service: &str| health.statuses.borrow().of(service).map(|status| status == ServingStatus::Serving);
+        let all = Vitals { database: true, policies: true, scheduler: true };
+        let cases = [
+            (all, [true; 5]),
+            (Vitals { scheduler: false, ..all }, [true, true, true, false, true]),
+            (Vitals { policies: false, ..all }, [false, false, true, true, true]),
+            (Vitals { database: false, ..all }, [false, true, true, false, false]),
+        ];
+        for (vitals, expected) in cases {
+            health.report(vitals);
+            let services = [
+                "",
+                "qedgix.v1.PolicyService",
+                "qedgix.v1.EnvironmentService",
+                "qedgix.v1.JobService",
+                "qedgix.v1.WorkerService",
+            ];
+            assert_eq!(services.map(|service| of(service).unwrap()), expected, "{vitals:?}");
+        }
+        assert_eq!(of("nobody"), None);
+    }
+}

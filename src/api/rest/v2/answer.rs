@@ -1,0 +1,102 @@
+//! Answers to requests for inference: JSON, and binary data after it where it was asked for.
+
+use axum::http::{HeaderValue, header};
+use axum::response::{IntoResponse, Response};
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
+use bytes::{BufMut, Bytes, BytesMut};
+use serde::Serialize;
+
+use super::HEADER_LENGTH;
+use super::body::Binary;
+use crate::api::convert::tensors::{Data, Tensor};
+use crate::api::oip::Reply;
+use crate::service::Error;
+
+#[derive(Serialize)]
+struct Body {
+    model_name: String,
+    model_version: String,
+    #[serde(skip_serializing_if = "String::is_empty")]
+    id: String,
+    parameters: Parameters,
+    outputs: Vec<Output>,
+}
+
+#[derive(Serialize)]
+struct Parameters {
+    step: u64,
+    digest: String,
+}
+
+#[derive(Serialize)]
+struct Output {
+    name: String,
+    datatype: String,
+    shape: Vec<i64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    parameters: Option<Size>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    data: Option<Values>,
+}
+
+#[derive(Serialize)]
+struct Size {
+    binary_data_size: usize,
+}
+
+/// What is not finite is null: JSON has no word for it.
+#[derive(Serialize)]
+#[serde(untagged)]
+enum Values {
+    Int32(Vec<i32>),
+    Int64(Vec<i64>),
+    Fp32(Vec<f32>),
+    Fp64(Vec<f64>),
+    /// In base64: they are no text.
+    Bytes(Vec<String>),
+}
+
+impl From<Data> for Values {
+    fn from(data: Data) -> Self {
+        let text = |value: &Bytes| BASE64_STANDARD.encode(value);
+        match data {
+            Data::Int32(values) => Self::Int32(values),
+            Data::Int64(values) => Self::Int64(values),
+            Data::Fp32(values) => Self::Fp32(values),
+            Data::Fp64(values) => Self::Fp64(values),
+            Data::Bytes(values) => Self::Bytes(values.iter().map(text).collect()),
+            Data::Raw(raw) => Self::Bytes(vec![text(&raw)]),
+        }
+    }
+}
+
+/// The answer, with `binary` outputs after the JSON.
+pub(super) fn response(reply: Reply, binary: &Binary) -> Response {
+    let Reply { model, version, id, step, digest, outputs } = reply;
+    let mut after = Vec::new();
+    let outputs = outputs.into_iter().enumerate().map(|(i, Tensor { name, datatype, shape, data })| {
+        if !binary.asked.get(i).copied().unwrap_or(binary.default) {
+            return Output { name, datatype, shape, parameters: None, data: Some(data.into()) };
+        }
+        let raw = data.into_raw();
+        let parameters = Some(Size { binary_data_size: raw.len() });
+        after.push(raw);
+        Output { name, datatype, shape, parameters, data: None }
+    });
+    let outputs = outputs.collect();
+    let parameters = Parameters { step, digest };
+    let body = Body { model_name: model, model_version: version.to_string(), id, parameters, outputs };
+    let json = match serde_json::to_vec(&body) {
+        Ok(json) => json,
+        Err(error) => return Error::internal(error).into_response(),
+    };
+    if after.is_empty() {
+        return ([(header::CONTENT_TYPE, HeaderValue::from_static("application/json"))], json).into_response();
+    }
+    let mut body = BytesMut::with_capacity(json.len() + after.iter().map(Bytes::len).sum::<usize>());
+    body.put_slice(&json);
+    after.into_iter().for_each(|raw| body.put(raw));
+    let kind = HeaderValue::from_static("application/octet-stream");
+    ([(header::CONTENT_TYPE, kind), (HEADER_LENGTH, json.len().into())], body.freeze()).into_response()
+}

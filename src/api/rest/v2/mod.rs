@@ -1,0 +1,181 @@
+//! `/v2`: the Open Inference Protocol over HTTP, tensors as JSON or as binary data after it.
+
+mod answer;
+mod body;
+mod data;
+
+use std::sync::Arc;
+
+use axum::extract::State;
+use axum::http::{HeaderMap, HeaderName, StatusCode};
+use axum::response::{IntoResponse, Response};
+use axum::routing::{get, post};
+use axum::{Json, Router};
+use serde::Deserialize;
+use serde_json::{Map, Value, json};
+
+use super::extract::{Path, Raw, parse};
+use crate::api::convert::tensors::TensorShape;
+use crate::api::errors::Problem;
+use crate::api::oip;
+use crate::service::{App, Error};
+
+/// Bytes of the JSON before binary data, in requests and answers.
+const HEADER_LENGTH: HeaderName = HeaderName::from_static("inference-header-content-length");
+/// Larger bodies are parsed away from the threads that serve connections.
+const LARGE: usize = 64 << 10;
+
+type Shared = State<Arc<App>>;
+
+/// The routes.
+pub fn router() -> Router<Arc<App>> {
+    Router::new()
+        .route("/v2", get(server))
+        .route("/v2/health/live", get(live))
+        .route("/v2/health/ready", get(ready))
+        .route("/v2/models/{model}", get(metadata))
+        .route("/v2/models/{model}/ready", get(model_ready))
+        .route("/v2/models/{model}/config", get(config))
+        .route("/v2/models/{model}/infer", post(infer))
+        .route("/v2/models/{model}/versions/{version}", get(metadata))
+        .route("/v2/models/{model}/versions/{version}/ready", get(model_ready))
+        .route("/v2/models/{model}/versions/{version}/config", get(config))
+        .route("/v2/models/{model}/versions/{version}/infer", post(infer))
+        .route("/v2/repository/index", post(index))
+        .route("/v2/repository/models/{model}/load", post(load))
+        .route("/v2/repository/models/{model}/unload", post(unload))
+}
+
+/// Whether a path is one of this protocol's, known or not.
+pub fn is_ours(path: &str) -> bool {
+    path == "/v2" || path.starts_with("/v2/")
+}
+
+/// Says a problem in this protocol's words, `{"error", "code"}`, with the same status.
+pub fn in_our_words(mut response: Response) -> Response {
+    let Some(problem) = response.extensions_mut().remove::<Problem>() else { return response };
+    let mut ours = (response.status(), Json(json!({"error": problem.detail, "code": problem.code}))).into_response();
+    let (headers, body_of) = (ours.headers_mut(), [axum::http::header::CONTENT_TYPE, axum::http::header::CONTENT_LENGTH]);
+    headers.extend(response.headers().iter().filter(|(name, _)| !body_of.contains(name)).map(|(n, v)| (n.clone(), v.clone())));
+    ours
+}
+
+/// A model with or without its version.
+#[derive(Debug, Deserialize)]
+struct Asked {
+    model: String,
+    #[serde(default)]
+    version: String,
+}
+
+async fn server() -> Json<Value> {
+    Json(json!({"name": oip::NAME, "version": oip::VERSION, "extensions": oip::EXTENSIONS}))
+}
+
+async fn live() -> Json<Value> {
+    Json(json!({"live": true}))
+}
+
+async fn ready(State(app): Shared) -> Result<Json<Value>, Error> {
+    app.ready().await?;
+    Ok(Json(json!({"ready": true})))
+}
+
+async fn model_ready(State(app): Shared, Path(asked): Path<Asked>) -> Result<Json<Value>, Error> {
+    if !oip::is_ready(&app, &asked.model, &asked.version)? {
+        // Says what is not ready about it.
+        oip::describe(&app, &asked.model, &asked.version)?;
+    }
+    Ok(Json(json!({"name": asked.model, "ready": true})))
+}
+
+async fn metadata(State(app): Shared, Path(asked): Path<Asked>) -> Result<Json<Value>, Error> {
+    let model = oip::describe(&app, &asked.model, &asked.version)?;
+    let tensor = |t: &TensorShape| json!({"name": t.name, "datatype": t.datatype.name(), "shape": t.shape});
+    Ok(Json(json!({
+        "name": model.name,
+        "versions": model.versions,
+        "platform": oip::NAME,
+        "inputs": model.inputs.iter().map(tensor).collect::<Vec<_>>(),
+        "outputs": model.outputs.iter().map(tensor).collect::<Vec<_>>(),
+    })))
+}
+
+async fn config(State(app): Shared, Path(asked): Path<Asked>) -> Result<Json<Value>, Error> {
+    let model = oip::describe(&app, &asked.model, &asked.version)?;
+    let output = |t: &TensorShape| json!({"name": t.name, "data_type": oip::config_type(t.datatype), "dims": t.shape});
+    let input = |t: &TensorShape| {
+        let mut input = output(t);
+        input["optional"] = t.optional.into();
+        input
+    };
+    let idle = u64::try_from(app.sessions.ttl().as_micros()).unwrap_or(u64::MAX);
+    Ok(Json(json!({
+        "name": model.name,
+        "platform": oip::NAME,
+        "backend": oip::NAME,
+        "max_batch_size": 0,
+        "input": model.inputs.iter().map(input).collect::<Vec<_>>(),
+        "output": model.outputs.iter().map(output).collect::<Vec<_>>(),
+        "sequence_batching": {"max_sequence_idle_microseconds": idle},
+        "model_transaction_policy": {"decoupled": false},
+    })))
+}
+
+async fn infer(State(app): Shared, Path(asked): Path<Asked>, headers: HeaderMap, Raw(body): Raw) -> Result<Response, Error> {
+    let Asked { model, version } = asked;
+    let large = body.len() > LARGE;
+    let read = move || body::read(&headers, body, model, version);
+    let (call, binary) = if large { tokio::task::spawn_blocking(read).await.map_err(Error::internal)?? } else { read()? };
+    Ok(answer::response(oip::infer(&app, call, None).await?, &binary))
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Index {
+    #[serde(default)]
+    ready: bool,
+}
+
+async fn index(State(app): Shared, Raw(body): Raw) -> Result<Json<Value>, Error> {
+    let Index { ready } = or_default(&body)?;
+    let entry = |entry: crate::service::policies::IndexEntry| {
+        json!({
+            "name": entry.name,
+            "version": entry.version.to_string(),
+            "state": oip::state(entry.ready),
+            "reason": entry.reason,
+        })
+    };
+    Ok(Json(oip::index(&app, "", ready)?.into_iter().map(entry).collect()))
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Loading {
+    #[serde(default)]
+    parameters: Map<String, Value>,
+}
+
+impl Loading {
+    fn names(&self) -> Vec<&str> {
+        self.parameters.keys().map(String::as_str).collect()
+    }
+}
+
+async fn load(State(app): Shared, Path(model): Path<String>, Raw(body): Raw) -> Result<StatusCode, Error> {
+    let loading: Loading = or_default(&body)?;
+    oip::load(&app, "", &model, &loading.names()).await?;
+    Ok(StatusCode::OK)
+}
+
+async fn unload(State(app): Shared, Path(model): Path<String>, Raw(body): Raw) -> Result<StatusCode, Error> {
+    let loading: Loading = or_default(&body)?;
+    oip::unload(&app, "", &model, &loading.names()).await?;
+    Ok(StatusCode::OK)
+}
+
+/// A document that may be left out.
+fn or_default<T: Default + serde::de::DeserializeOwned>(body: &[u8]) -> Result<T, Error> {
+    if body.is_empty() { Ok(T::default()) } else { parse(body) }
+}

@@ -1,0 +1,87 @@
+//! `grpc.health.v1`: what is served, what is unknown, what is broken, and the end.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use qedgix::api::grpc::SERVICES;
+use sqlx::Connection;
+use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
+use tonic::transport::Channel;
+use tonic::{Code, Streaming};
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_client::HealthClient;
+use tonic_health::pb::{HealthCheckRequest, HealthCheckResponse};
+
+use super::harness::*;
+
+fn ask(service: &str) -> HealthCheckRequest {
+    HealthCheckRequest { service: service.into() }
+}
+
+async fn status(health: &mut HealthClient<Channel>, service: &str) -> ServingStatus {
+    health.check(ask(service)).await.unwrap().into_inner().status()
+}
+
+async fn next(states: &mut Streaming<HealthCheckResponse>) -> Option<ServingStatus> {
+    soon(states.message()).await.unwrap().map(|state| state.status())
+}
+
+#[tokio::test]
+async fn every_service_is_known_and_no_other() {
+    let server = Server::start().await;
+    let mut health = HealthClient::new(server.channel().await);
+    assert!(SERVICES.len() >= 4);
+    for service in SERVICES.iter().chain(&[""]) {
+        assert_eq!(status(&mut health, service).await, ServingStatus::Serving, "{service}");
+    }
+    for unknown in ["no.such.Service", "qedgix.v1", "qedgix.v1.PolicyService "] {
+        let (code, reason, message) = refused(health.check(ask(unknown)).await);
+        assert_eq!((code, reason.as_str()), (Code::NotFound, "not_found"), "{message}");
+    }
+}
+
+#[tokio::test]
+async fn watches_hear_of_the_end_and_do_not_keep_it() {
+    let mut server = Server::start().await;
+    let gate = Arc::new(Gate::default());
+    server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
+    let mut flying = server.grpc().await;
+    let in_flight = tokio::spawn(async move { flying.act(held("slow", Bytes::new(), scene(2, 2, 0))).await });
+    gate.reached(1).await;
+    let mut health = HealthClient::new(server.channel().await);
+    let mut known = health.watch(ask("qedgix.v1.PolicyService")).await.unwrap().into_inner();
+    let mut whole = health.watch(ask("")).await.unwrap().into_inner();
+    let mut unknown = health.watch(ask("no.such.Service")).await.unwrap().into_inner();
+    assert_eq!(next(&mut known).await, Some(ServingStatus::Serving));
+    assert_eq!(next(&mut whole).await, Some(ServingStatus::Serving));
+    assert_eq!(next(&mut unknown).await, Some(ServingStatus::ServiceUnknown));
+    server.begin_stop();
+    for states in [&mut known, &mut whole] {
+        assert_eq!(next(states).await, Some(ServingStatus::NotServing));
+        assert_eq!(next(states).await, None);
+    }
+    assert_eq!(next(&mut unknown).await, None);
+    // All streams are held open by their client, and a request was in flight.
+    gate.open();
+    assert_eq!(soon(in_flight).await.unwrap().unwrap().into_inner().actions.len(), 2);
+    soon(server.stopped()).await;
+    drop((known, whole, unknown));
+}
+
+#[tokio::test]
+async fn jobs_are_not_served_while_their_queue_cannot_be_read() {
+    let server = Server::start().await;
+    let mut health = HealthClient::new(server.channel().await);
+    let mut states = health.watch(ask("qedgix.v1.JobService")).await.unwrap().into_inner();
+    assert_eq!(next(&mut states).await, Some(ServingStatus::Serving));
+    let file = server.dir.path().join(qedgix::store::FILE);
+    let mut database = SqliteConnection::connect_with(&SqliteConnectOptions::new().filename(file)).await.unwrap();
+    sqlx::query("ALTER TABLE jobs RENAME TO elsewhere").execute(&mut database).await.unwrap();
+    server.app.jobs.changed(0);
+    assert_eq!(next(&mut states).await, Some(ServingStatus::NotServing));
+    // Who asks a policy is not concerned.
+    assert_eq!(status(&mut health, "qedgix.v1.PolicyService").await, ServingStatus::Serving);
+    assert_eq!(status(&mut health, "").await, ServingStatus::Serving);
+    sqlx::query("ALTER TABLE elsewhere RENAME TO jobs").execute(&mut database).await.unwrap();
+    assert_eq!(next(&mut states).await, Some(ServingStatus::Serving));
+}
