@@ -10,7 +10,8 @@ use crate::invalid::{Invalid, expectation, in_range};
 use crate::recipe::{Algorithm, EXACT, Preset, TrainConfig, integral};
 use crate::store::{JobKind, JobSpec};
 
-const FIELDS: [&str; 10] =
+/// Everything that a job may say.
+pub const FIELDS: [&str; 10] =
     ["kind", "algorithm", "preset", "environment", "training", "threads", "priority", "seed", "name", "labels"];
 
 /// A job as it was sent: checked, every default filled in, and the digest by which the same body is known again.

@@ -13,6 +13,7 @@ mod large;
 mod limits;
 mod load;
 mod oip;
+mod openapi;
 mod operations;
 mod policies;
 mod promotion;

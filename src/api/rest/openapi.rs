@@ -22,7 +22,7 @@ use crate::policy::baselines;
         description = "Serves and trains policies that fly fleets of UAVs for fresh data (Age of Information).\n\n\
             Every error is a problem of RFC 9457 with a stable `code`. Every answer has an `x-request-id`, the caller's own if \
             the request had one. Unknown fields are errors, in bodies and in queries of `/v1`. The same use cases are served \
-            over gRPC by `qedgix.v1`."
+            over gRPC by `qedgix.v1`. `/v2` speaks the Open Inference Protocol, which has a document of its own."
     ),
     tags(
         (name = "act", description = "One slot of one fleet: what is seen in, a heading per UAV out."),
