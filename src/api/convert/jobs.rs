@@ -54,7 +54,7 @@ pub struct JobRequest {
     #[schema(schema_with = some_of_training)]
     training: Option<Training>,
     /// Fixes every metric and weight.
-    #[schema(minimum = 0, maximum = 9007199254740991_u64)]
+    #[schema(minimum = 0, maximum = 9_007_199_254_740_991_u64)]
     seed: Option<u64>,
 }
 

@@ -40,7 +40,7 @@ struct Create {
     environment: Map<String, Value>,
     /// Copy b flies its first episode with this seed + b.
     #[serde(default)]
-    #[schema(maximum = 9007199254740991_u64)]
+    #[schema(maximum = 9_007_199_254_740_991_u64)]
     seed: u64,
     /// Number of copies, 1 unless said otherwise.
     #[schema(minimum = 1, maximum = 1024)]
@@ -59,7 +59,7 @@ struct Create {
 #[schema(as = ResetRequest, example = json!({"seed": 10_000}))]
 struct Reset {
     /// Begins episode 0 of this seed.
-    #[schema(maximum = 9007199254740991_u64)]
+    #[schema(maximum = 9_007_199_254_740_991_u64)]
     seed: Option<u64>,
     /// Begins the episode of this number.
     episode: Option<u64>,

@@ -143,7 +143,7 @@ pub(super) struct Policy {
 
 /// Where a policy comes from, as the protocol writes it.
 #[derive(ToSchema)]
-#[expect(dead_code, clippy::enum_variant_names, reason = "written by the protocol's types; this is their documentation")]
+#[expect(dead_code, reason = "written by the protocol's types; this is their documentation")]
 enum PolicyKind {
     #[schema(rename = "POLICY_KIND_CHECKPOINT")]
     Checkpoint,

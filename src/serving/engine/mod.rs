@@ -207,19 +207,19 @@ impl Shared {
         self.meters.policy(&task.policy.reference.name).failure.increment(1);
     }
 
-    /// Computes a small fleet that comes while nothing else is to be done; gives it back otherwise.
-    fn at_once(&self, task: Task) -> Result<Result<Outcome, Error>, Task> {
-        {
-            let mut queue = self.lock();
-            if !queue.waiting.is_empty() || queue.running >= self.config.threads {
-                return Err(task);
-            }
-            queue.running += 1;
-        }
+    /// Lets the caller compute its small fleet at once, if nothing else is to be done; then it calls [`Shared::alone`].
+    fn may_compute(&self) -> bool {
+        let mut queue = self.lock();
+        let may = queue.waiting.is_empty() && queue.running < self.config.threads;
+        queue.running += usize::from(may);
+        may
+    }
+
+    fn alone(&self, task: Task) -> Result<Outcome, Error> {
         let outcome = batch::alone(task, &self.meters);
         self.lonely.fetch_add(1, Ordering::Relaxed);
         self.lock().running -= 1;
-        Ok(outcome)
+        outcome
     }
 
     /// Computes a batch for the caller and others if the oldest fleet is small and not too many compute; whether it did.
@@ -341,12 +341,8 @@ impl Engine {
         }
         let small = task.is_small() && shared.config.max_batch_delay.is_zero();
         let company = small && shared.expects_company();
-        let mut task = task;
-        if small && !company {
-            match shared.at_once(task) {
-                Ok(outcome) => return outcome,
-                Err(back) => task = back,
-            }
+        if small && !company && shared.may_compute() {
+            return shared.alone(task);
         }
         let mut caller = Caller { shared, answered: false };
         let mut answer = shared.enqueue(task, deadline)?;
