@@ -40,7 +40,6 @@ def run():
         f"--max-examples={os.environ.get('QEDGIX_EXAMPLES', '15')}",
         f"--seed={os.environ.get('QEDGIX_SEED', '1')}",
         "--generation-database=none",
-        "--request-timeout=30",
         "--no-color",
     ]
     with tempfile.TemporaryDirectory() as elsewhere:

@@ -10,7 +10,7 @@ use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use futures::{StreamExt, TryStreamExt};
 use serde::Deserialize;
-use utoipa::IntoParams;
+use utoipa::{IntoParams, ToSchema};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
@@ -37,6 +37,28 @@ struct FollowQuery {
     after: u64,
 }
 
+/// One event of the stream.
+#[derive(ToSchema)]
+#[schema(as = ServerSentEvent)]
+#[expect(dead_code, reason = "written by axum; this is its documentation")]
+struct Sent {
+    #[schema(pattern = "^[0-9]+$")]
+    id: String,
+    event: Name,
+    /// JSON: `{state, attempt, reason, at}`, or `{metrics}` with rows as `listJobMetrics` has them.
+    #[schema(content_media_type = "application/json")]
+    data: String,
+}
+
+/// What an event is about.
+#[derive(ToSchema)]
+#[schema(as = EventName, rename_all = "lowercase")]
+#[expect(dead_code, reason = "written by axum; this is its documentation")]
+enum Name {
+    State,
+    Metrics,
+}
+
 /// What browsers say when they come back.
 const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
 /// Proxies are asked not to collect events before they pass them on.
@@ -57,7 +79,7 @@ const UNBUFFERED: (HeaderName, HeaderValue) = (HeaderName::from_static("x-accel-
         ("last-event-id" = Option<u64>, Header, description = "Instead of `after`: the last event that was seen.", nullable = false)
     ),
     responses(
-        (status = 200, description = "Events as they happen.", body = String, content_type = "text/event-stream"),
+        (status = 200, description = "Events as they happen.", body = Sent, content_type = "text/event-stream"),
         (status = 204, description = "The job has ended, and its last event was seen."),
         BadRequest, NotFound, Draining
     )
