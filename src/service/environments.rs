@@ -2,7 +2,8 @@
 
 use serde_json::Value;
 
-use super::{App, Error, sessions};
+use super::paging::json_bytes;
+use super::{App, Error, Page, PageRequest};
 use crate::recipe;
 use crate::serving::{Blueprint, EnvironmentInfo, Flight, Reset, State};
 
@@ -67,12 +68,13 @@ pub async fn delete(app: &App, id: &str) -> Result<EnvironmentInfo, Error> {
     Ok(app.environments.delete(id).await?)
 }
 
-/// A page of environments in order of names, and the token of the next page.
+/// A page of environments in order of names.
 ///
 /// # Errors
-/// A page size out of range.
-pub fn list(app: &App, size: u32, token: &str) -> Result<(Vec<EnvironmentInfo>, Option<String>), Error> {
+/// [`Error::Invalid`]: the page size is out of range.
+pub fn list(app: &App, page: &PageRequest) -> Result<Page<EnvironmentInfo>, Error> {
     let table = app.environments.table();
-    let (page, next) = sessions::page(table, size, token)?;
-    Ok((page.iter().map(|environment| environment.info(table.ttl())).collect(), next))
+    let (environments, more) = table.list(&page.token, page.usual_limit()?);
+    let environments = environments.iter().map(|environment| environment.info(table.ttl())).collect();
+    Ok(Page::bounded(environments, more, |info| json_bytes(&info.blueprint.config), |info| info.id.clone()))
 }

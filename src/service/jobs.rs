@@ -3,22 +3,14 @@
 use serde_json::Value;
 use uuid::Uuid;
 
+use super::paging::{self, number};
 use super::worker::is_metric_name;
-use super::{App, Error, policies};
-use crate::invalid::{Invalid, in_range};
+use super::{App, Error, Page, PageRequest, policies};
+use crate::invalid::Invalid;
 use crate::jobs::spec;
 use crate::store::{
-    Attempt, Changed, Checkpoint, Job, JobId, JobState, MetricCursor, MetricRow, NewJob, Submitted, Verb, Wanted,
+    Attempt, Changed, Checkpoint, Job, JobId, JobState, JobSummary, MetricCursor, MetricRow, NewJob, Submitted, Verb, Wanted,
 };
-
-/// One page of something, and where the next begins.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Page<T> {
-    /// The items.
-    pub items: Vec<T>,
-    /// Cursor of the next page; absent on the last.
-    pub next: Option<String>,
-}
 
 /// Puts a job into the queue and tells whether it is new: the same `key` with the same document is the same job.
 /// What is returned is on the disk.
@@ -68,15 +60,14 @@ pub async fn get(app: &App, id: &str) -> Result<Job, Error> {
     app.store.job(parse_id(id)?).await?.ok_or_else(|| Error::not_found("job", id))
 }
 
-/// Jobs, newest first; `limit` 0 is 100.
+/// Summaries of jobs, newest first.
 ///
 /// # Errors
-/// A limit over 1000, or a cursor that no page gave.
-pub async fn list(app: &App, state: Option<JobState>, limit: u32, cursor: Option<&str>) -> Result<Page<Job>, Error> {
-    let limit = page_size(limit, 100, 1000)?;
-    let before = cursor.map(|c| number(c).ok_or_else(|| bad_cursor(c))).transpose()?;
-    let items = app.store.jobs(state, before, limit + 1).await?;
-    Ok(page(items, limit, |job| job.number.to_string()))
+/// [`Error::Invalid`]: the page size is over 1000, or no page returned the token.
+pub async fn list(app: &App, state: Option<JobState>, page: &PageRequest) -> Result<Page<JobSummary>, Error> {
+    let (limit, before) = (page.usual_limit()?, page.position(number)?);
+    let (jobs, more) = app.store.job_summaries(state, before, limit, paging::MAX_BYTES).await?;
+    Ok(Page::new(jobs, more, |job| job.number.to_string()))
 }
 
 /// Does `verb` to the job `id`. A running job is told; it changes when its worker has stopped.
@@ -112,22 +103,17 @@ pub async fn change(app: &App, id: &str, verb: Verb) -> Result<Job, Error> {
     }
 }
 
-/// Metrics of a job by name and step; `limit` 0 is 10 000.
+/// Metrics of a job in order of name and step, 10 000 rows to a page by default.
 ///
 /// # Errors
-/// There is no such job, a limit over 100 000, or a cursor that no page gave.
-pub async fn metrics(
-    app: &App,
-    id: &str,
-    name: Option<&str>,
-    limit: u32,
-    cursor: Option<&str>,
-) -> Result<Page<MetricRow>, Error> {
-    let limit = page_size(limit, 10_000, 100_000)?;
-    let after = cursor.map(|c| parse_metric_cursor(c).ok_or_else(|| bad_cursor(c))).transpose()?;
+/// [`Error::NotFound`]: there is no such job. [`Error::Invalid`]: the page size is over 100 000, or no page returned the token.
+pub async fn metrics(app: &App, id: &str, name: Option<&str>, page: &PageRequest) -> Result<Page<MetricRow>, Error> {
+    let (limit, after) = (page.limit(10_000, 100_000)?, page.position(parse_metric_cursor)?);
     let job = get(app, id).await?;
-    let items = app.store.metrics(job.id, name, after.as_ref(), limit + 1).await?;
-    Ok(page(items, limit, |row| format!("{}@{}", row.name, row.step)))
+    let mut rows = app.store.metrics(job.id, name, after.as_ref(), limit as u32 + 1).await?;
+    let more = rows.len() > limit;
+    rows.truncate(limit);
+    Ok(Page::new(rows, more, |row| format!("{}@{}", row.name, row.step)))
 }
 
 fn parse_metric_cursor(cursor: &str) -> Option<MetricCursor> {
@@ -167,27 +153,4 @@ pub async fn logs(app: &App, id: &str) -> Result<Vec<Attempt>, Error> {
         }
     }
     Ok(attempts)
-}
-
-/// A number in digits, as cursors have them.
-pub(super) fn number(text: &str) -> Option<i64> {
-    let digits = !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
-    text.parse().ok().filter(|_| digits)
-}
-
-fn page_size(limit: u32, default: u32, most: u32) -> Result<u32, Invalid> {
-    in_range("limit", limit, 0..=most)?;
-    Ok(if limit == 0 { default } else { limit })
-}
-
-fn bad_cursor(cursor: &str) -> Error {
-    Invalid::new("cursor", format!("{cursor:?}"), "the next cursor of the former page").into()
-}
-
-/// The first `limit` items; the next page begins behind the last of them if there are more.
-fn page<T>(mut items: Vec<T>, limit: u32, cursor: impl Fn(&T) -> String) -> Page<T> {
-    let more = items.len() > limit as usize;
-    items.truncate(limit as usize);
-    let next = items.last().filter(|_| more).map(cursor);
-    Page { items, next }
 }

@@ -7,6 +7,7 @@ pub mod events;
 pub mod jobs;
 pub mod keys;
 pub mod operations;
+mod paging;
 pub mod policies;
 pub mod sequences;
 pub mod sessions;
@@ -16,6 +17,7 @@ use std::sync::Arc;
 
 pub use error::Error;
 pub use events::Watchers;
+pub use paging::{Page, PageRequest};
 use tokio_util::sync::CancellationToken;
 
 use crate::jobs::Jobs;

@@ -1,11 +1,9 @@
 //! Opening, showing and ending sessions.
 
-use std::sync::Arc;
-
 use super::sequences::PREFIX;
-use super::{App, Error};
-use crate::invalid::{Invalid, in_range};
-use crate::serving::{Entry, Opened, PolicySpec, SessionInfo, Table};
+use super::{App, Error, Page, PageRequest};
+use crate::invalid::Invalid;
+use crate::serving::{Entry, Opened, PolicySpec, SessionInfo};
 
 /// Opens a session pinned to what `policy` names now.
 ///
@@ -37,24 +35,11 @@ pub async fn close(app: &App, id: &str) -> Result<SessionInfo, Error> {
     Ok(app.sessions.close(id).await?)
 }
 
-/// A page of open sessions in order of names, and the token of the next page.
+/// A page of open sessions in order of names.
 ///
 /// # Errors
-/// A page size out of range.
-pub fn list(app: &App, size: u32, token: &str) -> Result<(Vec<SessionInfo>, Option<String>), Error> {
-    let (page, next) = page(&app.sessions, size, token)?;
-    Ok((page.iter().map(|session| session.info(app.sessions.ttl())).collect(), next))
-}
-
-/// A page of what `table` holds, and the token of the next one.
-pub(super) fn page<T: Entry>(table: &Table<T>, size: u32, token: &str) -> Result<(Vec<Arc<T>>, Option<String>), Invalid> {
-    let (page, more) = table.list(token, page_size(size)?);
-    let next = page.last().filter(|_| more).map(|last| last.id().to_owned());
-    Ok((page, next))
-}
-
-/// The size of a page: 100 unless said otherwise.
-pub(super) fn page_size(size: u32) -> Result<usize, Invalid> {
-    in_range("page_size", size, 0..=1000)?;
-    Ok(if size == 0 { 100 } else { size as usize })
+/// [`Error::Invalid`]: the page size is out of range.
+pub fn list(app: &App, page: &PageRequest) -> Result<Page<SessionInfo>, Error> {
+    let (sessions, more) = app.sessions.list(&page.token, page.usual_limit()?);
+    Ok(Page::new(sessions, more, |session| session.id().to_owned()).map(|session| session.info(app.sessions.ttl())))
 }

@@ -4,12 +4,14 @@ use std::collections::BTreeMap;
 use std::fmt;
 
 use jiff::Timestamp;
+use futures::TryStreamExt;
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use sqlx::{FromRow, Sqlite, SqliteConnection, Transaction};
 use uuid::Uuid;
 
 use super::{Error, Result, Store, corrupt, timestamp};
-use crate::recipe::TrainConfig;
+use crate::recipe::{Algorithm, Preset, TrainConfig};
 
 /// Names a job for ever.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
@@ -133,9 +135,54 @@ pub struct JobSpec {
     pub config: TrainConfig,
 }
 
+/// What lists return of a [`JobSpec`]: everything but the environment and the training configuration, which may be large.
+// `Store::job_summaries` reads it from a JSON array in the order of the fields.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SpecSummary {
+    /// As in [`JobSpec`].
+    pub kind: JobKind,
+    /// As in [`JobSpec`].
+    pub name: Option<String>,
+    /// As in [`JobSpec`].
+    pub labels: BTreeMap<String, String>,
+    /// As in [`JobSpec`].
+    pub threads: usize,
+    /// As in [`JobSpec`].
+    pub priority: i64,
+    /// As in [`TrainConfig`].
+    pub algorithm: Algorithm,
+    /// As in [`TrainConfig`].
+    pub preset: Preset,
+    /// As in [`TrainConfig`].
+    pub seed: u64,
+    /// Environment steps to train for; no field of a job's document.
+    #[serde(skip_serializing)]
+    pub steps: u64,
+}
+
+impl From<&JobSpec> for SpecSummary {
+    fn from(spec: &JobSpec) -> Self {
+        let JobSpec { kind, name, labels, threads, priority, config } = spec;
+        Self {
+            kind: *kind,
+            name: name.clone(),
+            labels: labels.clone(),
+            threads: *threads,
+            priority: *priority,
+            algorithm: config.algorithm,
+            preset: config.preset,
+            seed: config.seed,
+            steps: config.training.steps,
+        }
+    }
+}
+
+/// A job as lists return it.
+pub type JobSummary = Job<SpecSummary>;
+
 /// A job as it stands.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Job {
+pub struct Job<S = JobSpec> {
     /// Its name for ever.
     pub id: JobId,
     /// Order of arrival.
@@ -147,7 +194,7 @@ pub struct Job {
     /// Why it failed, or what became of its last attempt.
     pub reason: Option<String>,
     /// What it does.
-    pub spec: JobSpec,
+    pub spec: S,
     /// Attempts begun.
     pub attempts: u32,
     /// Attempts that failed.
@@ -164,6 +211,32 @@ pub struct Job {
     pub started_at: Option<Timestamp>,
     /// When it ended.
     pub ended_at: Option<Timestamp>,
+}
+
+impl Job {
+    /// The job as lists return it, and the configuration that they leave out.
+    pub fn split(self) -> (JobSummary, TrainConfig) {
+        let spec = SpecSummary::from(&self.spec);
+        let Self { spec: JobSpec { config, .. }, id, number, state, wanted, reason, attempts, failures, .. } = self;
+        let Self { step, policy, last_event, created_at, started_at, ended_at, .. } = self;
+        let summary = Job {
+            id,
+            number,
+            state,
+            wanted,
+            reason,
+            spec,
+            attempts,
+            failures,
+            step,
+            policy,
+            last_event,
+            created_at,
+            started_at,
+            ended_at,
+        };
+        (summary, config)
+    }
 }
 
 #[derive(FromRow)]
@@ -184,7 +257,7 @@ struct JobRow {
     ended_at: Option<i64>,
 }
 
-impl TryFrom<JobRow> for Job {
+impl<S: DeserializeOwned> TryFrom<JobRow> for Job<S> {
     type Error = Error;
 
     fn try_from(row: JobRow) -> Result<Self> {
@@ -324,16 +397,35 @@ impl Store {
         find(&mut *self.read.acquire().await?, id).await
     }
 
-    /// Jobs, newest first: those in `state`, older than number `before`, at most `limit`.
+    /// Summaries of jobs, newest first: those in `state`, older than number `before`; and whether there are more than fit. At
+    /// most `limit` of them, and no more than take about `max_bytes`, but at least one.
     ///
     /// # Errors
     /// The database.
-    pub async fn jobs(&self, state: Option<JobState>, before: Option<i64>, limit: u32) -> Result<Vec<Job>> {
-        let sql = "SELECT * FROM jobs WHERE (?1 IS NULL OR state = ?1) AND (?2 IS NULL OR number < ?2)
-                   ORDER BY number DESC LIMIT ?3";
-        let rows: Vec<JobRow> =
-            sqlx::query_as(sql).bind(state.map(JobState::as_str)).bind(before).bind(limit).fetch_all(&self.read).await?;
-        rows.into_iter().map(Job::try_from).collect()
+    pub async fn job_summaries(
+        &self,
+        state: Option<JobState>,
+        before: Option<i64>,
+        limit: usize,
+        max_bytes: usize,
+    ) -> Result<(Vec<JobSummary>, bool)> {
+        /// What a summary takes besides its texts.
+        const FIXED: usize = 512;
+        let sql = "SELECT number, id, state, wanted, reason, attempts, failures, step, policy, seq, created_at, started_at, ended_at,
+                   json_extract(spec, '$.kind', '$.name', '$.labels', '$.threads', '$.priority', '$.config.algorithm',
+                   '$.config.preset', '$.config.seed', '$.config.training.steps') AS spec
+                   FROM jobs WHERE (?1 IS NULL OR state = ?1) AND (?2 IS NULL OR number < ?2) ORDER BY number DESC";
+        let query = sqlx::query_as(sql).bind(state.map(JobState::as_str)).bind(before);
+        let (mut rows, mut jobs, mut bytes) = (query.fetch(&self.read), Vec::new(), 0);
+        while let Some(row) = rows.try_next().await? {
+            let row: JobRow = row;
+            bytes += FIXED + row.spec.len() + row.reason.as_ref().map_or(0, String::len);
+            if jobs.len() == limit || (bytes > max_bytes && !jobs.is_empty()) {
+                return Ok((jobs, true));
+            }
+            jobs.push(row.try_into()?);
+        }
+        Ok((jobs, false))
     }
 
     /// How many jobs there are in each state.

@@ -13,7 +13,7 @@ mod snapshots;
 pub use attempts::{Attempt, Ending, Lease, LeaseRecord, Outcome};
 pub use checkpoints::{Checkpoint, CheckpointKind, NewCheckpoint};
 pub use events::{Happened, JobEvent};
-pub use jobs::{Changed, Job, JobId, JobKind, JobSpec, JobState, NewJob, Submitted, Verb, Wanted};
+pub use jobs::{Changed, Job, JobId, JobKind, JobSpec, JobState, JobSummary, NewJob, SpecSummary, Submitted, Verb, Wanted};
 pub use keys::KeyRecord;
 pub use metrics::{Metric, MetricCursor, MetricRow};
 pub use policies::{NewPolicyVersion, PolicyVersion, PublishedPolicy};

@@ -52,7 +52,7 @@ def cancel_jobs(rest):
     """Leaves the server idle: every body that is a job became one."""
     for state in ("queued", "paused", "running"):
         while True:
-            with urllib.request.urlopen(f"{rest}/v1/jobs?state={state}&limit=1000") as answer:
+            with urllib.request.urlopen(f"{rest}/v1/jobs?state={state}&page_size=1000") as answer:
                 jobs = [job["id"] for job in json.load(answer)["jobs"] if job["wanted"] != "cancel"]
             for job in jobs:
                 urllib.request.urlopen(urllib.request.Request(f"{rest}/v1/jobs/{job}/cancel", method="POST")).close()

@@ -381,7 +381,7 @@ async fn a_killed_server_loses_and_doubles_nothing_that_was_told() {
     for metric in told.iter().filter_map(|event| event.data["metrics"].as_array()).flatten() {
         figures.insert((metric["name"].to_string(), metric["step"].as_u64().unwrap()), metric["value"].clone());
     }
-    let kept = server.rest.get(&format!("/v1/jobs/{id}/metrics?limit=100000")).await;
+    let kept = server.rest.get(&format!("/v1/jobs/{id}/metrics?page_size=100000")).await;
     let kept: BTreeMap<_, _> = kept["metrics"]
         .as_array()
         .unwrap()

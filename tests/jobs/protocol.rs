@@ -75,10 +75,10 @@ async fn metrics_reported_twice_are_there_once() {
     assert_eq!(json!(rows), json!([["epsilon", 20, 1.0], ["loss", 20, 0.5], ["loss", 40, 0.25], ["loss", 60, 0.125]]));
     assert_eq!(server.get(&format!("/v1/jobs/{id}")).await["progress"]["step"], 60);
 
-    let page = server.get(&format!("/v1/jobs/{id}/metrics?name=loss&limit=2")).await;
-    let cursor = page["next_cursor"].as_str().unwrap();
-    let rest = server.get(&format!("/v1/jobs/{id}/metrics?name=loss&limit=2&cursor={cursor}")).await;
-    assert_eq!((&rest["metrics"][0]["step"], &rest["next_cursor"]), (&json!(60), &Value::Null));
+    let page = server.get(&format!("/v1/jobs/{id}/metrics?name=loss&page_size=2")).await;
+    let token = page["next_page_token"].as_str().unwrap();
+    let rest = server.get(&format!("/v1/jobs/{id}/metrics?name=loss&page_size=2&page_token={token}")).await;
+    assert_eq!((&rest["metrics"][0]["step"], &rest["next_page_token"]), (&json!(60), &json!("")));
 
     let csv = server.request(Method::GET, &format!("/v1/jobs/{id}/metrics?format=csv&name=loss")).send().await.unwrap();
     let csv = csv.text().await.unwrap();

@@ -63,11 +63,11 @@ async fn malformed_requests_get_the_error_of_the_table() {
     assert_eq!(problem["field"], "threads");
     assert!(problem["detail"].as_str().unwrap().contains("1 to 2"), "{problem}");
 
-    for query in ["state=resting", "limit=1001", "limit=-1", "cursor=x", "colour=red"] {
+    for query in ["state=resting", "page_size=1001", "page_size=-1", "page_token=x", "colour=red"] {
         expect(server.request(Method::GET, &format!("/v1/jobs?{query}")), StatusCode::BAD_REQUEST).await;
     }
     let id = server.submit(&tiny()).await;
-    for query in ["format=xml", "limit=100001", "cursor=loss", "nam=loss"] {
+    for query in ["format=xml", "page_size=100001", "page_token=loss", "nam=loss"] {
         let path = format!("/v1/jobs/{id}/metrics?{query}");
         expect(server.request(Method::GET, &path), StatusCode::BAD_REQUEST).await;
     }
@@ -148,18 +148,63 @@ async fn jobs_are_listed_newest_first_page_by_page() {
     for i in 0..5 {
         expected.insert(0, server.submit(&named(&format!("job-{i}"))).await);
     }
-    let (mut seen, mut path) = (Vec::new(), "/v1/jobs?limit=2".to_owned());
+    let (mut seen, mut path) = (Vec::new(), "/v1/jobs?page_size=2".to_owned());
     loop {
         let page = server.get(&path).await;
         seen.extend(page["jobs"].as_array().unwrap().iter().map(|job| job["id"].as_str().unwrap().to_owned()));
-        let Some(cursor) = page["next_cursor"].as_str() else { break };
-        path = format!("/v1/jobs?limit=2&cursor={cursor}");
+        let token = page["next_page_token"].as_str().unwrap();
+        if token.is_empty() {
+            break;
+        }
+        path = format!("/v1/jobs?page_size=2&page_token={token}");
     }
     assert_eq!(seen, expected);
     let mut grpc = server.jobs().await;
     let page = grpc.list_jobs(v1::ListJobsRequest { page_size: 2, ..Default::default() }).await.unwrap().into_inner();
     assert_eq!(page.jobs.iter().map(|job| &job.id).collect::<Vec<_>>(), [&expected[0], &expected[1]]);
     assert!(!page.next_page_token.is_empty());
+}
+
+#[tokio::test]
+async fn lists_are_bounded_in_bytes() {
+    const MAX_BYTES: usize = (1 << 20) + (64 << 10);
+    let (_dir, server) = server().await;
+    let layout: Vec<[f64; 2]> = (0..20_000).map(|i| [f64::from(i) / 20_000.0, 0.123_456_789_012_345_6]).collect();
+    let labels: std::collections::BTreeMap<String, String> = (0..32).map(|i| (format!("label-{i}"), "\u{1F6E9}".repeat(255))).collect();
+    let large = server.submit(&with(&json!({"environment": {"users": layout.len(), "layout": {"given": layout}}}))).await;
+    assert!(server.get(&format!("/v1/jobs/{large}")).await["environment"]["layout"]["given"][19_999].is_array());
+    let mut expected = vec![large];
+    for _ in 0..40 {
+        expected.push(server.submit(&with(&json!({"labels": labels, "seed": 7}))).await);
+    }
+    expected.reverse();
+
+    let (mut listed, mut pages, mut token) = (Vec::new(), 0, String::new());
+    loop {
+        let request = server.request(Method::GET, &format!("/v1/jobs?page_size=1000&page_token={token}"));
+        let text = request.send().await.unwrap().text().await.unwrap();
+        assert!(text.len() < MAX_BYTES, "{}", text.len());
+        let page: Value = serde_json::from_str(&text).unwrap();
+        for job in page["jobs"].as_array().unwrap() {
+            assert!(job["environment"].is_null() && job["training"].is_null() && job["seed"].is_u64());
+            listed.push(job["id"].as_str().unwrap().to_owned());
+        }
+        (pages, token) = (pages + 1, page["next_page_token"].as_str().unwrap().to_owned());
+        if token.is_empty() {
+            break;
+        }
+    }
+    assert_eq!(listed, expected);
+    assert_eq!(pages, 2);
+
+    let mut grpc = server.jobs().await;
+    let first = grpc.list_jobs(v1::ListJobsRequest { page_size: 1000, ..Default::default() }).await.unwrap().into_inner();
+    assert!(prost::Message::encoded_len(&first) < MAX_BYTES && !first.next_page_token.is_empty());
+    let next = v1::ListJobsRequest { page_token: first.next_page_token, ..Default::default() };
+    let next = grpc.list_jobs(next).await.unwrap().into_inner();
+    assert!(next.next_page_token.is_empty() && !next.jobs.last().unwrap().spec.as_ref().unwrap().fields.contains_key("environment"));
+    let ids: Vec<String> = first.jobs.into_iter().chain(next.jobs).map(|job| job.id).collect();
+    assert_eq!(ids, expected);
 }
 
 #[tokio::test]

@@ -8,8 +8,8 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use qedgix::policy::Turn;
-use qedgix::service::App;
 use qedgix::service::policies::{self, Target};
+use qedgix::service::{App, PageRequest};
 use qedgix::serving::Observation;
 use qedgix::store::{Promotion, PromotionFilter};
 use qedgix::wire::v1;
@@ -113,7 +113,7 @@ async fn aliases_of_a_policy_are_bounded() {
     }
     assert!(set(100).await.unwrap_err().to_string().contains("at most 100 aliases"));
     assert_eq!(set(99).await.unwrap(), Some(1));
-    let newest = policies::history(&server.app, "mine", None, 1, "").await.unwrap().items.remove(0);
+    let newest = policies::history(&server.app, "mine", None, &PageRequest { size: 1, ..Default::default() }).await.unwrap().items.remove(0);
     assert_eq!((newest.alias.as_str(), newest.by.as_deref()), ("a99", Some("somebody")));
 }
 

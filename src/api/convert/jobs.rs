@@ -18,8 +18,8 @@ use crate::jobs::Directive;
 use crate::recipe::{Algorithm, Preset, TrainConfig, Training};
 use crate::service::worker::Finish;
 use crate::store::{
-    Attempt, Checkpoint, CheckpointKind, Job, JobId, JobKind, JobSpec, JobState, Metric, MetricRow, NewCheckpoint, Outcome,
-    Wanted,
+    Attempt, Checkpoint, CheckpointKind, Job, JobId, JobKind, JobState, JobSummary, Metric, MetricRow, NewCheckpoint, Outcome,
+    SpecSummary, Wanted,
 };
 use crate::wire::v1;
 
@@ -86,96 +86,95 @@ fn some_of_training() -> RefOr<Schema> {
     OneOfBuilder::new().item(schema).item(null).into()
 }
 
-/// What a job does, in the fields it was submitted in.
+/// A job as lists return it: without its environment and its training configuration.
 #[derive(Debug, Serialize, ToSchema)]
-#[schema(as = JobSpec)]
-pub struct SpecView<'a> {
-    #[schema(value_type = Only)]
-    kind: JobKind,
-    #[schema(required = true)]
-    name: &'a Option<String>,
-    labels: &'a BTreeMap<String, String>,
-    threads: usize,
-    priority: i64,
-    algorithm: Algorithm,
-    preset: Preset,
-    environment: &'a EnvConfig,
-    training: &'a Training,
-    seed: u64,
-}
-
-impl<'a> From<&'a JobSpec> for SpecView<'a> {
-    fn from(spec: &'a JobSpec) -> Self {
-        let JobSpec { kind, name, labels, threads, priority, config } = spec;
-        let TrainConfig { algorithm, preset, environment, training, seed } = config;
-        Self {
-            kind: *kind,
-            name,
-            labels,
-            threads: *threads,
-            priority: *priority,
-            algorithm: *algorithm,
-            preset: *preset,
-            environment,
-            training,
-            seed: *seed,
-        }
-    }
-}
-
-/// A job as REST shows it.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Job)]
-pub struct JobView<'a> {
+#[schema(as = JobSummary)]
+pub struct SummaryView {
     #[schema(value_type = Uuid)]
     id: JobId,
     state: JobState,
-    /// What a running job was asked for and has not done yet.
+    /// What a running job was asked to do and has not done yet.
     #[schema(required = true)]
     wanted: Option<Wanted>,
-    /// Why it failed, or what became of its last attempt.
+    /// Why the job failed, or why its last attempt ended.
     #[schema(required = true)]
-    reason: &'a Option<String>,
+    reason: Option<String>,
     progress: Progress,
+    /// Attempts begun.
     attempts: u32,
+    /// Attempts that failed.
     failures: u32,
-    /// NAME:VERSION of the policy it was published as.
+    /// `NAME:VERSION` of the published policy.
     #[schema(required = true)]
-    policy: &'a Option<String>,
+    policy: Option<String>,
     last_event_id: u64,
     created_at: Timestamp,
     #[schema(required = true)]
     started_at: Option<Timestamp>,
     #[schema(required = true)]
     ended_at: Option<Timestamp>,
+    #[schema(value_type = Only)]
+    kind: JobKind,
+    #[schema(required = true)]
+    name: Option<String>,
+    labels: BTreeMap<String, String>,
+    threads: usize,
+    priority: i64,
+    algorithm: Algorithm,
+    preset: Preset,
+    seed: u64,
+}
+
+/// A job with its whole configuration.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Job)]
+pub struct JobView {
     #[serde(flatten)]
-    spec: SpecView<'a>,
+    summary: SummaryView,
+    environment: EnvConfig,
+    training: Training,
 }
 
 #[derive(Debug, Serialize, ToSchema)]
 struct Progress {
-    /// Environment steps done, and in all.
+    /// Environment steps done.
     step: u64,
+    /// Environment steps to do.
     steps: u64,
 }
 
-impl<'a> From<&'a Job> for JobView<'a> {
-    fn from(job: &'a Job) -> Self {
+impl From<JobSummary> for SummaryView {
+    fn from(job: JobSummary) -> Self {
+        let SpecSummary { kind, name, labels, threads, priority, algorithm, preset, seed, steps } = job.spec;
         Self {
             id: job.id,
             state: job.state,
             wanted: job.wanted,
-            reason: &job.reason,
-            progress: Progress { step: job.step, steps: job.spec.config.training.steps },
+            reason: job.reason,
+            progress: Progress { step: job.step, steps },
             attempts: job.attempts,
             failures: job.failures,
-            policy: &job.policy,
+            policy: job.policy,
             last_event_id: job.last_event,
             created_at: job.created_at,
             started_at: job.started_at,
             ended_at: job.ended_at,
-            spec: (&job.spec).into(),
+            kind,
+            name,
+            labels,
+            threads,
+            priority,
+            algorithm,
+            preset,
+            seed,
         }
+    }
+}
+
+impl From<Job> for JobView {
+    fn from(job: Job) -> Self {
+        let (summary, config) = job.split();
+        Self { summary: summary.into(), environment: config.environment, training: config.training }
     }
 }
 
@@ -293,16 +292,16 @@ pub fn state_filter(state: i32) -> Result<Option<JobState>, Invalid> {
     }))
 }
 
-impl From<Job> for v1::Job {
-    fn from(job: Job) -> Self {
-        let spec = serde_json::to_value(SpecView::from(&job.spec)).expect("a specification is plain data");
+impl From<JobSummary> for v1::Job {
+    fn from(job: JobSummary) -> Self {
+        let spec = serde_json::to_value(&job.spec).expect("a specification is plain data");
         Self {
             id: job.id.to_string(),
             state: v1::JobState::from(job.state).into(),
             reason: job.reason.unwrap_or_default(),
             spec: to_struct(&spec),
             step: job.step,
-            steps: job.spec.config.training.steps,
+            steps: job.spec.steps,
             attempts: job.attempts,
             failures: job.failures,
             wanted: job.wanted.map(|w| w.to_string()).unwrap_or_default(),
@@ -312,6 +311,16 @@ impl From<Job> for v1::Job {
             ended_at: job.ended_at.map(timestamp),
             last_event_id: job.last_event,
         }
+    }
+}
+
+impl From<Job> for v1::Job {
+    fn from(job: Job) -> Self {
+        let (summary, TrainConfig { environment, training, .. }) = job.split();
+        let configuration = serde_json::json!({"environment": environment, "training": training});
+        let mut job = Self::from(summary);
+        job.spec.get_or_insert_default().fields.extend(to_struct(&configuration).unwrap_or_default().fields);
+        job
     }
 }
 

@@ -10,7 +10,7 @@ use crate::api::convert::jobs::state_filter;
 use crate::api::convert::structs::from_struct;
 use crate::api::errors::in_stream;
 use crate::api::gate::Opener;
-use crate::service::{App, Error, events, jobs};
+use crate::service::{App, Error, PageRequest, events, jobs};
 use crate::store::Verb;
 use crate::wire::v1;
 use crate::wire::v1::job_service_server::{JobService, JobServiceServer};
@@ -52,9 +52,8 @@ impl JobService for Service {
     async fn list_jobs(&self, request: Request<v1::ListJobsRequest>) -> Answer<v1::ListJobsResponse> {
         let v1::ListJobsRequest { state, page_size, page_token } = request.into_inner();
         let state = state_filter(state).map_err(Error::from)?;
-        let page = jobs::list(&self.0, state, page_size, given(&page_token)).await?;
-        let jobs = page.items.into_iter().map(Into::into).collect();
-        Ok(Response::new(v1::ListJobsResponse { jobs, next_page_token: page.next.unwrap_or_default() }))
+        let page = jobs::list(&self.0, state, &PageRequest { size: page_size, token: page_token }).await?.map(Into::into);
+        Ok(Response::new(v1::ListJobsResponse { jobs: page.items, next_page_token: page.next_token }))
     }
 
     async fn cancel_job(&self, request: Request<v1::CancelJobRequest>) -> Answer<v1::Job> {
@@ -71,9 +70,9 @@ impl JobService for Service {
 
     async fn get_job_metrics(&self, request: Request<v1::GetJobMetricsRequest>) -> Answer<v1::GetJobMetricsResponse> {
         let v1::GetJobMetricsRequest { id, name, page_size, page_token } = request.into_inner();
-        let page = jobs::metrics(&self.0, &id, given(&name), page_size, given(&page_token)).await?;
-        let rows = page.items.into_iter().map(Into::into).collect();
-        Ok(Response::new(v1::GetJobMetricsResponse { rows, next_page_token: page.next.unwrap_or_default() }))
+        let page = PageRequest { size: page_size, token: page_token };
+        let page = jobs::metrics(&self.0, &id, given(&name), &page).await?.map(Into::into);
+        Ok(Response::new(v1::GetJobMetricsResponse { rows: page.items, next_page_token: page.next_token }))
     }
 
     type WatchJobStream = BoxStream<'static, Result<v1::JobEvent, Status>>;

@@ -12,7 +12,7 @@ use crate::api::convert::{request::open_session, response::act_response};
 use crate::api::errors::act_error;
 use crate::api::gate::Opener;
 use crate::invalid::in_range;
-use crate::service::{App, Error, act, policies, sessions};
+use crate::service::{App, Error, PageRequest, act, policies, sessions};
 use crate::serving::PolicySpec;
 use crate::wire::v1;
 use crate::wire::v1::policy_service_server::{PolicyService, PolicyServiceServer};
@@ -106,10 +106,9 @@ impl PolicyService for Handlers {
         &self,
         request: Request<v1::ListSessionsRequest>,
     ) -> Result<Response<v1::ListSessionsResponse>, Status> {
-        let request = request.into_inner();
-        let (page, next) = sessions::list(&self.0, request.page_size, &request.page_token)?;
-        let sessions = page.into_iter().map(Into::into).collect();
-        Ok(Response::new(v1::ListSessionsResponse { sessions, next_page_token: next.unwrap_or_default() }))
+        let v1::ListSessionsRequest { page_size, page_token } = request.into_inner();
+        let page = sessions::list(&self.0, &PageRequest { size: page_size, token: page_token })?.map(Into::into);
+        Ok(Response::new(v1::ListSessionsResponse { sessions: page.items, next_page_token: page.next_token }))
     }
 
     async fn close_session(&self, request: Request<v1::CloseSessionRequest>) -> Result<Response<v1::Session>, Status> {
@@ -120,10 +119,9 @@ impl PolicyService for Handlers {
         &self,
         request: Request<v1::ListPoliciesRequest>,
     ) -> Result<Response<v1::ListPoliciesResponse>, Status> {
-        let request = request.into_inner();
-        let (page, next) = policies::list(&self.0, request.page_size, &request.page_token)?;
-        let policies = page.into_iter().map(Into::into).collect();
-        Ok(Response::new(v1::ListPoliciesResponse { policies, next_page_token: next.unwrap_or_default() }))
+        let v1::ListPoliciesRequest { page_size, page_token } = request.into_inner();
+        let page = policies::list(&self.0, &PageRequest { size: page_size, token: page_token })?.map(Into::into);
+        Ok(Response::new(v1::ListPoliciesResponse { policies: page.items, next_page_token: page.next_token }))
     }
 
     async fn get_policy(&self, request: Request<v1::GetPolicyRequest>) -> Result<Response<v1::Policy>, Status> {

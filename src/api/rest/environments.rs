@@ -204,8 +204,8 @@ async fn create(State(app): Shared, extract::Json(body): extract::Json<Create>) 
     responses((status = 200, description = "A page of them.", body = Page), BadRequest)
 )]
 async fn list(State(app): Shared, Query(paging): Query<Paging>) -> Result<Json<Page>, Error> {
-    let (page, next) = environments::list(&app, paging.page_size, &paging.page_token)?;
-    Ok(Json(Page { environments: page.into_iter().map(shown).collect(), next_page_token: next.unwrap_or_default() }))
+    let page = environments::list(&app, &paging.into())?.map(shown);
+    Ok(Json(Page { environments: page.items, next_page_token: page.next_token }))
 }
 
 /// One environment

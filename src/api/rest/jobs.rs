@@ -15,9 +15,9 @@ use uuid::Uuid;
 use super::extract::{Json, Path, Query};
 use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
 use super::schemas;
-use crate::api::convert::jobs::{AttemptView, CheckpointView, JobRequest, JobView, MetricView, to_csv};
+use crate::api::convert::jobs::{AttemptView, CheckpointView, JobRequest, JobView, MetricView, SummaryView, to_csv};
 use crate::invalid::Invalid;
-use crate::service::{App, Error, jobs};
+use crate::service::{App, Error, PageRequest, jobs};
 use crate::store::{Job, JobState, Verb};
 
 type Shared = State<Arc<App>>;
@@ -60,7 +60,7 @@ struct Id {
     request_body = JobRequest,
     responses(
         (
-            status = 201, description = "It is in the queue, or was already: the same answer.", body = JobView<'_>,
+            status = 201, description = "It is in the queue, or was already: the same answer.", body = JobView,
             headers(
                 ("location", description = "Where it is."),
                 ("idempotency-replayed", description = "`true` if the key was used before.")
@@ -82,10 +82,10 @@ async fn submit(State(app): Shared, headers: HeaderMap, Json(document): Json<Val
     let location = (header::LOCATION, format!("/v1/jobs/{}", job.id));
     let replayed = (HeaderName::from_static("idempotency-replayed"), (!new).to_string());
     // The same answer as the first time: who repeats a request did not see it.
-    Ok((StatusCode::CREATED, [location, replayed], shown(&job)).into_response())
+    Ok((StatusCode::CREATED, [location, replayed], shown(job)).into_response())
 }
 
-fn shown(job: &Job) -> Response {
+fn shown(job: Job) -> Response {
     axum::Json(JobView::from(job)).into_response()
 }
 
@@ -96,37 +96,36 @@ struct ListQuery {
     /// Only those in this state.
     #[param(nullable = false)]
     state: Option<JobState>,
-    /// At most this many; 0: 100.
+    /// At most this many jobs; 0: 100. A page ends early before it exceeds about 1 MiB.
     #[serde(default)]
     #[param(maximum = 1000)]
-    limit: u32,
-    /// `next_cursor` of the former page.
-    #[param(value_type = schemas::Number, inline, required = false)]
-    cursor: Option<String>,
+    page_size: u32,
+    /// `next_page_token` of the previous page.
+    #[serde(default)]
+    #[param(value_type = schemas::NumberToken, inline, required = false)]
+    page_token: String,
 }
 
 #[derive(Serialize, ToSchema)]
-#[schema(as = JobPage)]
-struct Jobs<'a> {
-    jobs: Vec<JobView<'a>>,
-    /// Null on the last page.
-    #[schema(required = true)]
-    next_cursor: Option<String>,
+struct JobPage {
+    jobs: Vec<SummaryView>,
+    /// Empty on the last page.
+    next_page_token: String,
 }
 
-/// Jobs, newest first
+/// List summaries of jobs, newest first
 #[utoipa::path(
     get,
     path = "/v1/jobs",
     operation_id = "listJobs",
     tag = "jobs",
     params(ListQuery),
-    responses((status = 200, description = "A page of them.", body = Jobs<'_>), BadRequest)
+    responses((status = 200, description = "A page of jobs.", body = JobPage), BadRequest)
 )]
-async fn list(State(app): Shared, Query(query): Query<ListQuery>) -> Result<Response, Error> {
-    let page = jobs::list(&app, query.state, query.limit, query.cursor.as_deref()).await?;
-    let jobs = page.items.iter().map(Into::into).collect();
-    Ok(axum::Json(Jobs { jobs, next_cursor: page.next }).into_response())
+async fn list(State(app): Shared, Query(query): Query<ListQuery>) -> Result<axum::Json<JobPage>, Error> {
+    let ListQuery { state, page_size, page_token } = query;
+    let page = jobs::list(&app, state, &PageRequest { size: page_size, token: page_token }).await?.map(Into::into);
+    Ok(axum::Json(JobPage { jobs: page.items, next_page_token: page.next_token }))
 }
 
 /// One job
@@ -136,10 +135,10 @@ async fn list(State(app): Shared, Query(query): Query<ListQuery>) -> Result<Resp
     operation_id = "getJob",
     tag = "jobs",
     params(Id),
-    responses((status = 200, description = "As it stands.", body = JobView<'_>), BadRequest, NotFound)
+    responses((status = 200, description = "As it stands.", body = JobView), BadRequest, NotFound)
 )]
 async fn one(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    Ok(shown(&jobs::get(&app, &id).await?))
+    Ok(shown(jobs::get(&app, &id).await?))
 }
 
 /// Forget a job that has ended
@@ -163,10 +162,10 @@ async fn delete(State(app): Shared, Path(id): Path<String>) -> Result<StatusCode
     operation_id = "cancelJob",
     tag = "jobs",
     params(Id),
-    responses((status = 200, description = "As it stands now.", body = JobView<'_>), BadRequest, NotFound, Conflict)
+    responses((status = 200, description = "As it stands now.", body = JobView), BadRequest, NotFound, Conflict)
 )]
 async fn cancel(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    Ok(shown(&jobs::change(&app, &id, Verb::Cancel).await?))
+    Ok(shown(jobs::change(&app, &id, Verb::Cancel).await?))
 }
 
 /// Take a job off the machine; a running one is snapshotted first
@@ -176,10 +175,10 @@ async fn cancel(State(app): Shared, Path(id): Path<String>) -> Result<Response, 
     operation_id = "pauseJob",
     tag = "jobs",
     params(Id),
-    responses((status = 200, description = "As it stands now.", body = JobView<'_>), BadRequest, NotFound, Conflict)
+    responses((status = 200, description = "As it stands now.", body = JobView), BadRequest, NotFound, Conflict)
 )]
 async fn pause(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    Ok(shown(&jobs::change(&app, &id, Verb::Pause).await?))
+    Ok(shown(jobs::change(&app, &id, Verb::Pause).await?))
 }
 
 /// Put a paused job back into the queue, to go on where it was
@@ -189,10 +188,10 @@ async fn pause(State(app): Shared, Path(id): Path<String>) -> Result<Response, E
     operation_id = "resumeJob",
     tag = "jobs",
     params(Id),
-    responses((status = 200, description = "As it stands now.", body = JobView<'_>), BadRequest, NotFound, Conflict, Draining)
+    responses((status = 200, description = "As it stands now.", body = JobView), BadRequest, NotFound, Conflict, Draining)
 )]
 async fn resume(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    Ok(shown(&jobs::change(&app, &id, Verb::Resume).await?))
+    Ok(shown(jobs::change(&app, &id, Verb::Resume).await?))
 }
 
 #[derive(Clone, Copy, Default, Deserialize, ToSchema)]
@@ -213,28 +212,27 @@ struct MetricsQuery {
     #[serde(default)]
     #[param(inline)]
     format: Format,
-    /// At most this many rows; 0: 10 000, or all of them as CSV.
+    /// At most this many rows; 0: 10 000, or all rows as CSV.
     #[serde(default)]
     #[param(maximum = 100_000)]
-    limit: u32,
-    /// Where the former page says the next one begins.
-    #[param(value_type = schemas::MetricCursor, inline, required = false)]
-    cursor: Option<String>,
+    page_size: u32,
+    /// `next_page_token` of the previous page.
+    #[serde(default)]
+    #[param(value_type = schemas::MetricToken, inline, required = false)]
+    page_token: String,
 }
 
-/// Behind which the next page begins, for formats without a place for it.
-const NEXT_CURSOR: HeaderName = HeaderName::from_static("qedgix-next-cursor");
+/// The token of the next page of a format that has no field for it.
+const NEXT_PAGE_TOKEN: HeaderName = HeaderName::from_static("qedgix-next-page-token");
 
 #[derive(Serialize, ToSchema)]
-#[schema(as = MetricPage)]
-struct Metrics {
+struct MetricPage {
     metrics: Vec<MetricView>,
-    /// Null on the last page.
-    #[schema(required = true)]
-    next_cursor: Option<String>,
+    /// Empty on the last page.
+    next_page_token: String,
 }
 
-/// Figures that a job has reported, by name and step
+/// List the metrics of a job by name and step
 #[utoipa::path(
     get,
     path = "/v1/jobs/{id}/metrics",
@@ -243,36 +241,32 @@ struct Metrics {
     params(Id, MetricsQuery),
     responses(
         (
-            status = 200, description = "A page of rows; as CSV, `qedgix-next-cursor` says where the next one begins.",
-            content((Metrics = "application/json"), (String = "text/csv"))
+            status = 200, description = "A page of rows.", content((MetricPage = "application/json"), (String = "text/csv")),
+            headers(("qedgix-next-page-token", description = "With CSV, the token of the next page, if there is one."))
         ),
         BadRequest, NotFound
     )
 )]
 async fn metrics(State(app): Shared, Path(id): Path<String>, Query(query): Query<MetricsQuery>) -> Result<Response, Error> {
-    let MetricsQuery { name, format, limit, cursor } = query;
-    let mut page = jobs::metrics(&app, &id, name.as_deref(), limit, cursor.as_deref()).await?;
-    match format {
-        Format::Json => {
-            let metrics = page.items.into_iter().map(Into::into).collect();
-            Ok(axum::Json(Metrics { metrics, next_cursor: page.next }).into_response())
-        }
-        Format::Csv => {
-            // A table is wanted whole, unless a limit says otherwise.
-            while limit == 0
-                && let Some(next) = page.next.take()
-            {
-                let more = jobs::metrics(&app, &id, name.as_deref(), limit, Some(&next)).await?;
-                page.items.extend(more.items);
-                page.next = more.next;
-            }
-            let mut response = ([(header::CONTENT_TYPE, "text/csv; charset=utf-8")], to_csv(&page.items)).into_response();
-            if let Some(next) = page.next.and_then(|next| next.parse().ok()) {
-                response.headers_mut().insert(NEXT_CURSOR, next);
-            }
-            Ok(response)
-        }
+    let MetricsQuery { name, format, page_size, page_token } = query;
+    let mut request = PageRequest { size: page_size, token: page_token };
+    let mut page = jobs::metrics(&app, &id, name.as_deref(), &request).await?;
+    if let Format::Json = format {
+        let page = page.map(Into::into);
+        return Ok(axum::Json(MetricPage { metrics: page.items, next_page_token: page.next_token }).into_response());
     }
+    // CSV has all rows unless the request sets a page size.
+    while page_size == 0 && !page.next_token.is_empty() {
+        request.token = std::mem::take(&mut page.next_token);
+        let more = jobs::metrics(&app, &id, name.as_deref(), &request).await?;
+        page.items.extend(more.items);
+        page.next_token = more.next_token;
+    }
+    let mut response = ([(header::CONTENT_TYPE, "text/csv; charset=utf-8")], to_csv(&page.items)).into_response();
+    if let Some(token) = page.next_token.parse().ok().filter(|_| !page.next_token.is_empty()) {
+        response.headers_mut().insert(NEXT_PAGE_TOKEN, token);
+    }
+    Ok(response)
 }
 
 #[derive(Serialize, ToSchema)]

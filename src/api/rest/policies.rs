@@ -18,7 +18,7 @@ use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
 use super::schemas;
 use super::wording::Policy;
 use crate::service::keys::Caller;
-use crate::service::{App, Error, policies};
+use crate::service::{App, Error, PageRequest, policies};
 use crate::serving::{Described, PolicySpec};
 use crate::store::Promotion;
 use crate::wire::v1;
@@ -49,13 +49,19 @@ pub(super) fn router() -> OpenApiRouter<Arc<App>> {
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct Paging {
-    /// At most this many; 0: 100.
+    /// At most this many items; 0: 100. A page ends early before it exceeds about 1 MiB.
     #[serde(default)]
     #[param(maximum = 1000)]
-    pub page_size: u32,
-    /// `next_page_token` of the former page.
+    page_size: u32,
+    /// `next_page_token` of the previous page.
     #[serde(default)]
-    pub page_token: String,
+    page_token: String,
+}
+
+impl From<Paging> for PageRequest {
+    fn from(paging: Paging) -> Self {
+        Self { size: paging.page_size, token: paging.page_token }
+    }
 }
 
 /// A policy in a path.
@@ -119,8 +125,8 @@ struct Page {
     responses((status = 200, description = "A page of them.", body = Page), BadRequest)
 )]
 async fn list(State(app): Shared, Query(paging): Query<Paging>) -> Result<Json<Page>, Error> {
-    let (page, next) = policies::list(&app, paging.page_size, &paging.page_token)?;
-    Ok(Json(Page { policies: page.into_iter().map(shown).collect(), next_page_token: next.unwrap_or_default() }))
+    let page = policies::list(&app, &paging.into())?.map(shown);
+    Ok(Json(Page { policies: page.items, next_page_token: page.next_token }))
 }
 
 /// One policy version
@@ -377,11 +383,11 @@ struct HistoryQuery {
     /// Only this alias.
     #[param(value_type = schemas::Name, inline, required = false)]
     alias: Option<String>,
-    /// At most this many; 0: 100.
+    /// At most this many moves; 0: 100.
     #[serde(default)]
     #[param(maximum = 1000)]
     page_size: u32,
-    /// `next_page_token` of the former page.
+    /// `next_page_token` of the previous page.
     #[serde(default)]
     #[param(value_type = schemas::NumberToken, inline, required = false)]
     page_token: String,
@@ -434,7 +440,7 @@ async fn history(
     Query(query): Query<HistoryQuery>,
 ) -> Result<Json<History>, Error> {
     let HistoryQuery { alias, page_size, page_token } = query;
-    let page = policies::history(&app, &policy, alias.as_deref(), page_size, &page_token).await?;
-    let history = page.items.into_iter().map(Into::into).collect();
-    Ok(Json(History { history, next_page_token: page.next.unwrap_or_default() }))
+    let page = PageRequest { size: page_size, token: page_token };
+    let page = policies::history(&app, &policy, alias.as_deref(), &page).await?.map(Into::into);
+    Ok(Json(History { history: page.items, next_page_token: page.next_token }))
 }

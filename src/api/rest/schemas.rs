@@ -72,10 +72,8 @@ texts! {
     OptionalPolicySpec = concat!("^(", name!(), "(@", name!(), "|:", version!(), ")?)?$");
     /// Where the next page begins: digits, or nothing for the first.
     NumberToken = "^[0-9]{0,18}$";
-    /// The same, never nothing.
-    Number = "^[0-9]{1,18}$";
-    /// Behind which metric a page begins.
-    MetricCursor = "^[A-Za-z0-9_/.-]{1,63}@[0-9]{1,18}$";
+    /// The metric after which a page begins; empty for the first page.
+    MetricToken = "^([A-Za-z0-9_/.-]{1,63}@[0-9]{1,18})?$";
     /// Seconds with an `s`: `0.000021000s`.
     Seconds = "^[0-9]+\\.[0-9]{9}s$";
     /// SHA-256 in hexadecimal.

@@ -79,9 +79,8 @@ async fn open(State(app): State<Arc<App>>, extract::Json(open): extract::Json<Op
     responses((status = 200, description = "A page of them.", body = Page), BadRequest)
 )]
 async fn list(State(app): State<Arc<App>>, Query(paging): Query<Paging>) -> Result<Json<Page>, Error> {
-    let (page, next) = sessions::list(&app, paging.page_size, &paging.page_token)?;
-    let sessions = page.into_iter().map(|session| v1::Session::from(session).into()).collect();
-    Ok(Json(Page { sessions, next_page_token: next.unwrap_or_default() }))
+    let page = sessions::list(&app, &paging.into())?.map(|session| v1::Session::from(session).into());
+    Ok(Json(Page { sessions: page.items, next_page_token: page.next_token }))
 }
 
 /// One session

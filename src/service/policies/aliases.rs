@@ -4,9 +4,8 @@ use std::collections::BTreeMap;
 
 use super::{Shelf, in_turn};
 use crate::invalid::Invalid;
-use crate::service::jobs::{Page, number};
-use crate::service::sessions::page_size;
-use crate::service::{App, Error};
+use crate::service::paging::number;
+use crate::service::{App, Error, Page, PageRequest};
 use crate::serving::{Kind, PolicyRef, PolicySpec, Registry, Which, check_name};
 use crate::store::{AliasMove, Promotion, PromotionFilter};
 
@@ -87,24 +86,22 @@ pub async fn delete_alias(app: &App, target: Target) -> Result<(), Error> {
     .await
 }
 
-/// Moves of aliases of the policy `name`, newest first; of one alias if it is named. `size` 0 is 100.
+/// Moves of aliases of the policy `name`, newest first; of one alias if `alias` is set.
 ///
 /// # Errors
-/// There is no such policy, a page size out of range, a token that no page gave.
-pub async fn history(app: &App, name: &str, alias: Option<&str>, size: u32, token: &str) -> Result<Page<Promotion>, Error> {
+/// [`Error::NotFound`]: there is no such policy. [`Error::Invalid`]: the page size is out of range, or no page returned the
+/// token.
+pub async fn history(app: &App, name: &str, alias: Option<&str>, page: &PageRequest) -> Result<Page<Promotion>, Error> {
     check_name("policy", name)?;
     if let Some(alias) = alias {
         check_name("alias", alias)?;
     }
     app.registry.aliases(name)?;
-    let limit = page_size(size)?;
-    let wrong = || Invalid::new("page_token", format!("{token:?}"), "the next_page_token of the former page");
-    let before = if token.is_empty() { None } else { Some(number(token).ok_or_else(wrong)?) };
-    let mut items = app.store.promotions(PromotionFilter { name, alias, before }, limit as u32 + 1).await?;
-    let more = items.len() > limit;
-    items.truncate(limit);
-    let next = items.last().filter(|_| more).map(|last| last.id.to_string());
-    Ok(Page { items, next })
+    let (limit, before) = (page.usual_limit()?, page.position(number)?);
+    let mut moves = app.store.promotions(PromotionFilter { name, alias, before }, limit as u32 + 1).await?;
+    let more = moves.len() > limit;
+    moves.truncate(limit);
+    Ok(Page::new(moves, more, |last| last.id.to_string()))
 }
 
 fn check(target: &Target) -> Result<(), Invalid> {

@@ -13,19 +13,19 @@ pub use aliases::{Target, aliases, delete_alias, history, set_alias};
 pub use loading::{IndexEntry, index, load, load_policy, unload_policy};
 pub use publish::{Source, Upload, check_publishable, publish, upload};
 
-use super::sessions::page_size;
-use super::{App, Error};
+use super::paging::json_bytes;
+use super::{App, Error, Page, PageRequest};
 use crate::serving::{Described, Kind, PolicyRef, PolicySpec, Registry};
 use crate::store::Store;
 
-/// A page of policies in order of names, each in its newest version, and the token of the next page.
+/// A page of policies in order of names, each in its newest version.
 ///
 /// # Errors
-/// A page size out of range.
-pub fn list(app: &App, size: u32, token: &str) -> Result<(Vec<Described>, Option<String>), Error> {
-    let (page, more) = app.registry.list(token, page_size(size)?);
-    let next = page.last().filter(|_| more).map(|last| last.about.reference.name.clone());
-    Ok((page, next))
+/// [`Error::Invalid`]: the page size is out of range.
+pub fn list(app: &App, page: &PageRequest) -> Result<Page<Described>, Error> {
+    let (policies, more) = app.registry.list(&page.token, page.usual_limit()?);
+    let bytes = |policy: &Described| json_bytes(&policy.about.config) + json_bytes(&policy.about.metrics);
+    Ok(Page::bounded(policies, more, bytes, |policy| policy.about.reference.name.clone()))
 }
 
 /// The version that `spec` names, loaded or not.
