@@ -54,12 +54,7 @@ impl<T> Page<T> {
     }
 
     /// The same of items of any size: the page ends before it exceeds [`MAX_BYTES`].
-    pub(super) fn bounded(
-        mut items: Vec<T>,
-        more: bool,
-        bytes: impl Fn(&T) -> usize,
-        token: impl Fn(&T) -> String,
-    ) -> Self {
+    pub(super) fn bounded(mut items: Vec<T>, more: bool, bytes: impl Fn(&T) -> usize, token: impl Fn(&T) -> String) -> Self {
         let mut total = 0;
         let excess = items.iter().position(|item| {
             total += bytes(item);
@@ -113,7 +108,10 @@ mod tests {
         let page = |sizes: &[usize], more| Page::bounded(sizes.to_vec(), more, |&size| size, usize::to_string);
         assert_eq!(page(&[1, 2, 3], false), Page { items: vec![1, 2, 3], next_token: String::new() });
         assert_eq!(page(&[1, 2, 3], true).next_token, "3");
-        assert_eq!(page(&[1, MAX_BYTES - 1, 3], false), Page { items: vec![1, MAX_BYTES - 1], next_token: (MAX_BYTES - 1).to_string() });
+        assert_eq!(
+            page(&[1, MAX_BYTES - 1, 3], false),
+            Page { items: vec![1, MAX_BYTES - 1], next_token: (MAX_BYTES - 1).to_string() }
+        );
         assert_eq!(page(&[MAX_BYTES + 1, 2], false).items, [MAX_BYTES + 1]);
         assert_eq!(page(&[MAX_BYTES + 1], false).next_token, "");
     }

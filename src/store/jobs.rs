@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
-use jiff::Timestamp;
 use futures::TryStreamExt;
+use jiff::Timestamp;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use sqlx::{FromRow, Sqlite, SqliteConnection, Transaction};
@@ -411,7 +411,8 @@ impl Store {
     ) -> Result<(Vec<JobSummary>, bool)> {
         /// What a summary takes besides its texts.
         const FIXED: usize = 512;
-        let sql = "SELECT number, id, state, wanted, reason, attempts, failures, step, policy, seq, created_at, started_at, ended_at,
+        let sql =
+            "SELECT number, id, state, wanted, reason, attempts, failures, step, policy, seq, created_at, started_at, ended_at,
                    json_extract(spec, '$.kind', '$.name', '$.labels', '$.threads', '$.priority', '$.config.algorithm',
                    '$.config.preset', '$.config.seed', '$.config.training.steps') AS spec
                    FROM jobs WHERE (?1 IS NULL OR state = ?1) AND (?2 IS NULL OR number < ?2) ORDER BY number DESC";

@@ -170,7 +170,8 @@ async fn lists_are_bounded_in_bytes() {
     const MAX_BYTES: usize = (1 << 20) + (64 << 10);
     let (_dir, server) = server().await;
     let layout: Vec<[f64; 2]> = (0..20_000).map(|i| [f64::from(i) / 20_000.0, 0.123_456_789_012_345_6]).collect();
-    let labels: std::collections::BTreeMap<String, String> = (0..32).map(|i| (format!("label-{i}"), "\u{1F6E9}".repeat(255))).collect();
+    let labels: std::collections::BTreeMap<String, String> =
+        (0..32).map(|i| (format!("label-{i}"), "\u{1F6E9}".repeat(255))).collect();
     let large = server.submit(&with(&json!({"environment": {"users": layout.len(), "layout": {"given": layout}}}))).await;
     assert!(server.get(&format!("/v1/jobs/{large}")).await["environment"]["layout"]["given"][19_999].is_array());
     let mut expected = vec![large];
@@ -202,7 +203,9 @@ async fn lists_are_bounded_in_bytes() {
     assert!(prost::Message::encoded_len(&first) < MAX_BYTES && !first.next_page_token.is_empty());
     let next = v1::ListJobsRequest { page_token: first.next_page_token, ..Default::default() };
     let next = grpc.list_jobs(next).await.unwrap().into_inner();
-    assert!(next.next_page_token.is_empty() && !next.jobs.last().unwrap().spec.as_ref().unwrap().fields.contains_key("environment"));
+    assert!(
+        next.next_page_token.is_empty() && !next.jobs.last().unwrap().spec.as_ref().unwrap().fields.contains_key("environment")
+    );
     let ids: Vec<String> = first.jobs.into_iter().chain(next.jobs).map(|job| job.id).collect();
     assert_eq!(ids, expected);
 }

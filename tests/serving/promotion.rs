@@ -113,7 +113,11 @@ async fn aliases_of_a_policy_are_bounded() {
     }
     assert!(set(100).await.unwrap_err().to_string().contains("at most 100 aliases"));
     assert_eq!(set(99).await.unwrap(), Some(1));
-    let newest = policies::history(&server.app, "mine", None, &PageRequest { size: 1, ..Default::default() }).await.unwrap().items.remove(0);
+    let newest = policies::history(&server.app, "mine", None, &PageRequest { size: 1, ..Default::default() })
+        .await
+        .unwrap()
+        .items
+        .remove(0);
     assert_eq!((newest.alias.as_str(), newest.by.as_deref()), ("a99", Some("somebody")));
 }
 
