@@ -3,14 +3,14 @@
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use qedgix::learner::{Algorithm, Learner, Preset, TrainConfig};
-use qedgix::policy::{Learned, Policy, Slot, Turn};
+use qedgix::policy::{FleetStep, LearnedPolicy, Policy, Slot};
 
 fn act(c: &mut Criterion) {
     let mut group = c.benchmark_group("served answer");
     for (uavs, users) in [(3, 5), (20, 100), (1000, 10_000)] {
         let config = TrainConfig::preset(Algorithm::Qedgix, Preset::Practical);
         let learner = Learner::new(&config, 1).expect("a thread");
-        let policy = Learned::new(config.agent(), config.dims(), learner.agent_parameters().to_vec()).expect("its own");
+        let policy = LearnedPolicy::new(config.agent(), config.dims(), learner.agent_parameters().to_vec()).expect("its own");
         // One user per 1/10 of a square as wide as the detection range, however many there are.
         let width = 0.28 * (users as f64 / 10.0).sqrt();
         let spread = |n: usize, step: f64| -> Vec<[f64; 2]> {
@@ -24,7 +24,7 @@ fn act(c: &mut Criterion) {
             b.iter(|| {
                 slot.set_scene(&own, &all, &aoi, 0.28);
                 let (memory, headings) = (&mut memory[..], &mut headings[..]);
-                policy.act(&mut [Turn { slot: &slot, step: 0, memory, headings, q_values: None }]);
+                policy.act(&mut [FleetStep { slot: &slot, step: 0, memory, headings, q_values: None }]);
             });
         });
     }

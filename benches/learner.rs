@@ -9,8 +9,8 @@ use std::time::Duration;
 
 use criterion::{BatchSize, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use qedgix::learner::{Algorithm, Learner, MixerKind, Preset, TrainConfig};
-use qedgix::nn::matmul::{Lhs, Out, Rhs, Start, matmul};
-use qedgix::policy::{Actor, Aggregation, Identity, Observation, StepInput, TOKEN};
+use qedgix::nn::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
+use qedgix::policy::{Actor, Aggregation, Identity, ObservationKind, StepInput, TOKEN};
 use sample::episodes;
 
 /// What `reference/torch_qedgix.py speed` runs: flat, one-hot, mean, qmix.
@@ -74,7 +74,7 @@ fn products(c: &mut Criterion) {
                 || vec![0.0_f32; m * n],
                 |c| {
                     let out = Out { data: c, stride: n };
-                    matmul((m, k, n), Lhs::rows(&a, k), Rhs { data: &b, stride: n }, out, Start::Zero);
+                    matmul((m, k, n), Lhs::rows(&a, k), Rhs { data: &b, stride: n }, out, Accumulate::Zero);
                 },
                 BatchSize::NumIterations(100),
             );

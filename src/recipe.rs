@@ -8,8 +8,8 @@ use utoipa::ToSchema;
 
 use crate::env::EnvConfig;
 use crate::invalid::{Invalid, expectation, in_range};
-use crate::policy::mixer::Mixing;
-use crate::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, Observation};
+use crate::policy::mixer::MixerKind;
+use crate::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, ObservationKind};
 
 /// The algorithms of the paper and its usual company.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -43,38 +43,13 @@ pub enum Preset {
     Practical,
 }
 
-/// How the UAVs' values become one (spec 4).
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum MixerKind {
-    /// Hypernetworks on the flat state.
-    Qmix,
-    /// Hypernetworks on a permutation-invariant summary.
-    Invariant,
-    /// The sum.
-    Vdn,
-    /// Each UAV has its own target (`iql`).
-    None,
-}
-
-impl From<MixerKind> for Mixing {
-    fn from(kind: MixerKind) -> Self {
-        match kind {
-            MixerKind::Qmix => Self::Qmix,
-            MixerKind::Invariant => Self::Invariant,
-            MixerKind::Vdn => Self::Vdn,
-            MixerKind::None => Self::None,
-        }
-    }
-}
-
 /// Everything about learning that is not the environment. `steps` counts environment slots.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 #[allow(clippy::struct_excessive_bools, reason = "a document of independent switches")]
 pub struct Training {
     /// Observation of every node.
-    pub observation: Observation,
+    pub observation: ObservationKind,
     /// Identity of a UAV.
     pub identity: Identity,
     /// Aggregation of `edgeconv`.
@@ -196,7 +171,7 @@ impl TrainConfig {
     pub fn preset(algorithm: Algorithm, preset: Preset) -> Self {
         let mut environment = EnvConfig::default();
         let mut training = Training {
-            observation: Observation::Flat,
+            observation: ObservationKind::Flat,
             identity: Identity::Onehot,
             aggregation: Aggregation::Mean,
             layers: 2,

@@ -9,7 +9,7 @@ use futures::FutureExt;
 use futures::future::BoxFuture;
 use jiff::Timestamp;
 use qedgix::learner::{Algorithm, Learner, Preset, TrainConfig};
-use qedgix::policy::{Learned, Slot};
+use qedgix::policy::{LearnedPolicy, Slot};
 use qedgix::serving::{Engine, EngineConfig, Error, LoadedPolicy, Outcome, PolicyRef, Room, Task};
 
 const UAVS: usize = 3;
@@ -18,7 +18,7 @@ const USERS: usize = 5;
 fn policy() -> Arc<LoadedPolicy> {
     let config = TrainConfig::preset(Algorithm::Qedgix, Preset::Practical);
     let learner = Learner::new(&config, 1).expect("a thread");
-    let policy = Learned::new(config.agent(), config.dims(), learner.agent_parameters().to_vec()).expect("its own");
+    let policy = LearnedPolicy::new(config.agent(), config.dims(), learner.agent_parameters().to_vec()).expect("its own");
     let reference = PolicyRef { name: "p".into(), version: 1, digest: [0; 32] };
     Arc::new(LoadedPolicy::baseline(reference, "of a test", Arc::new(policy), Timestamp::UNIX_EPOCH))
 }

@@ -4,11 +4,11 @@ use std::sync::Arc;
 
 use qedgix::env::{EnvConfig, EpisodeMetrics, Point};
 use qedgix::learner::{difference, evaluate, layouts};
-use qedgix::policy::baselines::{self, LIST, World};
-use qedgix::policy::{Needs, Policy, Slot, Turn};
+use qedgix::policy::baselines::{self, EnvParams, LIST};
+use qedgix::policy::{FleetStep, Policy, RequiredInput, Slot};
 
 fn policy(name: &str) -> Arc<dyn Policy> {
-    baselines::by_name(name, World::default()).unwrap()
+    baselines::by_name(name, EnvParams::default()).unwrap()
 }
 
 fn flown(name: &str, env: &EnvConfig, episodes: usize) -> Vec<EpisodeMetrics> {
@@ -66,7 +66,7 @@ fn a_tour_is_planned_once_and_again_when_users_have_walked() {
     let mut memory = vec![0.0; policy.memory_len(3, 5)];
     let fly = |slot: &Slot, step, memory: &mut Vec<f32>| {
         let mut headings = [99; 3];
-        policy.act(&mut [Turn { slot, step, memory, headings: &mut headings, q_values: None }]);
+        policy.act(&mut [FleetStep { slot, step, memory, headings: &mut headings, q_values: None }]);
         headings
     };
     fly(&scene(&users), 0, &mut memory);
@@ -130,8 +130,8 @@ impl Fleet {
         Self { slot: Slot::from_scene(&own, &all, &aoi, policy.detection_range()), memory, headings: vec![99; uavs] }
     }
 
-    fn turn(&mut self, step: u64) -> Turn<'_> {
-        Turn { slot: &self.slot, step, memory: &mut self.memory, headings: &mut self.headings, q_values: None }
+    fn turn(&mut self, step: u64) -> FleetStep<'_> {
+        FleetStep { slot: &self.slot, step, memory: &mut self.memory, headings: &mut self.headings, q_values: None }
     }
 }
 
@@ -142,7 +142,7 @@ fn fleets_of_different_sizes_share_a_batch_without_noticing() {
         let fleets = || [(1, 1, 5), (3, 5, 6), (6, 2, 7)].map(|(m, n, seed)| Fleet::new(&*policy, m, n, seed));
         let (mut together, mut alone) = (fleets(), fleets());
         for step in 0..5 {
-            let mut turns: Vec<Turn<'_>> = together.iter_mut().map(|f| f.turn(step)).collect();
+            let mut turns: Vec<FleetStep<'_>> = together.iter_mut().map(|f| f.turn(step)).collect();
             policy.act(&mut turns);
             for fleet in alone.iter_mut().rev() {
                 policy.act(&mut [fleet.turn(step)]);
@@ -158,12 +158,12 @@ fn fleets_of_different_sizes_share_a_batch_without_noticing() {
 
 #[test]
 fn detections_are_enough_where_the_scene_is_not_needed() {
-    for b in LIST.iter().filter(|b| b.needs < Needs::FullScene) {
+    for b in LIST.iter().filter(|b| b.needs < RequiredInput::FullScene) {
         let policy = policy(b.name);
         let mut scene = Fleet::new(&*policy, 3, 5, 11);
         let mut graph = Fleet::new(&*policy, 3, 5, 11);
         let lists: Vec<_> = (0..8).map(|i| scene.slot.detections(i).to_vec()).collect();
-        let own = (b.needs == Needs::OwnPositions).then(|| scene.slot.uav_positions().unwrap().to_vec());
+        let own = (b.needs == RequiredInput::OwnPositions).then(|| scene.slot.uav_positions().unwrap().to_vec());
         graph.slot = Slot::from_detections(own, 3, scene.slot.aoi().to_vec(), &lists);
         for step in 0..5 {
             policy.act(&mut [scene.turn(step)]);
@@ -199,11 +199,11 @@ fn values_are_absent_and_fleets_are_checked() {
     let policy = policy("sweep");
     let mut fleet = Fleet::new(&*policy, 2, 2, 0);
     let mut q = vec![0.0; 16];
-    policy.act(&mut [Turn { q_values: Some(&mut q), ..fleet.turn(0) }]);
+    policy.act(&mut [FleetStep { q_values: Some(&mut q), ..fleet.turn(0) }]);
     assert!(q.iter().all(|q| q.is_nan()));
     assert!(policy.check_fleet(3, 5).is_ok());
     for (m, n) in [(0, 5), (3, 0), (5000, 1), (4096, 60_000)] {
         assert!(policy.check_fleet(m, n).is_err(), "({m}, {n})");
     }
-    assert!(baselines::by_name("no-such", World::default()).is_none());
+    assert!(baselines::by_name("no-such", EnvParams::default()).is_none());
 }

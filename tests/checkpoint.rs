@@ -4,7 +4,7 @@ use proptest::prelude::*;
 use qedgix::checkpoint::{self, Checkpoint, Error};
 use qedgix::env::EpisodeMetrics;
 use qedgix::learner::{Algorithm, MixerKind, Preset, TrainConfig, evaluate, layouts};
-use qedgix::policy::{Policy, Slot, Turn};
+use qedgix::policy::{FleetStep, Policy, Slot};
 use rand::RngExt;
 use serde_json::{Value, json};
 
@@ -250,7 +250,13 @@ fn fly(checkpoint: &Checkpoint, seed: u64) {
             let aoi: Vec<f32> = (0..users).map(|user| (user * 1000) as f32).collect();
             let slot = Slot::from_scene(&at, &of, &aoi, policy.detection_range());
             let (mut headings, mut q) = (vec![255; uavs], vec![0.0; uavs * policy.actions()]);
-            policy.act(&mut [Turn { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: Some(&mut q) }]);
+            policy.act(&mut [FleetStep {
+                slot: &slot,
+                step,
+                memory: &mut memory,
+                headings: &mut headings,
+                q_values: Some(&mut q),
+            }]);
             assert!(headings.iter().all(|&heading| usize::from(heading) < policy.actions()), "{headings:?}");
         }
     }

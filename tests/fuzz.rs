@@ -16,7 +16,7 @@ use prost::Message;
 use qedgix::api::{grpc, rest};
 use qedgix::checkpoint::{Checkpoint, layout};
 use qedgix::config::Config;
-use qedgix::policy::{Policy, Slot, Turn};
+use qedgix::policy::{FleetStep, Policy, Slot};
 use qedgix::recipe::{Algorithm, Preset, TrainConfig};
 use qedgix::server::{self, DataDir};
 use qedgix::service::App;
@@ -328,7 +328,7 @@ impl Subject {
         }
         let (mut memory, mut headings) = (vec![0.0; policy.memory_len(3, 5)], [0; 3]);
         policy.start(3, 5, 1, &mut memory);
-        policy.act(&mut [Turn { slot: &self.slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: None }]);
+        policy.act(&mut [FleetStep { slot: &self.slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: None }]);
         assert!(headings.iter().all(|&heading| usize::from(heading) < policy.actions()));
         "accepted".into()
     }

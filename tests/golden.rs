@@ -12,9 +12,9 @@ use std::str::FromStr;
 use qedgix::learner::Episodes;
 use qedgix::learner::objective::{Objective, Returns, Trace};
 use qedgix::nn::Adam;
-use qedgix::policy::mixer::Mixing;
+use qedgix::policy::mixer::MixerKind;
 use qedgix::policy::{
-    AgentConfig, Aggregation, Dims, Geometry, GeometryConfig, Gnn, Identity, Observation, TOKEN, flat_observation, flat_state,
+    AgentConfig, Aggregation, Dims, Geometry, GeometryConfig, Gnn, Identity, ObservationKind, TOKEN, flat_observation, flat_state,
 };
 use safetensors::{Dtype, SafeTensors};
 
@@ -63,7 +63,7 @@ fn golden_files(dir: &Path) -> Outcome<Vec<PathBuf>> {
 struct Config {
     agent: AgentConfig,
     dims: Dims,
-    mixing: Mixing,
+    mixing: MixerKind,
     returns: Returns,
     batch: usize,
     learning_rate: f64,
@@ -99,8 +99,8 @@ impl Config {
                 _ => return unknown("agg"),
             },
             observation: match text("encoder")? {
-                "flat" => Observation::Flat,
-                "set" => Observation::Set,
+                "flat" => ObservationKind::Flat,
+                "set" => ObservationKind::Set,
                 _ => return unknown("encoder"),
             },
             identity: match text("ident")? {
@@ -128,9 +128,9 @@ impl Config {
                 slots: count("K")?,
             },
             mixing: match text("mixer")? {
-                "qmix" => Mixing::Qmix,
-                "invariant" => Mixing::Invariant,
-                "vdn" => Mixing::Vdn,
+                "qmix" => MixerKind::Qmix,
+                "invariant" => MixerKind::Invariant,
+                "vdn" => MixerKind::Vdn,
                 _ => return unknown("mixer"),
             },
             returns: Returns { gamma: real("gamma")?, lambda: real("td_lambda")? },

@@ -3,9 +3,11 @@
 mod sample;
 
 use qedgix::learner::objective::{Objective, Returns};
-use qedgix::nn::{Batch, Graph, GraphLayer, Gru, HIDDEN, LayerCache, LayerScratch, Layout, Linear, Mlp, MlpCache, Weights};
-use qedgix::policy::mixer::Mixing;
-use qedgix::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, Observation};
+use qedgix::nn::{
+    Batch, Graph, GraphLayer, Gru, HIDDEN, LayerCache, LayerScratch, Linear, Mlp, MlpCache, ParameterLayout, Weights,
+};
+use qedgix::policy::mixer::MixerKind;
+use qedgix::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, ObservationKind};
 use qedgix::rng;
 use rand::RngExt;
 use sample::{AGENT, episodes};
@@ -54,19 +56,19 @@ fn check(
 trait Layer {
     fn forward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>) -> Batch<f64>;
     fn backward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>, dy: Batch<f64>, grads: &mut [f64]) -> Batch<f64>;
-    fn prepare(&self, flat: &[f64], turned: &mut [f64]);
+    fn prepare(&self, flat: &[f64], transposed: &mut [f64]);
 }
 
-fn check_layer(name: &str, layout: &Layout, layer: &mut impl Layer, width: usize, samples: usize) {
+fn check_layer(name: &str, layout: &ParameterLayout, layer: &mut impl Layer, width: usize, samples: usize) {
     let params = layout.len();
     let mut at = uniform(params, &format!("{name} parameters"));
     at.iter_mut().for_each(|p| *p *= 0.2);
     at.extend(uniform(width * samples, name));
     let mut run = |at: &[f64], cotangent: Option<&[f64]>| -> (Vec<f64>, Vec<f64>) {
         let (flat, x) = at.split_at(params);
-        let mut turned = vec![0.0; params];
-        layer.prepare(flat, &mut turned);
-        let w = Weights { flat, turned: &turned };
+        let mut transposed = vec![0.0; params];
+        layer.prepare(flat, &mut transposed);
+        let w = Weights { flat, transposed: &transposed };
         let mut input = Batch::default();
         input.reset(width, samples);
         input.as_mut_slice().copy_from_slice(x);
@@ -91,8 +93,8 @@ fn check_layer(name: &str, layout: &Layout, layer: &mut impl Layer, width: usize
 struct Plain(Linear);
 
 impl Layer for Plain {
-    fn prepare(&self, flat: &[f64], turned: &mut [f64]) {
-        self.0.prepare(flat, turned);
+    fn prepare(&self, flat: &[f64], transposed: &mut [f64]) {
+        self.0.prepare(flat, transposed);
     }
 
     fn forward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>) -> Batch<f64> {
@@ -112,7 +114,7 @@ impl Layer for Plain {
 
 #[test]
 fn linear() {
-    let mut layout = Layout::default();
+    let mut layout = ParameterLayout::default();
     let mut layer = Plain(Linear::new(&mut layout, "linear", 21, 9));
     check_layer("linear", &layout, &mut layer, 21, 7);
 }
@@ -120,8 +122,8 @@ fn linear() {
 struct Split(Mlp<96>, MlpCache<f64>);
 
 impl Layer for Split {
-    fn prepare(&self, flat: &[f64], turned: &mut [f64]) {
-        self.0.prepare(flat, turned);
+    fn prepare(&self, flat: &[f64], transposed: &mut [f64]) {
+        self.0.prepare(flat, transposed);
     }
 
     fn forward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>) -> Batch<f64> {
@@ -135,7 +137,7 @@ impl Layer for Split {
         self.0.backward(w.flat, (x.rows(), x.rows().from_column(5), 5), dy.rows(), &mut self.1, grads);
         let mut dx = Batch::default();
         dx.reset(x.width(), x.len());
-        let start = qedgix::nn::matmul::Start::Zero;
+        let start = qedgix::nn::matmul::Accumulate::Zero;
         self.0.first.backward_input(w.flat, (0, x.width()), self.0.d_first(&self.1), dx.rows_mut(), start);
         dx
     }
@@ -143,7 +145,7 @@ impl Layer for Split {
 
 #[test]
 fn mlp_of_two_parts() {
-    let mut layout = Layout::default();
+    let mut layout = ParameterLayout::default();
     let mut layer = Split(Mlp::new(&mut layout, "mlp", 13, 8), MlpCache::default());
     check_layer("mlp", &layout, &mut layer, 13, 6);
 }
@@ -154,8 +156,8 @@ struct Cell(Gru, Batch<f64>, Batch<f64>);
 const SLOTS: usize = 5;
 
 impl Layer for Cell {
-    fn prepare(&self, flat: &[f64], turned: &mut [f64]) {
-        self.0.prepare(flat, turned);
+    fn prepare(&self, flat: &[f64], transposed: &mut [f64]) {
+        self.0.prepare(flat, transposed);
     }
 
     fn forward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>) -> Batch<f64> {
@@ -178,7 +180,7 @@ impl Layer for Cell {
 
 #[test]
 fn gru_over_time() {
-    let mut layout = Layout::default();
+    let mut layout = ParameterLayout::default();
     let mut layer = Cell(Gru::new(&mut layout, "gru"), Batch::default(), Batch::default());
     check_layer("gru", &layout, &mut layer, HIDDEN, 3 * SLOTS);
 }
@@ -186,8 +188,8 @@ fn gru_over_time() {
 struct Convolution(GraphLayer, Graph, LayerCache<f64>);
 
 impl Layer for Convolution {
-    fn prepare(&self, flat: &[f64], turned: &mut [f64]) {
-        self.0.prepare(flat, turned);
+    fn prepare(&self, flat: &[f64], transposed: &mut [f64]) {
+        self.0.prepare(flat, transposed);
     }
 
     fn forward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>) -> Batch<f64> {
@@ -217,14 +219,14 @@ fn graph() -> Graph {
 
 #[test]
 fn graph_layers() {
-    let layers: [(&str, fn(&mut Layout) -> GraphLayer); 4] = [
+    let layers: [(&str, fn(&mut ParameterLayout) -> GraphLayer); 4] = [
         ("edgeconv, mean", |layout| GraphLayer::edge_conv(layout, "layer", true)),
         ("edgeconv, sum", |layout| GraphLayer::edge_conv(layout, "layer", false)),
         ("agggnn", |layout| GraphLayer::agg_gnn(layout, "layer")),
         ("rgcn", |layout| GraphLayer::rgcn(layout, "layer")),
     ];
     for (name, make) in layers {
-        let mut layout = Layout::default();
+        let mut layout = ParameterLayout::default();
         let mut layer = Convolution(make(&mut layout), graph(), LayerCache::default());
         check_layer(name, &layout, &mut layer, HIDDEN, 6);
     }
@@ -232,15 +234,15 @@ fn graph_layers() {
 
 #[test]
 fn whole_loss() {
-    let set = AgentConfig { observation: Observation::Set, identity: Identity::Phase, self_position: true, ..AGENT };
+    let set = AgentConfig { observation: ObservationKind::Set, identity: Identity::Phase, self_position: true, ..AGENT };
     let cases = [
-        ("qedgix", AGENT, Mixing::Qmix),
-        ("qedgix on sets", AgentConfig { self_loops: true, aggregation: Aggregation::Sum, ..set }, Mixing::Invariant),
-        ("three layers", AgentConfig { layers: 3, identity: Identity::Token, ..AGENT }, Mixing::Vdn),
-        ("agggnn", AgentConfig { gnn: Gnn::AggGnn, layers: 1, ..set }, Mixing::Invariant),
-        ("rgcn", AgentConfig { gnn: Gnn::Rgcn, identity: Identity::None, ..AGENT }, Mixing::Qmix),
-        ("qmix", AgentConfig { gnn: Gnn::None, ..AGENT }, Mixing::Qmix),
-        ("iql", AgentConfig { gnn: Gnn::None, identity: Identity::Token, ..set }, Mixing::None),
+        ("qedgix", AGENT, MixerKind::Qmix),
+        ("qedgix on sets", AgentConfig { self_loops: true, aggregation: Aggregation::Sum, ..set }, MixerKind::Invariant),
+        ("three layers", AgentConfig { layers: 3, identity: Identity::Token, ..AGENT }, MixerKind::Vdn),
+        ("agggnn", AgentConfig { gnn: Gnn::AggGnn, layers: 1, ..set }, MixerKind::Invariant),
+        ("rgcn", AgentConfig { gnn: Gnn::Rgcn, identity: Identity::None, ..AGENT }, MixerKind::Qmix),
+        ("qmix", AgentConfig { gnn: Gnn::None, ..AGENT }, MixerKind::Qmix),
+        ("iql", AgentConfig { gnn: Gnn::None, identity: Identity::Token, ..set }, MixerKind::None),
     ];
     for (name, agent, mixing) in cases {
         let dims = Dims { uavs: 3, users: 4, actions: 9, detection_range: 0.28, slots: 3 };

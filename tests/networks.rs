@@ -5,25 +5,26 @@ mod sample;
 use qedgix::env::Point;
 use qedgix::learner::objective::{Objective, Returns, Trace};
 use qedgix::learner::{Algorithm, Learner, Preset, TrainConfig};
-use qedgix::nn::{Batch, Graph, GraphLayer, HIDDEN, LayerCache, Layout, Rows, Weights};
-use qedgix::policy::mixer::{Mixer, MixerCache, Mixing};
+use qedgix::nn::{Batch, Graph, GraphLayer, HIDDEN, LayerCache, ParameterLayout, Rows, Weights};
+use qedgix::policy::mixer::{Mixer, MixerCache, MixerKind};
 use qedgix::policy::{
-    Actor, Agent, AgentConfig, Dims, Geometry, GeometryConfig, Gnn, Identity, Learned, Needs, Observation, Policy, Slot,
-    StepInput, TOKEN, Turn,
+    Actor, Agent, AgentConfig, Dims, FleetStep, Geometry, GeometryConfig, Gnn, Identity, LearnedPolicy, ObservationKind, Policy,
+    RequiredInput, Slot, StepInput, TOKEN,
 };
 use qedgix::rng;
 use rand::RngExt;
 use sample::{AGENT, episodes};
 
 const DIMS: Dims = Dims { uavs: 3, users: 5, actions: 8, detection_range: 0.28, slots: 80 };
-const SET: AgentConfig = AgentConfig { observation: Observation::Set, identity: Identity::Phase, self_position: true, ..AGENT };
+const SET: AgentConfig =
+    AgentConfig { observation: ObservationKind::Set, identity: Identity::Phase, self_position: true, ..AGENT };
 
-fn parameters(layout: &Layout, seed: u64) -> Vec<f32> {
+fn parameters(layout: &ParameterLayout, seed: u64) -> Vec<f32> {
     layout.initialise(&mut rng::stream(seed, "init", 0))
 }
 
-fn learned(config: AgentConfig) -> Learned {
-    Learned::new(config, DIMS, parameters(Agent::new(config, DIMS).layout(), 1)).expect("as many as the layout says")
+fn learned(config: AgentConfig) -> LearnedPolicy {
+    LearnedPolicy::new(config, DIMS, parameters(Agent::new(config, DIMS).layout(), 1)).expect("as many as the layout says")
 }
 
 /// A slot with everybody near the middle, so that most see each other.
@@ -44,16 +45,16 @@ struct Fleet {
 }
 
 impl Fleet {
-    fn new(policy: &Learned, uavs: usize, users: usize, seed: u64) -> Self {
+    fn new(policy: &LearnedPolicy, uavs: usize, users: usize, seed: u64) -> Self {
         let mut memory = vec![0.0; policy.memory_len(uavs, users)];
         policy.start(uavs, users, seed, &mut memory);
         let (headings, q) = (vec![0; uavs], vec![0.0; uavs * policy.actions()]);
         Self { slot: slot(uavs, users, seed), memory, headings, q }
     }
 
-    fn turn(&mut self) -> Turn<'_> {
+    fn turn(&mut self) -> FleetStep<'_> {
         let Self { slot, memory, headings, q } = self;
-        Turn { slot, step: 0, memory, headings, q_values: Some(q) }
+        FleetStep { slot, step: 0, memory, headings, q_values: Some(q) }
     }
 
     fn bits(&self) -> (Vec<u32>, Vec<u8>, Vec<u32>) {
@@ -125,13 +126,13 @@ fn actor_policy_and_update_see_the_same_values() {
         let (m, n, slots) = (dims.uavs, dims.users, dims.slots);
         let ep = episodes(&dims, 2, 8);
         let returns = Returns { gamma: 0.99, lambda: 0.6 };
-        let mut objective = Objective::<f32>::new(config, dims, Mixing::Vdn, returns, 1);
+        let mut objective = Objective::<f32>::new(config, dims, MixerKind::Vdn, returns, 1);
         let params = parameters(objective.layout(), 3);
         let mut trace = Trace::default();
         objective.evaluate(&params, &params, &ep, Some(&mut trace));
 
         let agent = Agent::new(config, dims);
-        let policy = Learned::new(config, dims, params.clone()).expect("as many as the layout says");
+        let policy = LearnedPolicy::new(config, dims, params.clone()).expect("as many as the layout says");
         let mut actor = Actor::new(&agent, 1);
         for e in 0..2 {
             actor.begin(&agent, &params, &ep.token[e * m * TOKEN..][..m * TOKEN]);
@@ -154,7 +155,7 @@ fn actor_policy_and_update_see_the_same_values() {
                 let slot = Slot::from_scene(&points(uav_xy), &points(user_xy), aoi, dims.detection_range);
                 let (mut headings, mut served) = (vec![0; m], vec![0.0; q.len()]);
                 let turn =
-                    Turn { slot: &slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: Some(&mut served) };
+                    FleetStep { slot: &slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: Some(&mut served) };
                 policy.act(&mut [turn]);
                 assert_eq!(q, served, "slot {t}, {config:?}");
 
@@ -171,8 +172,8 @@ fn actor_policy_and_update_see_the_same_values() {
 #[test]
 fn without_an_identity_uavs_move_as_one_for_ever_and_with_one_they_part() {
     let fly = |config: AgentConfig, seed: u64| {
-        let policy = Learned::new(config, DIMS, parameters(Agent::new(config, DIMS).layout(), seed)).expect("the layout's");
-        assert_eq!(policy.needs(), if config.self_position { Needs::OwnPositions } else { Needs::Detections });
+        let policy = LearnedPolicy::new(config, DIMS, parameters(Agent::new(config, DIMS).layout(), seed)).expect("the layout's");
+        assert_eq!(policy.needs(), if config.self_position { RequiredInput::OwnPositions } else { RequiredInput::Detections });
         let mut stream = rng::stream(seed, "users", 0);
         let users: Vec<Point> = (0..5).map(|_| [stream.random(), stream.random()]).collect();
         let mut uavs: Vec<Point> = vec![[0.5, 0.5]; 3];
@@ -182,7 +183,7 @@ fn without_an_identity_uavs_move_as_one_for_ever_and_with_one_they_part() {
         for step in 0..80 {
             let slot = Slot::from_scene(&uavs, &users, &[step as f32; 5], DIMS.detection_range);
             let mut headings = [0; 3];
-            policy.act(&mut [Turn { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
+            policy.act(&mut [FleetStep { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
             for (p, h) in uavs.iter_mut().zip(headings) {
                 let (sin, cos) = (f64::from(h) * std::f64::consts::FRAC_PI_4).sin_cos();
                 *p = [(p[0] + 0.04 * cos).clamp(0.0, 1.0), (p[1] + 0.04 * sin).clamp(0.0, 1.0)];
@@ -202,13 +203,13 @@ fn without_an_identity_uavs_move_as_one_for_ever_and_with_one_they_part() {
 }
 
 /// q of one slot of a set agent without identity, its UAVs and users in the order given.
-fn values(policy: &Learned, uavs: &[Point], users: &[(Point, f32)]) -> Vec<f32> {
+fn values(policy: &LearnedPolicy, uavs: &[Point], users: &[(Point, f32)]) -> Vec<f32> {
     let (points, aoi): (Vec<Point>, Vec<f32>) = users.iter().copied().unzip();
     let slot = Slot::from_scene(uavs, &points, &aoi, DIMS.detection_range);
     let mut memory = vec![0.0; policy.memory_len(uavs.len(), users.len())];
     policy.start(uavs.len(), users.len(), 0, &mut memory);
     let (mut headings, mut q) = (vec![0; uavs.len()], vec![0.0; uavs.len() * 8]);
-    policy.act(&mut [Turn { slot: &slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: Some(&mut q) }]);
+    policy.act(&mut [FleetStep { slot: &slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: Some(&mut q) }]);
     q
 }
 
@@ -241,17 +242,17 @@ fn set_agents_are_equivariant_under_permutations_of_uavs_and_invariant_under_tho
 struct Mixed {
     mixer: Mixer,
     flat: Vec<f32>,
-    turned: Vec<f32>,
+    transposed: Vec<f32>,
 }
 
 impl Mixed {
-    fn new(mixing: Mixing, dims: &Dims, seed: u64) -> Self {
-        let mut layout = Layout::default();
+    fn new(mixing: MixerKind, dims: &Dims, seed: u64) -> Self {
+        let mut layout = ParameterLayout::default();
         let mixer = Mixer::new(mixing, dims, &mut layout);
         let flat = parameters(&layout, seed);
-        let mut turned = vec![0.0; flat.len()];
-        mixer.prepare(&flat, &mut turned);
-        Self { mixer, flat, turned }
+        let mut transposed = vec![0.0; flat.len()];
+        mixer.prepare(&flat, &mut transposed);
+        Self { mixer, flat, transposed }
     }
 
     fn rows(x: &[f32]) -> Rows<'_, f32> {
@@ -259,7 +260,7 @@ impl Mixed {
     }
 
     fn total(&self, state: &[f32], q: &[f32]) -> f32 {
-        let w = Weights { flat: &self.flat, turned: &self.turned };
+        let w = Weights { flat: &self.flat, transposed: &self.transposed };
         let mut total = Batch::default();
         total.reset(1, 1);
         self.mixer.forward(w, (Self::rows(state), Self::rows(q)), &mut MixerCache::default(), total.rows_mut());
@@ -267,7 +268,7 @@ impl Mixed {
     }
 
     fn slope(&self, state: &[f32], q: &[f32]) -> Vec<f32> {
-        let w = Weights { flat: &self.flat, turned: &self.turned };
+        let w = Weights { flat: &self.flat, transposed: &self.transposed };
         let (mut cache, mut total, mut dq) = (MixerCache::default(), Batch::default(), Batch::default());
         total.reset(1, 1);
         let inputs = (Self::rows(state), Self::rows(q));
@@ -284,7 +285,7 @@ fn drawn(len: usize, seed: u64) -> Vec<f32> {
 
 #[test]
 fn q_tot_does_not_fall_when_a_value_rises() {
-    for mixing in [Mixing::Qmix, Mixing::Invariant, Mixing::Vdn] {
+    for mixing in [MixerKind::Qmix, MixerKind::Invariant, MixerKind::Vdn] {
         for seed in 0..50 {
             let mixed = Mixed::new(mixing, &DIMS, seed);
             let (state, q) = (drawn(2 * 3 + 3 * 5, seed), drawn(3, seed + 1000));
@@ -301,7 +302,7 @@ fn q_tot_does_not_fall_when_a_value_rises() {
 
 #[test]
 fn the_invariant_mixer_ignores_the_order_of_uavs_and_of_users() {
-    let mixed = Mixed::new(Mixing::Invariant, &DIMS, 4);
+    let mixed = Mixed::new(MixerKind::Invariant, &DIMS, 4);
     let (state, q) = (drawn(21, 4), drawn(3, 5));
     let order = [2, 0, 1];
     let uavs = order.iter().flat_map(|&i| &state[2 * i..2 * i + 2]);
@@ -315,15 +316,15 @@ fn the_invariant_mixer_ignores_the_order_of_uavs_and_of_users() {
 #[test]
 fn an_invariant_mixer_fits_any_fleet() {
     let layout = |uavs, users| {
-        let mut layout = Layout::default();
-        Mixer::new(Mixing::Invariant, &Dims { uavs, users, ..DIMS }, &mut layout);
+        let mut layout = ParameterLayout::default();
+        Mixer::new(MixerKind::Invariant, &Dims { uavs, users, ..DIMS }, &mut layout);
         layout
     };
     assert_eq!(layout(3, 5), layout(12, 40));
 }
 
 /// x'_i = agg_j f(x_i || x_j - x_i), edge by edge, as the formula reads, in f64.
-fn naive_edge_conv(layout: &Layout, flat: &[f64], graph: &Graph, x: &Batch<f64>, mean: bool, nodes: usize) -> Vec<f64> {
+fn naive_edge_conv(layout: &ParameterLayout, flat: &[f64], graph: &Graph, x: &Batch<f64>, mean: bool, nodes: usize) -> Vec<f64> {
     let get = |name: &str| {
         let p = layout.parameters().iter().find(|p| p.name == format!("layer.f.{name}")).expect(name);
         &flat[p.range.clone()]
@@ -363,18 +364,24 @@ fn the_factored_edge_conv_is_the_naive_one() {
     let offsets = (0..=9).map(|i| lists[..i].iter().map(|l| l.len() as u32).sum()).collect();
     let graph = Graph { offsets, targets: lists.concat(), reach: vec![5, 9, 12] };
     for mean in [true, false] {
-        let mut layout = Layout::default();
+        let mut layout = ParameterLayout::default();
         let layer = GraphLayer::edge_conv(&mut layout, "layer", mean);
         // Scales and shifts that differ, so that the order of operations matters.
         let mut flat: Vec<f64> = layout.initialise(&mut rng::stream(7, "init", 0));
         flat.iter_mut().zip(drawn(layout.len(), 8)).for_each(|(p, d)| *p += 0.1 * f64::from(d));
-        let mut turned = vec![0.0; flat.len()];
-        layer.prepare(&flat, &mut turned);
+        let mut transposed = vec![0.0; flat.len()];
+        layer.prepare(&flat, &mut transposed);
         let (mut x, mut y) = (Batch::default(), Batch::default());
         x.reset(HIDDEN, 12);
         x.as_mut_slice().iter_mut().zip(drawn(12 * HIDDEN, 9)).for_each(|(x, d)| *x = d.into());
         y.reset(HIDDEN, 9);
-        layer.forward(Weights { flat: &flat, turned: &turned }, &graph, x.rows(), &mut LayerCache::default(), y.rows_mut());
+        layer.forward(
+            Weights { flat: &flat, transposed: &transposed },
+            &graph,
+            x.rows(),
+            &mut LayerCache::default(),
+            y.rows_mut(),
+        );
         let naive = naive_edge_conv(&layout, &flat, &graph, &x, mean, 9);
         for (a, b) in y.as_slice().iter().zip(&naive) {
             assert!((a - b).abs() < 1e-12, "{a} instead of {b}");

@@ -5,11 +5,11 @@ use std::sync::Mutex;
 use qedgix::env::{EnvConfig, EpisodeMetrics};
 use qedgix::invalid::Invalid;
 use qedgix::learner::{Disturbance, Loss, Survey, evaluate, layouts, survey};
-use qedgix::policy::baselines::{self, World};
-use qedgix::policy::{Needs, Policy, Turn};
+use qedgix::policy::baselines::{self, EnvParams};
+use qedgix::policy::{FleetStep, Policy, RequiredInput};
 
 fn flown(name: &str, env: &EnvConfig, disturbance: &Disturbance, threads: usize) -> Survey {
-    let policy = baselines::by_name(name, World::from(env)).unwrap();
+    let policy = baselines::by_name(name, EnvParams::from(env)).unwrap();
     survey(&*policy, env, &layouts("valid-v1").unwrap().seeds(11), 7, disturbance, threads).unwrap()
 }
 
@@ -22,7 +22,7 @@ fn without_disturbance_a_survey_is_an_evaluation() {
     let env = EnvConfig { user_speed: 0.01, ..EnvConfig::default() };
     let seeds = layouts("valid-v1").unwrap().seeds(11);
     for name in ["sweep", "random", "greedy-global"] {
-        let plain = evaluate(&*baselines::by_name(name, World::default()).unwrap(), &env, &seeds, 1).unwrap();
+        let plain = evaluate(&*baselines::by_name(name, EnvParams::default()).unwrap(), &env, &seeds, 1).unwrap();
         let survey = flown(name, &env, &Disturbance::default(), 1);
         assert_eq!(plain, survey.episodes, "{name}");
         assert_eq!(survey.aoi.len(), env.slots + 1);
@@ -102,8 +102,8 @@ impl Policy for Spy {
     fn actions(&self) -> usize {
         8
     }
-    fn needs(&self) -> Needs {
-        Needs::FullScene
+    fn needs(&self) -> RequiredInput {
+        RequiredInput::FullScene
     }
     fn detection_range(&self) -> f64 {
         0.28
@@ -115,7 +115,7 @@ impl Policy for Spy {
         0
     }
     fn start(&self, _uavs: usize, _users: usize, _seed: u64, _memory: &mut [f32]) {}
-    fn act(&self, turns: &mut [Turn<'_>]) {
+    fn act(&self, turns: &mut [FleetStep<'_>]) {
         for turn in turns {
             let slot = turn.slot;
             let seen = (0..slot.uavs() + slot.users()).map(|i| slot.detections(i).iter().map(|d| d.target).collect());

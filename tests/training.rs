@@ -43,7 +43,7 @@ fn other(algorithm: Algorithm) -> TrainConfig {
     t.learning_rate_decay = if t.learning_rate_decay < 1.0 { 1.0 } else { 0.1 };
     t.normalise = !t.normalise;
     t.hyper_init = 0.5;
-    t.observation = qedgix::policy::Observation::Flat;
+    t.observation = qedgix::policy::ObservationKind::Flat;
     config.environment.user_speed = 0.02;
     config
 }

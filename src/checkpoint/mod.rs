@@ -18,9 +18,9 @@ pub use file::Tensor;
 
 use crate::env::EpisodeMetrics;
 use crate::invalid::Invalid;
-use crate::nn::Layout;
+use crate::nn::ParameterLayout;
 use crate::policy::mixer::Mixer;
-use crate::policy::{Agent, Learned};
+use crate::policy::{Agent, LearnedPolicy};
 use crate::recipe::TrainConfig;
 
 /// `format` of every checkpoint.
@@ -41,7 +41,7 @@ pub struct Checkpoint {
 }
 
 /// The parameters of a configuration, `agent.*` then `mixer.*`: the order of the flat vector of [`Checkpoint::parameters`].
-pub fn layout(config: &TrainConfig) -> Layout {
+pub fn layout(config: &TrainConfig) -> ParameterLayout {
     let dims = config.dims();
     let mut layout = Agent::new(config.agent(), dims).layout().clone();
     Mixer::new(config.training.mixer.into(), &dims, &mut layout);
@@ -93,10 +93,10 @@ impl Checkpoint {
     ///
     /// # Panics
     /// Never: what the policy asks of its parameters was checked when the checkpoint was made or read.
-    pub fn policy(&self) -> Learned {
+    pub fn policy(&self) -> LearnedPolicy {
         let (agent, dims) = (self.config.agent(), self.config.dims());
         let len = Agent::new(agent, dims).layout().len();
-        Learned::new(agent, dims, self.parameters[..len].to_vec()).expect("checked when it was made or read")
+        LearnedPolicy::new(agent, dims, self.parameters[..len].to_vec()).expect("checked when it was made or read")
     }
 
     /// The file.

@@ -6,7 +6,7 @@
 use super::disturbance::Disturbance;
 use crate::env::{BatchEnv, EnvConfig, EpisodeMetrics, Point};
 use crate::invalid::{Invalid, in_range};
-use crate::policy::{Policy, Slot, Turn};
+use crate::policy::{FleetStep, Policy, Slot};
 
 /// Flies `policy` on the episodes with these seeds, shared among `threads`; figures in the order of `seeds`. A policy with
 /// fewer actions than the environment has uses the first ones.
@@ -182,11 +182,11 @@ fn fly(
             disturbance.distort(config, seed, step, &mut uavs, &mut users);
             slot.set_scene(&uavs, &users, &env.aoi()[b * n..(b + 1) * n], config.detection_range);
         }
-        let mut turns: Vec<Turn<'_>> = slots
+        let mut turns: Vec<FleetStep<'_>> = slots
             .iter()
             .zip(&mut memories)
             .zip(headings.chunks_exact_mut(m))
-            .map(|((slot, memory), headings)| Turn { slot, step: step as u64, memory, headings, q_values: None })
+            .map(|((slot, memory), headings)| FleetStep { slot, step: step as u64, memory, headings, q_values: None })
             .collect();
         policy.act(&mut turns);
         env.step(&headings);

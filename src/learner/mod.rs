@@ -22,4 +22,5 @@ pub use snapshot::SnapshotError;
 pub use trainer::{Evaluated, Trainer};
 pub use update::{Learner, LearnerState, Update};
 
-pub use crate::recipe::{Algorithm, MixerKind, Preset, TrainConfig, Training};
+pub use crate::policy::mixer::MixerKind;
+pub use crate::recipe::{Algorithm, Preset, TrainConfig, Training};

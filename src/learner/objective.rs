@@ -14,8 +14,8 @@ use std::sync::{Mutex, PoisonError};
 use rayon::prelude::*;
 
 use super::episodes::Episodes;
-use crate::nn::{Batch, Layout, Real, Weights, norm_squared};
-use crate::policy::mixer::{Mixer, MixerCache, Mixing};
+use crate::nn::{Batch, ParameterLayout, Real, Weights, argmax, norm_squared};
+use crate::policy::mixer::{Mixer, MixerCache, MixerKind};
 use crate::policy::{Agent, AgentCache, AgentConfig, Dims, Geometry, Inputs, NO_ACTION, TOKEN, flat_state};
 
 /// UAV rows per slot that a chunk aims at: enough for a product to be efficient, few enough for the caches.
@@ -64,10 +64,10 @@ pub struct Trace<T> {
 pub struct Objective<T: Real> {
     agent: Agent,
     mixer: Mixer,
-    layout: Layout,
+    layout: ParameterLayout,
     returns: Returns,
     /// Online and target network, see [`Weights`].
-    turned: [Vec<T>; 2],
+    transposed: [Vec<T>; 2],
     chunks: Vec<Chunk<T>>,
     workspaces: Vec<Mutex<Workspace<T>>>,
     gradient: Vec<T>,
@@ -106,17 +106,17 @@ struct Workspace<T: Real> {
 
 impl<T: Real> Objective<T> {
     /// Networks for `config`; `threads` is how many threads will work at most.
-    pub fn new(config: AgentConfig, dims: Dims, mixing: Mixing, returns: Returns, threads: usize) -> Self {
+    pub fn new(config: AgentConfig, dims: Dims, mixer: MixerKind, returns: Returns, threads: usize) -> Self {
         let agent = Agent::new(config, dims);
         let mut layout = agent.layout().clone();
-        let mixer = Mixer::new(mixing, &dims, &mut layout);
+        let mixer = Mixer::new(mixer, &dims, &mut layout);
         let len = layout.len();
         Self {
             agent,
             mixer,
             layout,
             returns,
-            turned: [vec![T::ZERO; len], vec![T::ZERO; len]],
+            transposed: [vec![T::ZERO; len], vec![T::ZERO; len]],
             chunks: Vec::new(),
             workspaces: (0..threads.max(1)).map(|_| Mutex::default()).collect(),
             gradient: vec![T::ZERO; len],
@@ -125,7 +125,7 @@ impl<T: Real> Objective<T> {
     }
 
     /// `agent.*`, then `mixer.*`.
-    pub fn layout(&self) -> &Layout {
+    pub fn layout(&self) -> &ParameterLayout {
         &self.layout
     }
 
@@ -147,10 +147,10 @@ impl<T: Real> Objective<T> {
         let dims = *self.agent.dims();
         assert!(episodes.len > 0, "a batch of at least one episode");
         assert_eq!((episodes.uavs, episodes.users, episodes.slots), (dims.uavs, dims.users, dims.slots), "episodes of M, N, K");
-        let [turned_online, turned_target] = &mut self.turned;
-        for (flat, turned) in [(online, &mut *turned_online), (target, &mut *turned_target)] {
-            self.agent.prepare(flat, turned);
-            self.mixer.prepare(flat, turned);
+        let [transposed_online, transposed_target] = &mut self.transposed;
+        for (flat, transposed) in [(online, &mut *transposed_online), (target, &mut *transposed_target)] {
+            self.agent.prepare(flat, transposed);
+            self.mixer.prepare(flat, transposed);
         }
         let per_chunk = chunk_of(dims.uavs);
         let count = episodes.len.div_ceil(per_chunk);
@@ -162,8 +162,8 @@ impl<T: Real> Objective<T> {
         let pass = Pass {
             agent: &self.agent,
             mixer: &self.mixer,
-            online: Weights { flat: online, turned: turned_online },
-            target: Weights { flat: target, turned: turned_target },
+            online: Weights { flat: online, transposed: transposed_online },
+            target: Weights { flat: target, transposed: transposed_target },
             returns: self.returns,
             episodes,
             traced: trace.is_some(),
@@ -244,13 +244,13 @@ impl<T: Real> Pass<'_, T> {
         if self.traced {
             trace(w, (b, slots, m), &mut out.trace);
         }
-        let share = T::of(1.0 / (ep.len * k * values) as f64);
+        let share = T::from_f64(1.0 / (ep.len * k * values) as f64);
         (out.loss, out.q_tot) = (0.0, 0.0);
         // From here on `total` is its own gradient.
         for (total, &goal) in w.total.as_mut_slice().iter_mut().zip(w.goal.as_slice()) {
-            out.q_tot += total.wide();
+            out.q_tot += total.to_f64();
             *total -= goal;
-            out.loss += total.wide() * total.wide();
+            out.loss += total.to_f64() * total.to_f64();
             *total *= share;
         }
 
@@ -268,11 +268,11 @@ impl<T: Real> Pass<'_, T> {
     fn goals(&self, first: usize, b: usize, future: &[T], goal: &mut [T]) {
         let k = self.episodes.slots;
         let stride = b * self.mixer.values();
-        let gamma = T::of(self.returns.gamma);
-        let (keep, cut) = (T::of(self.returns.lambda), T::of(1.0 - self.returns.lambda));
+        let gamma = T::from_f64(self.returns.gamma);
+        let (keep, cut) = (T::from_f64(self.returns.lambda), T::from_f64(1.0 - self.returns.lambda));
         for t in (0..k).rev() {
             for i in 0..stride {
-                let reward = T::of(self.episodes.reward[(first + i / self.mixer.values()) * k + t].into());
+                let reward = T::from_f64(self.episodes.reward[(first + i / self.mixer.values()) * k + t].into());
                 let value = future[t * stride + i];
                 let next = if t + 1 == k { value } else { goal[(t + 1) * stride + i] };
                 goal[t * stride + i] = reward + gamma * (keep * next + cut * value);
@@ -326,9 +326,4 @@ fn trace<T: Real>(w: &Workspace<T>, (b, slots, m): (usize, usize, usize), out: &
     reorder(w.online.q.as_slice(), slots, &mut out.q);
     reorder(w.total.as_slice(), slots - 1, &mut out.q_tot);
     reorder(w.goal.as_slice(), slots - 1, &mut out.target);
-}
-
-/// Index of the first largest value.
-fn argmax<T: Real>(x: &[T]) -> usize {
-    (1..x.len()).fold(0, |best, i| if x[i] > x[best] { i } else { best })
 }

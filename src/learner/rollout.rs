@@ -20,6 +20,7 @@ use super::replay::Shape;
 use super::{Episodes, TrainConfig};
 use crate::env::BatchEnv;
 use crate::invalid::Invalid;
+use crate::nn::argmax;
 use crate::policy::{Actor, Agent, StepInput, TOKEN};
 use crate::rng;
 
@@ -95,7 +96,8 @@ impl Rollout {
             let q = self.actor.step(agent, input);
             for (i, (action, q)) in self.actions.iter_mut().zip(q.chunks_exact(headings)).enumerate() {
                 let explorer = &mut self.explorers[i / uavs];
-                *action = if explorer.random::<f64>() < epsilon { explorer.random_range(0..headings as u8) } else { greedy(q) };
+                *action =
+                    if explorer.random::<f64>() < epsilon { explorer.random_range(0..headings as u8) } else { argmax(q) as u8 };
             }
             self.actor.acted(&self.actions);
             self.env.step(&self.actions);
@@ -144,17 +146,6 @@ fn place<T: Copy>(all: &mut [T], now: &[T], episodes: usize, slot: usize) {
     for (all, now) in all.chunks_exact_mut(total).zip(now.chunks_exact(width)) {
         all[slot * width..][..width].copy_from_slice(now);
     }
-}
-
-/// The action of the largest value; the first of equals.
-fn greedy(q: &[f32]) -> u8 {
-    let mut best = 0;
-    for (a, &value) in q.iter().enumerate() {
-        if value > q[best] {
-            best = a;
-        }
-    }
-    best as u8
 }
 
 #[cfg(test)]

@@ -19,7 +19,7 @@ use super::{Episodes, Event, Iteration, Learner, LearnerState, TrainConfig, Trai
 use crate::checkpoint::{self, Checkpoint};
 use crate::env::EpisodeMetrics;
 use crate::invalid::Invalid;
-use crate::policy::Learned;
+use crate::policy::LearnedPolicy;
 use crate::rng;
 
 /// What the next call of `next` does.
@@ -194,7 +194,7 @@ impl Trainer {
     fn evaluate(&mut self) -> Event {
         let t = &self.config.training;
         let weights = self.learner.published()[..self.learner.agent().layout().len()].to_vec();
-        let policy = Learned::new(self.config.agent(), self.config.dims(), weights).expect("as many as the agent has");
+        let policy = LearnedPolicy::new(self.config.agent(), self.config.dims(), weights).expect("as many as the agent has");
         let seeds = layouts("valid-v1").expect("a list of this program").seeds(t.eval_episodes);
         let flown = evaluate(&policy, &self.config.environment, &seeds, self.threads).expect("an agent fits its environment");
         let now = Evaluated { step: self.progress.step, metrics: EpisodeMetrics::mean(&flown) };

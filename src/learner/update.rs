@@ -5,7 +5,7 @@ use rayon::ThreadPool;
 use super::episodes::Episodes;
 use super::objective::{Figures, Objective, Returns};
 use crate::invalid::{Invalid, in_range};
-use crate::nn::{Adam, Layout};
+use crate::nn::{Adam, ParameterLayout};
 use crate::policy::Agent;
 use crate::recipe::TrainConfig;
 use crate::rng;
@@ -53,7 +53,7 @@ impl Learner {
         in_range("threads", threads, 1..=1024)?;
         let training = &config.training;
         let returns = Returns { gamma: training.gamma, lambda: training.lambda };
-        let objective = Objective::new(config.agent(), config.dims(), training.mixer.into(), returns, threads);
+        let objective = Objective::new(config.agent(), config.dims(), training.mixer, returns, threads);
         let mut online: Vec<f32> = objective.layout().initialise(&mut rng::stream(config.seed, "init", 0));
         // The last layers of the hypernetworks, by their names in the checkpoint.
         for p in objective.layout().parameters().iter().filter(|p| p.name.starts_with("mixer.") && p.name.contains(".2.")) {
@@ -106,7 +106,7 @@ impl Learner {
     }
 
     /// Names, shapes and ranges of the flat vectors: `agent.*`, then `mixer.*`.
-    pub fn layout(&self) -> &Layout {
+    pub fn layout(&self) -> &ParameterLayout {
         self.objective.layout()
     }
 

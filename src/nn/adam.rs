@@ -1,7 +1,7 @@
 //! Adam over a flat vector, with the gradient clipped to a global norm, as `PyTorch` does both.
 
-use super::kernels::simd;
 use super::real::Real;
+use super::simd::simd;
 
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
@@ -32,10 +32,11 @@ impl<T: Real> Adam<T> {
         assert!(params.len() == grads.len() && grads.len() == self.m.len(), "one moment per parameter");
         self.steps += 1;
         let power = i32::try_from(self.steps).unwrap_or(i32::MAX);
-        let scale = T::of((clip / (norm + 1e-6)).min(1.0));
-        let rate = T::of(rate / (1.0 - BETA1.powi(power)));
-        let root = T::of(1.0 / (1.0 - BETA2.powi(power)).sqrt());
-        let (rest1, beta2, rest2, eps) = (T::of(1.0 - BETA1), T::of(BETA2), T::of(1.0 - BETA2), T::of(EPS));
+        let scale = T::from_f64((clip / (norm + 1e-6)).min(1.0));
+        let rate = T::from_f64(rate / (1.0 - BETA1.powi(power)));
+        let root = T::from_f64(1.0 / (1.0 - BETA2.powi(power)).sqrt());
+        let (rest1, beta2, rest2, eps) =
+            (T::from_f64(1.0 - BETA1), T::from_f64(BETA2), T::from_f64(1.0 - BETA2), T::from_f64(EPS));
         let (m, v) = (&mut self.m[..], &mut self.v[..]);
         simd(
             #[inline(always)]
@@ -53,5 +54,5 @@ impl<T: Real> Adam<T> {
 
 /// Sum of squares, in f64.
 pub fn norm_squared<T: Real>(x: &[T]) -> f64 {
-    x.iter().map(|x| x.wide() * x.wide()).sum()
+    x.iter().map(|x| x.to_f64() * x.to_f64()).sum()
 }

@@ -5,6 +5,7 @@ use std::ops::Range;
 use nalgebra::DMatrix;
 
 use super::real::Real;
+use super::simd::simd;
 
 /// Activations: `width` numbers for each of `len` samples. Resizing keeps the allocation.
 #[derive(Clone, Debug)]
@@ -121,4 +122,17 @@ impl<T: Real> Batch<T> {
         let w = self.width();
         RowsMut { stride: w, len: range.len(), data: &mut self.as_mut_slice()[range.start * w..range.end * w] }
     }
+}
+
+/// Adds every row of `rows` to `sums`; rows and `sums` have the same width.
+pub(super) fn add_rows<T: Real>(rows: Rows<'_, T>, sums: &mut [T]) {
+    let width = sums.len();
+    simd(
+        #[inline(always)]
+        || {
+            for row in rows.data.chunks(rows.stride.max(1)).take(rows.len) {
+                sums.iter_mut().zip(&row[..width]).for_each(|(s, &x)| *s += x);
+            }
+        },
+    );
 }

@@ -4,7 +4,7 @@
 
 use super::HIDDEN as H;
 use super::linear::Linear;
-use super::params::{Layout, Weights};
+use super::params::{ParameterLayout, Weights};
 use super::real::Real;
 
 /// The embedding of points of F coordinates.
@@ -20,18 +20,18 @@ pub struct EmbeddingGrad<T, const F: usize> {
 
 impl<const F: usize> Embedding<F> {
     /// Adds `name.weight` (64, F) and `name.bias`.
-    pub fn new(layout: &mut Layout, name: &str) -> Self {
+    pub fn new(layout: &mut ParameterLayout, name: &str) -> Self {
         Self(Linear::new(layout, name, F, H))
     }
 
     /// See [`Linear::prepare`].
-    pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
-        self.0.prepare(flat, turned);
+    pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
+        self.0.prepare(flat, transposed);
     }
 
     /// The weights, ready for [`EmbeddingGrad::add`] and [`EmbeddingGrad::backward`].
     pub fn load<T: Real>(&self, w: Weights<'_, T>) -> EmbeddingGrad<T, F> {
-        let rows = self.0.weight_turned(w).as_chunks::<H>().0;
+        let rows = self.0.weight_transposed(w).as_chunks::<H>().0;
         EmbeddingGrad { weight: rows.try_into().expect("F rows"), bias: self.0.bias(w).try_into().expect("64 numbers") }
     }
 

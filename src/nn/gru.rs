@@ -12,8 +12,8 @@ use super::HIDDEN as H;
 use super::batch::{Batch, Rows};
 use super::kernels::{add_rows, simd};
 use super::linear::transpose;
-use super::matmul::{Lhs, Out, Rhs, Start, matmul};
-use super::params::{Init, Layout, Weights};
+use super::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
+use super::params::{Init, ParameterLayout, Weights};
 use super::real::Real;
 
 /// Numbers kept per sample: r, z, n, q; after backward the gradients before their activations, in the same places.
@@ -30,7 +30,7 @@ pub struct Gru {
 
 impl Gru {
     /// Adds `name.weight_ih`, `weight_hh` (3H, H), `bias_ih`, `bias_hh` (3H), uniform in +-1/sqrt(H).
-    pub fn new(layout: &mut Layout, name: &str) -> Self {
+    pub fn new(layout: &mut ParameterLayout, name: &str) -> Self {
         let init = Init::Uniform(1.0 / (H as f64).sqrt());
         let mut add = |part: &str, shape: &[usize]| layout.add(format!("{name}.{part}"), shape, init);
         Self {
@@ -42,13 +42,13 @@ impl Gru {
     }
 
     /// Transposes both weights and joins the biases of r and z.
-    pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
+    pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
         for weight in [self.weight_ih, self.weight_hh] {
-            transpose(&flat[weight..][..3 * H * H], H, &mut turned[weight..][..3 * H * H]);
+            transpose(&flat[weight..][..3 * H * H], H, &mut transposed[weight..][..3 * H * H]);
         }
         for i in 0..3 * H {
             let hidden = if i < 2 * H { flat[self.bias_hh + i] } else { T::ZERO };
-            turned[self.bias_ih + i] = flat[self.bias_ih + i] + hidden;
+            transposed[self.bias_ih + i] = flat[self.bias_ih + i] + hidden;
         }
     }
 
@@ -57,18 +57,18 @@ impl Gru {
         let n = x.len / slots;
         assert_eq!(h.len(), x.len + n, "one block of states before the first slot");
         gates.reset(GATES, x.len);
-        let weight = Rhs { data: &w.turned[self.weight_ih..][..3 * H * H], stride: 3 * H };
-        let bias = Start::Bias(&w.turned[self.bias_ih..][..3 * H]);
+        let weight = Rhs { data: &w.transposed[self.weight_ih..][..3 * H * H], stride: 3 * H };
+        let bias = Accumulate::Bias(&w.transposed[self.bias_ih..][..3 * H]);
         let all = Out { data: gates.as_mut_slice(), stride: GATES };
         matmul((x.len, H, 3 * H), Lhs::rows(x.data, x.stride), weight, all, bias);
-        let weight = &w.turned[self.weight_hh..][..3 * H * H];
+        let weight = &w.transposed[self.weight_hh..][..3 * H * H];
         let bias = &w.flat[self.bias_hh + 2 * H..][..H];
         for (gates, t) in gates.as_mut_slice().chunks_exact_mut(n * GATES).zip(0..) {
             let (before, after) = h.as_mut_slice()[t * n * H..].split_at_mut(n * H);
             let lhs = Lhs::rows(before, H);
-            matmul((n, H, 2 * H), lhs, Rhs { data: weight, stride: 3 * H }, Out { data: gates, stride: GATES }, Start::Add);
+            matmul((n, H, 2 * H), lhs, Rhs { data: weight, stride: 3 * H }, Out { data: gates, stride: GATES }, Accumulate::Add);
             let q = Out { data: &mut gates[3 * H..], stride: GATES };
-            matmul((n, H, H), lhs, Rhs { data: &weight[2 * H..], stride: 3 * H }, q, Start::Bias(bias));
+            matmul((n, H, H), lhs, Rhs { data: &weight[2 * H..], stride: 3 * H }, q, Accumulate::Bias(bias));
             simd(
                 #[inline(always)]
                 || step(gates, before, &mut after[..n * H]),
@@ -101,22 +101,22 @@ impl Gru {
             );
             if !first {
                 let rz = Rhs { data: weight, stride: H };
-                matmul((n, 2 * H, H), Lhs::rows(gates, GATES), rz, Out { data: carry, stride: H }, Start::Add);
+                matmul((n, 2 * H, H), Lhs::rows(gates, GATES), rz, Out { data: carry, stride: H }, Accumulate::Add);
                 let q = Rhs { data: &weight[2 * H * H..], stride: H };
-                matmul((n, H, H), Lhs::rows(&gates[3 * H..], GATES), q, Out { data: carry, stride: H }, Start::Add);
+                matmul((n, H, H), Lhs::rows(&gates[3 * H..], GATES), q, Out { data: carry, stride: H }, Accumulate::Add);
             }
         }
         let d = gates.as_slice();
         let len = x.len;
         let hidden = |d, width, grads: &mut [T]| {
             let before = Rhs { data: h.as_slice(), stride: H };
-            matmul((width, len, H), Lhs::transposed(d, GATES), before, Out { data: grads, stride: H }, Start::Add);
+            matmul((width, len, H), Lhs::transposed(d, GATES), before, Out { data: grads, stride: H }, Accumulate::Add);
         };
         hidden(d, 2 * H, &mut grads[self.weight_hh..]);
         hidden(&d[3 * H..], H, &mut grads[self.weight_hh + 2 * H * H..]);
         let input = Rhs { data: x.data, stride: x.stride };
         let out = Out { data: &mut grads[self.weight_ih..], stride: H };
-        matmul((3 * H, len, H), Lhs::transposed(d, GATES), input, out, Start::Add);
+        matmul((3 * H, len, H), Lhs::transposed(d, GATES), input, out, Accumulate::Add);
         let rows = |from: usize| Rows { data: &d[from..], stride: GATES, len };
         add_rows(rows(0), &mut grads[self.bias_ih..][..3 * H]);
         add_rows(rows(0), &mut grads[self.bias_hh..][..2 * H]);
@@ -128,7 +128,7 @@ impl Gru {
         dx.reset(H, gates.len());
         let weight = Rhs { data: &flat[self.weight_ih..][..3 * H * H], stride: H };
         let out = Out { data: dx.as_mut_slice(), stride: H };
-        matmul((gates.len(), 3 * H, H), Lhs::rows(gates.as_slice(), GATES), weight, out, Start::Zero);
+        matmul((gates.len(), 3 * H, H), Lhs::rows(gates.as_slice(), GATES), weight, out, Accumulate::Zero);
     }
 }
 

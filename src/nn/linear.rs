@@ -1,9 +1,9 @@
 //! y = W x + b with W (out, in), as in `PyTorch`. Weights are also kept transposed (in, out) for the forward product.
 
+use super::batch::add_rows;
 use super::batch::{Rows, RowsMut};
-use super::kernels::add_rows;
-use super::matmul::{Lhs, Out, Rhs, Start, matmul};
-use super::params::{Init, Layout, Weights};
+use super::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
+use super::params::{Init, ParameterLayout, Weights};
 use super::real::Real;
 
 /// A linear layer: offsets of its weight and bias in the flat vector.
@@ -19,7 +19,7 @@ pub struct Linear {
 
 impl Linear {
     /// Adds `name.weight` and `name.bias`, uniform in +-1/sqrt(inputs).
-    pub fn new(layout: &mut Layout, name: &str, inputs: usize, outputs: usize) -> Self {
+    pub fn new(layout: &mut ParameterLayout, name: &str, inputs: usize, outputs: usize) -> Self {
         let init = Init::Uniform(1.0 / (inputs as f64).sqrt());
         let weight = layout.add(format!("{name}.weight"), &[outputs, inputs], init);
         let bias = layout.add(format!("{name}.bias"), &[outputs], init);
@@ -27,9 +27,9 @@ impl Linear {
     }
 
     /// Writes the transposed weight.
-    pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
+    pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
         let n = self.inputs * self.outputs;
-        transpose(&flat[self.weight..][..n], self.inputs, &mut turned[self.weight..][..n]);
+        transpose(&flat[self.weight..][..n], self.inputs, &mut transposed[self.weight..][..n]);
     }
 
     /// The product of a forward pass over `rows` samples, as (rows, k, columns).
@@ -43,8 +43,8 @@ impl Linear {
     }
 
     /// W transposed, (inputs, outputs).
-    pub fn weight_turned<'a, T>(&self, w: Weights<'a, T>) -> &'a [T] {
-        &w.turned[self.weight..][..self.inputs * self.outputs]
+    pub fn weight_transposed<'a, T>(&self, w: Weights<'a, T>) -> &'a [T] {
+        &w.transposed[self.weight..][..self.inputs * self.outputs]
     }
 
     /// b.
@@ -64,7 +64,7 @@ impl Linear {
 
     /// y = W x + b.
     pub fn forward<T: Real>(&self, w: Weights<'_, T>, x: Rows<'_, T>, y: RowsMut<'_, T>) {
-        self.forward_part(w, (0, self.inputs), x, y, Start::Bias(self.bias(w)));
+        self.forward_part(w, (0, self.inputs), x, y, Accumulate::Bias(self.bias(w)));
     }
 
     /// y = start + W[:, from..from + width] x: the share of some inputs.
@@ -74,12 +74,12 @@ impl Linear {
         (from, width): (usize, usize),
         x: Rows<'_, T>,
         y: RowsMut<'_, T>,
-        start: Start<'_, T>,
+        accumulate: Accumulate<'_, T>,
     ) {
         debug_assert_eq!(x.len, y.len);
-        let b = Rhs { data: &self.weight_turned(w)[from * self.outputs..], stride: self.outputs };
+        let b = Rhs { data: &self.weight_transposed(w)[from * self.outputs..], stride: self.outputs };
         let c = Out { data: y.data, stride: y.stride };
-        matmul((x.len, width, self.outputs), Lhs::rows(x.data, x.stride), b, c, start);
+        matmul((x.len, width, self.outputs), Lhs::rows(x.data, x.stride), b, c, accumulate);
     }
 
     /// Adds the gradients of W and b; writes dx where wanted.
@@ -87,7 +87,7 @@ impl Linear {
         self.backward_bias(dy, grads);
         self.backward_part((0, self.inputs), x, dy, grads);
         if let Some(dx) = dx {
-            self.backward_input(flat, (0, self.inputs), dy, dx, Start::Zero);
+            self.backward_input(flat, (0, self.inputs), dy, dx, Accumulate::Zero);
         }
     }
 
@@ -102,7 +102,7 @@ impl Linear {
         let stride = self.inputs;
         let c = Out { data: &mut self.weight_grad(grads)[from..], stride };
         let b = Rhs { data: x.data, stride: x.stride };
-        matmul((self.outputs, dy.len, width), Lhs::transposed(dy.data, dy.stride), b, c, Start::Add);
+        matmul((self.outputs, dy.len, width), Lhs::transposed(dy.data, dy.stride), b, c, Accumulate::Add);
     }
 
     /// dx = start + dy W[:, from..from + width].
@@ -112,11 +112,11 @@ impl Linear {
         (from, width): (usize, usize),
         dy: Rows<'_, T>,
         dx: RowsMut<'_, T>,
-        start: Start<'_, T>,
+        accumulate: Accumulate<'_, T>,
     ) {
         let b = Rhs { data: &self.weight(flat)[from..], stride: self.inputs };
         let c = Out { data: dx.data, stride: dx.stride };
-        matmul((dy.len, self.outputs, width), Lhs::rows(dy.data, dy.stride), b, c, start);
+        matmul((dy.len, self.outputs, width), Lhs::rows(dy.data, dy.stride), b, c, accumulate);
     }
 }
 

@@ -52,7 +52,7 @@ pub struct Out<'a, T> {
 
 /// What the sum over k begins with.
 #[derive(Clone, Copy, Debug)]
-pub enum Start<'a, T> {
+pub enum Accumulate<'a, T> {
     /// 0.
     Zero,
     /// One number per column.
@@ -68,17 +68,23 @@ const DEPTH: usize = 144;
 ///
 /// # Panics
 /// When a slice is too short for its shape.
-pub fn matmul<T: Real>((m, k, n): (usize, usize, usize), a: Lhs<'_, T>, b: Rhs<'_, T>, c: Out<'_, T>, start: Start<'_, T>) {
+pub fn matmul<T: Real>(
+    (m, k, n): (usize, usize, usize),
+    a: Lhs<'_, T>,
+    b: Rhs<'_, T>,
+    c: Out<'_, T>,
+    accumulate: Accumulate<'_, T>,
+) {
     if m == 0 || n == 0 {
         return;
     }
     assert!(c.data.len() >= (m - 1) * c.stride + n && c.stride >= n, "C is too short");
     assert!(k == 0 || a.data.len() > (m - 1) * a.row + (k - 1) * a.col, "A is too short");
     assert!(k == 0 || b.data.len() >= (k - 1) * b.stride + n, "B is too short");
-    if let Start::Bias(bias) = start {
+    if let Accumulate::Bias(bias) = accumulate {
         assert!(bias.len() >= n, "the bias is too short");
     }
-    Arch::new().dispatch(Product { m, k, n, a, b, c, start });
+    Arch::new().dispatch(Product { m, k, n, a, b, c, accumulate });
 }
 
 struct Product<'a, T> {
@@ -88,7 +94,7 @@ struct Product<'a, T> {
     a: Lhs<'a, T>,
     b: Rhs<'a, T>,
     c: Out<'a, T>,
-    start: Start<'a, T>,
+    accumulate: Accumulate<'a, T>,
 }
 
 impl<T: Real> WithSimd for Product<'_, T> {
@@ -120,7 +126,7 @@ impl<T: Real> WithSimd for Product<'_, T> {
             if k0 >= self.k {
                 return;
             }
-            self.start = Start::Add;
+            self.accumulate = Accumulate::Add;
         }
     }
 }
@@ -157,9 +163,9 @@ impl<T: Real> Product<'_, T> {
         let lanes = T::lanes::<S>();
         let last = width - (V - 1) * lanes;
         let mut sums = [[T::splat(simd, T::ZERO); V]; R];
-        match self.start {
-            Start::Zero => {}
-            Start::Bias(bias) => {
+        match self.accumulate {
+            Accumulate::Zero => {}
+            Accumulate::Bias(bias) => {
                 for v in 0..V {
                     let at = j + v * lanes;
                     let x = T::load(simd, &bias[at..at + if v + 1 < V { lanes } else { last }]);
@@ -168,7 +174,7 @@ impl<T: Real> Product<'_, T> {
                     }
                 }
             }
-            Start::Add => {
+            Accumulate::Add => {
                 for (r, row) in sums.iter_mut().enumerate() {
                     let c = &self.c.data[(i + r) * self.c.stride + j..][..width];
                     for (v, x) in row.iter_mut().enumerate() {
@@ -254,12 +260,12 @@ mod tests {
 
     /// Row i, column j of start + A B, as the formula reads, in f64.
     fn naive<T: Real>(k: usize, a: impl Fn(usize) -> T, b: impl Fn(usize) -> T, start: T) -> f64 {
-        (0..k).map(|k| a(k).wide() * b(k).wide()).sum::<f64>() + start.wide()
+        (0..k).map(|k| a(k).to_f64() * b(k).to_f64()).sum::<f64>() + start.to_f64()
     }
 
     fn check<T: Real>(tolerance: f64) {
         let mut stream = crate::rng::stream(3, "matmul", 0);
-        let mut draw = |len: usize| -> Vec<T> { (0..len).map(|_| T::of(2.0 * stream.random::<f64>() - 1.0)).collect() };
+        let mut draw = |len: usize| -> Vec<T> { (0..len).map(|_| T::from_f64(2.0 * stream.random::<f64>() - 1.0)).collect() };
         for m in [1, 2, 3, 5, 6, 7, 13, 24] {
             for k in [0, 1, 2, 21, 64, DEPTH - 1, DEPTH + 1, 2 * DEPTH] {
                 for n in [1, 2, 8, 9, 15, 16, 17, 31, 33, 96] {
@@ -267,7 +273,7 @@ mod tests {
                     let (a, b) = (draw(m.max(k) * (wide_a + m)), draw(k.max(1) * wide_b));
                     let (before, bias) = (draw(m * wide_c), draw(n));
                     for (lhs, place) in [(Lhs::rows(&a, wide_a), (wide_a, 1)), (Lhs::transposed(&a, m + 1), (1, m + 1))] {
-                        for start in [Start::Zero, Start::Bias(&bias), Start::Add] {
+                        for start in [Accumulate::Zero, Accumulate::Bias(&bias), Accumulate::Add] {
                             let mut c = before.clone();
                             let (rhs, out) = (Rhs { data: &b, stride: wide_b }, Out { data: &mut c, stride: wide_c });
                             matmul((m, k, n), lhs, rhs, out, start);
@@ -278,12 +284,12 @@ mod tests {
                                     continue;
                                 }
                                 let start = match start {
-                                    Start::Zero => T::ZERO,
-                                    Start::Bias(bias) => bias[j],
-                                    Start::Add => before,
+                                    Accumulate::Zero => T::ZERO,
+                                    Accumulate::Bias(bias) => bias[j],
+                                    Accumulate::Add => before,
                                 };
                                 let exact = naive(k, |k| a[i * place.0 + k * place.1], |k| b[k * wide_b + j], start);
-                                assert!((c.wide() - exact).abs() <= tolerance * (1.0 + k as f64), "{m} {k} {n}: {c} {exact}");
+                                assert!((c.to_f64() - exact).abs() <= tolerance * (1.0 + k as f64), "{m} {k} {n}: {c} {exact}");
                             }
                         }
                     }
@@ -308,7 +314,7 @@ mod tests {
         let product = |rows: std::ops::Range<usize>| {
             let mut c = vec![0.0; rows.len() * 33];
             let a = Lhs::rows(&data[rows.start * 64..], 64);
-            matmul((rows.len(), 64, 33), a, Rhs { data: &data, stride: 33 }, Out { data: &mut c, stride: 33 }, Start::Zero);
+            matmul((rows.len(), 64, 33), a, Rhs { data: &data, stride: 33 }, Out { data: &mut c, stride: 33 }, Accumulate::Zero);
             c
         };
         let whole = product(0..50);

@@ -3,19 +3,19 @@
 //! The input may come in two parts (x || x'), which are multiplied apart and never concatenated.
 
 use super::batch::{Batch, Rows, RowsMut};
-use super::kernels::simd;
+use super::layer_norm::{self, Affine, LayerNorm, Stats};
 use super::linear::Linear;
-use super::matmul::Start;
-use super::norm::{self, Affine, Norm, Stats};
-use super::params::{Layout, Weights};
+use super::matmul::Accumulate;
+use super::params::{ParameterLayout, Weights};
 use super::real::Real;
+use super::simd::simd;
 
 /// A network with a hidden layer of W.
 #[derive(Clone, Copy, Debug)]
 pub struct Mlp<const W: usize> {
     /// First layer.
     pub first: Linear,
-    norm: Norm<W>,
+    norm: LayerNorm<W>,
     last: Linear,
 }
 
@@ -29,18 +29,18 @@ pub struct MlpCache<T: Real> {
 
 impl<const W: usize> Mlp<W> {
     /// Adds `name.0`, `name.1` and `name.3`, as `PyTorch` numbers them in a sequence.
-    pub fn new(layout: &mut Layout, name: &str, inputs: usize, outputs: usize) -> Self {
+    pub fn new(layout: &mut ParameterLayout, name: &str, inputs: usize, outputs: usize) -> Self {
         Self {
             first: Linear::new(layout, &format!("{name}.0"), inputs, W),
-            norm: Norm::new(layout, &format!("{name}.1")),
+            norm: LayerNorm::new(layout, &format!("{name}.1")),
             last: Linear::new(layout, &format!("{name}.3"), W, outputs),
         }
     }
 
     /// See [`Linear::prepare`].
-    pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
-        self.first.prepare(flat, turned);
-        self.last.prepare(flat, turned);
+    pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
+        self.first.prepare(flat, transposed);
+        self.last.prepare(flat, transposed);
     }
 
     /// The products of a forward pass over `rows` samples, each as (rows, k, columns).
@@ -60,8 +60,8 @@ impl<const W: usize> Mlp<W> {
         cache.before.reset(W, a.len);
         cache.stats.reset(2, a.len);
         cache.hidden.reset(W, a.len);
-        first.forward_part(w, (0, split), a, cache.before.rows_mut(), Start::Bias(first.bias(w)));
-        first.forward_part(w, (split, first.inputs - split), b, cache.before.rows_mut(), Start::Add);
+        first.forward_part(w, (0, split), a, cache.before.rows_mut(), Accumulate::Bias(first.bias(w)));
+        first.forward_part(w, (split, first.inputs - split), b, cache.before.rows_mut(), Accumulate::Add);
         let affine = self.norm.affine(w.flat);
         simd(
             #[inline(always)]
@@ -82,7 +82,7 @@ impl<const W: usize> Mlp<W> {
         self.last.backward_bias(dy, grads);
         self.last.backward_part((0, W), cache.hidden.rows(), dy, grads);
         // The hidden layer has served; its gradient takes its place, then the first layer's that of `before`.
-        self.last.backward_input(flat, (0, W), dy, cache.hidden.rows_mut(), Start::Zero);
+        self.last.backward_input(flat, (0, W), dy, cache.hidden.rows_mut(), Accumulate::Zero);
         let affine = self.norm.affine(flat);
         let mut sums = Affine::zero();
         simd(
@@ -106,9 +106,9 @@ impl<const W: usize> Mlp<W> {
 fn normalise<T: Real, const W: usize>(x: &[T], p: &Affine<T, W>, stats: &mut [T], y: &mut [T]) {
     let rows = x.as_chunks::<W>().0.iter().zip(y.as_chunks_mut::<W>().0);
     for ((x, y), stats) in rows.zip(stats.as_chunks_mut::<2>().0) {
-        let s = norm::stats(x);
-        *stats = [s.mean, s.inverse];
-        norm::forward(x, s, p, y);
+        let s = layer_norm::stats(x);
+        *stats = [s.mean, s.rstd];
+        layer_norm::forward(x, s, p, y);
     }
 }
 
@@ -116,6 +116,6 @@ fn normalise<T: Real, const W: usize>(x: &[T], p: &Affine<T, W>, stats: &mut [T]
 fn normalise_back<T: Real, const W: usize>(x: &mut [T], p: &Affine<T, W>, stats: &[T], dy: &[T], sums: &mut Affine<T, W>) {
     let rows = x.as_chunks_mut::<W>().0.iter_mut().zip(dy.as_chunks::<W>().0);
     for ((x, dy), stats) in rows.zip(stats.as_chunks::<2>().0) {
-        *x = norm::backward(x, Stats { mean: stats[0], inverse: stats[1] }, p, dy, sums);
+        *x = layer_norm::backward(x, Stats { mean: stats[0], rstd: stats[1] }, p, dy, sums);
     }
 }

@@ -31,7 +31,7 @@ pub struct Parameter {
 
 /// The parameters of a network, in the order of its flat vector.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Layout {
+pub struct ParameterLayout {
     parameters: Vec<Parameter>,
 }
 
@@ -41,10 +41,10 @@ pub struct Weights<'a, T> {
     /// The parameters.
     pub flat: &'a [T],
     /// As long as `flat`: weights transposed, and other derived forms, at the places of what they derive from.
-    pub turned: &'a [T],
+    pub transposed: &'a [T],
 }
 
-impl Layout {
+impl ParameterLayout {
     /// Appends a parameter and returns where it begins.
     pub fn add(&mut self, name: impl Into<String>, shape: &[usize], init: Init) -> usize {
         let start = self.len();
@@ -73,7 +73,7 @@ impl Layout {
         let mut flat = Vec::with_capacity(self.len());
         for p in &self.parameters {
             for _ in p.range.clone() {
-                flat.push(T::of(match p.init {
+                flat.push(T::from_f64(match p.init {
                     Init::Constant(x) => x,
                     Init::Uniform(bound) => bound * (2.0 * rng.random::<f64>() - 1.0),
                     Init::Normal(deviation) => {

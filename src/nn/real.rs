@@ -37,9 +37,9 @@ pub trait Real:
     type Vector<S: Simd>: Copy;
 
     /// Rounds to this type.
-    fn of(x: f64) -> Self;
+    fn from_f64(x: f64) -> Self;
     /// Widens to f64.
-    fn wide(self) -> f64;
+    fn to_f64(self) -> f64;
     /// self * a + b, rounded once.
     #[must_use]
     fn mul_add(self, a: Self, b: Self) -> Self;
@@ -94,12 +94,12 @@ impl Real for f32 {
     type Vector<S: Simd> = S::f32s;
 
     #[inline(always)]
-    fn of(x: f64) -> Self {
+    fn from_f64(x: f64) -> Self {
         x as Self
     }
 
     #[inline(always)]
-    fn wide(self) -> f64 {
+    fn to_f64(self) -> f64 {
         f64::from(self)
     }
 
@@ -193,12 +193,12 @@ impl Real for f64 {
     type Vector<S: Simd> = S::f64s;
 
     #[inline(always)]
-    fn of(x: f64) -> Self {
+    fn from_f64(x: f64) -> Self {
         x
     }
 
     #[inline(always)]
-    fn wide(self) -> f64 {
+    fn to_f64(self) -> f64 {
         self
     }
 

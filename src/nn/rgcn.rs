@@ -6,11 +6,11 @@
 use super::HIDDEN as H;
 use super::batch::{Batch, Rows, RowsMut};
 use super::graph::Graph;
-use super::kernels::simd;
 use super::linear::{Linear, transpose};
-use super::matmul::{Lhs, Out, Rhs, Start, matmul};
-use super::params::{Init, Layout, Weights};
+use super::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
+use super::params::{Init, ParameterLayout, Weights};
 use super::real::Real;
+use super::simd::simd;
 
 /// One layer.
 #[derive(Clone, Copy, Debug)]
@@ -27,16 +27,16 @@ pub struct RgcnCache<T: Real> {
 
 impl Rgcn {
     /// Adds `name.root` and `name.rel` (3, H, H), which multiplies from the right.
-    pub fn new(layout: &mut Layout, name: &str) -> Self {
+    pub fn new(layout: &mut ParameterLayout, name: &str) -> Self {
         let root = Linear::new(layout, &format!("{name}.root"), H, H);
         Self { root, rel: layout.add(format!("{name}.rel"), &[3, H, H], Init::Normal(1.0 / (H as f64).sqrt())) }
     }
 
     /// Transposes, which only backward needs of the relations.
-    pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
-        self.root.prepare(flat, turned);
+    pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
+        self.root.prepare(flat, transposed);
         for at in (self.rel..).step_by(H * H).take(3) {
-            transpose(&flat[at..][..H * H], H, &mut turned[at..][..H * H]);
+            transpose(&flat[at..][..H * H], H, &mut transposed[at..][..H * H]);
         }
     }
 
@@ -74,7 +74,7 @@ impl Rgcn {
             for (kind, r) in relations.into_iter().enumerate() {
                 let means = Lhs::rows(cache.means.range(run.clone()).from_column(kind * H).data, 2 * H);
                 let rel = Rhs { data: &w.flat[self.rel + r * H * H..][..H * H], stride: H };
-                matmul((run.len(), H, H), means, rel, Out { data: &mut y.data[run.start * stride..], stride }, Start::Add);
+                matmul((run.len(), H, H), means, rel, Out { data: &mut y.data[run.start * stride..], stride }, Accumulate::Add);
             }
         }
     }
@@ -97,10 +97,10 @@ impl Rgcn {
                 let column = (kind * H).min(means.data.len());
                 let out = Out { data: &mut grads[at..][..H * H], stride: H };
                 let rhs = Rhs { data: d, stride: dy.stride };
-                matmul((H, run.len(), H), Lhs::transposed(&means.data[column..], 2 * H), rhs, out, Start::Add);
+                matmul((H, run.len(), H), Lhs::transposed(&means.data[column..], 2 * H), rhs, out, Accumulate::Add);
                 let out = Out { data: &mut means.data[column..], stride: 2 * H };
-                let turned = Rhs { data: &w.turned[at..][..H * H], stride: H };
-                matmul((run.len(), H, H), Lhs::rows(d, dy.stride), turned, out, Start::Zero);
+                let transposed = Rhs { data: &w.transposed[at..][..H * H], stride: H };
+                matmul((run.len(), H, H), Lhs::rows(d, dy.stride), transposed, out, Accumulate::Zero);
             }
         }
         let means = cache.means.as_slice().as_chunks::<H>().0;
@@ -131,7 +131,7 @@ fn neighbours<T: Real>(graph: &Graph, i: usize) -> impl Iterator<Item = (usize, 
     let all = graph.neighbours(i);
     let kind = |&&j: &&u32| usize::from(j as usize >= graph.first_kind());
     let second = all.iter().filter(|j| kind(j) == 1).count();
-    let shares = [all.len() - second, second].map(|n| T::of(1.0 / n.max(1) as f64));
+    let shares = [all.len() - second, second].map(|n| T::from_f64(1.0 / n.max(1) as f64));
     all.iter().map(move |j| {
         let kind = usize::from(*j as usize >= graph.first_kind());
         (kind, *j as usize, shares[kind])

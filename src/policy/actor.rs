@@ -22,7 +22,7 @@ pub struct StepInput<'a> {
 pub struct Actor {
     fleets: usize,
     flat: Vec<f32>,
-    turned: Vec<f32>,
+    transposed: Vec<f32>,
     hidden: Vec<f32>,
     last: Vec<u8>,
     token: Vec<f32>,
@@ -37,7 +37,7 @@ impl Actor {
         Self {
             fleets,
             flat: vec![0.0; len],
-            turned: vec![0.0; len],
+            transposed: vec![0.0; len],
             hidden: vec![0.0; rows * HIDDEN],
             last: vec![NO_ACTION; rows],
             token: vec![0.0; rows * TOKEN],
@@ -52,7 +52,7 @@ impl Actor {
     /// When a length does not fit.
     pub fn begin(&mut self, agent: &Agent, params: &[f32], token: &[f32]) {
         self.flat.copy_from_slice(params);
-        agent.prepare(&self.flat, &mut self.turned);
+        agent.prepare(&self.flat, &mut self.transposed);
         self.token.copy_from_slice(token);
         self.hidden.fill(0.0);
         self.last.fill(NO_ACTION);
@@ -75,7 +75,7 @@ impl Actor {
         self.geometry.finish(&config);
         let rows = self.fleets * m;
         self.cache.begin(rows, 1).copy_from_slice(&self.hidden);
-        let weights = Weights { flat: &self.flat, turned: &self.turned };
+        let weights = Weights { flat: &self.flat, transposed: &self.transposed };
         let inputs = Inputs { geometry: &self.geometry, last: &self.last, token: &self.token, position: input.uav_xy };
         agent.forward(weights, &inputs, 1, &mut self.cache);
         self.hidden.copy_from_slice(self.cache.last_hidden(rows));

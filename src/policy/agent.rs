@@ -8,14 +8,14 @@
 //!
 //! All slots of all fleets go through each layer at once. UAV rows are time-major: slot, fleet, UAV.
 
-use super::config::{AgentConfig, Aggregation, Gnn, Identity, Observation};
+use super::config::{AgentConfig, Aggregation, Gnn, Identity, ObservationKind};
 use super::features::{Inputs, SetEncoder, flat_observation, identity_width, write_rest};
 use super::geometry::{Geometry, GeometryConfig};
 use crate::invalid::Invalid;
-use crate::nn::matmul::Start;
+use crate::nn::matmul::Accumulate;
 use crate::nn::{
-    Batch, GraphLayer, Gru, HIDDEN, LayerCache, LayerScratch, Layout, Linear, Mlp, MlpCache, Real, Rows, Weights, leaky_relu,
-    leaky_relu_back, relu, relu_back,
+    Batch, GraphLayer, Gru, HIDDEN, LayerCache, LayerScratch, Linear, Mlp, MlpCache, ParameterLayout, Real, Rows, Weights,
+    leaky_relu, leaky_relu_back, relu, relu_back,
 };
 
 /// Sizes of the fleet and the environment that an agent is made for.
@@ -38,7 +38,7 @@ pub struct Dims {
 pub struct Agent {
     config: AgentConfig,
     dims: Dims,
-    layout: Layout,
+    layout: ParameterLayout,
     sets: Option<SetEncoder>,
     fc: Linear,
     rnn: Gru,
@@ -97,7 +97,7 @@ impl<T: Real> AgentCache<T> {
 impl Agent {
     /// The agent's own layout: `agent.*`.
     pub fn new(config: AgentConfig, dims: Dims) -> Self {
-        let mut layout = Layout::default();
+        let mut layout = ParameterLayout::default();
         let m = dims.uavs;
         let sets =
             (config.observation == Observation::Set).then(|| SetEncoder::new(&mut layout, "agent.sets", dims.detection_range));
@@ -107,7 +107,7 @@ impl Agent {
         let fc = Linear::new(&mut layout, "agent.fc", input, HIDDEN);
         let rnn = Gru::new(&mut layout, "agent.rnn");
         let mean = config.aggregation == Aggregation::Mean;
-        let layer: &dyn Fn(&mut Layout, &str) -> GraphLayer = match config.gnn {
+        let layer: &dyn Fn(&mut ParameterLayout, &str) -> GraphLayer = match config.gnn {
             Gnn::None | Gnn::EdgeConv => &|layout, name| GraphLayer::edge_conv(layout, name, mean),
             Gnn::AggGnn => &|layout, name| GraphLayer::agg_gnn(layout, name),
             Gnn::Rgcn => &|layout, name| GraphLayer::rgcn(layout, name),
@@ -134,7 +134,7 @@ impl Agent {
     }
 
     /// Its parameters.
-    pub fn layout(&self) -> &Layout {
+    pub fn layout(&self) -> &ParameterLayout {
         &self.layout
     }
 
@@ -171,20 +171,20 @@ impl Agent {
         Ok(())
     }
 
-    /// Fills `turned` (see [`Weights`]); both are as long as the layout, or longer.
-    pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
+    /// Fills `transposed` (see [`Weights`]); both are as long as the layout, or longer.
+    pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
         if let Some(sets) = &self.sets {
-            sets.prepare(flat, turned);
+            sets.prepare(flat, transposed);
         }
-        self.fc.prepare(flat, turned);
-        self.rnn.prepare(flat, turned);
+        self.fc.prepare(flat, transposed);
+        self.rnn.prepare(flat, transposed);
         match &self.body {
-            Body::Plain { head } => head.prepare(flat, turned),
+            Body::Plain { head } => head.prepare(flat, transposed),
             Body::Graph { w1, w2, layers, head } => {
-                w1.prepare(flat, turned);
-                w2.prepare(flat, turned);
-                layers.iter().for_each(|layer| layer.prepare(flat, turned));
-                head.prepare(flat, turned);
+                w1.prepare(flat, transposed);
+                w2.prepare(flat, transposed);
+                layers.iter().for_each(|layer| layer.prepare(flat, transposed));
+                head.prepare(flat, transposed);
             }
         }
     }
@@ -281,9 +281,9 @@ impl Agent {
                 let graph = inputs.geometry.graph();
                 head.backward(w.flat, (h, c.y[layers.len()].rows(), HIDDEN), dq, &mut c.head, grads);
                 let d = head.d_first(&c.head);
-                head.first.backward_input(w.flat, (0, HIDDEN), d, s.dh.rows_mut(), Start::Zero);
+                head.first.backward_input(w.flat, (0, HIDDEN), d, s.dh.rows_mut(), Accumulate::Zero);
                 s.dy.reset(HIDDEN, uavs);
-                head.first.backward_input(w.flat, (HIDDEN, HIDDEN), d, s.dy.rows_mut(), Start::Zero);
+                head.first.backward_input(w.flat, (HIDDEN, HIDDEN), d, s.dy.rows_mut(), Accumulate::Zero);
                 for (l, layer) in layers.iter().enumerate().rev() {
                     if l + 1 < layers.len() {
                         relu_back(c.y[l + 1].as_slice(), s.dy.as_mut_slice());
@@ -296,12 +296,12 @@ impl Agent {
                 let (own, users) = (s.dy.range(0..uavs), s.dy.range(uavs..s.dy.len()));
                 w1.backward_bias(own, grads);
                 w1.backward_part((0, HIDDEN), h, own, grads);
-                w1.backward_input(w.flat, (0, HIDDEN), own, s.dh.rows_mut(), Start::Add);
+                w1.backward_input(w.flat, (0, HIDDEN), own, s.dh.rows_mut(), Accumulate::Add);
                 w2.backward_bias(users, grads);
                 w2.backward_part((0, self.observation), c.user_obs.rows(), users, grads);
                 if let Some(sets) = &self.sets {
                     s.observation.reset(SetEncoder::WIDTH, users.len);
-                    w2.backward_input(w.flat, (0, SetEncoder::WIDTH), users, s.observation.rows_mut(), Start::Zero);
+                    w2.backward_input(w.flat, (0, SetEncoder::WIDTH), users, s.observation.rows_mut(), Accumulate::Zero);
                     sets.backward(w, (inputs.geometry, uavs), s.observation.rows(), grads);
                 }
             }
@@ -312,7 +312,7 @@ impl Agent {
         self.fc.backward(w.flat, c.input.rows(), s.dx.rows(), grads, None);
         if let Some(sets) = &self.sets {
             s.observation.reset(SetEncoder::WIDTH, uavs);
-            self.fc.backward_input(w.flat, (0, SetEncoder::WIDTH), s.dx.rows(), s.observation.rows_mut(), Start::Zero);
+            self.fc.backward_input(w.flat, (0, SetEncoder::WIDTH), s.dx.rows(), s.observation.rows_mut(), Accumulate::Zero);
             sets.backward(w, (inputs.geometry, 0), s.observation.rows(), grads);
         }
     }

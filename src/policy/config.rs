@@ -30,7 +30,8 @@ pub enum Aggregation {
 /// What a node is told of what it sees.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
-pub enum Observation {
+#[schema(as = Observation)]
+pub enum ObservationKind {
     /// One fixed place per entity, width 2M + 3N (spec 2.1); ties a checkpoint to (M, N).
     Flat,
     /// Sums of embeddings, width 128 (spec 2.2); any M and N.
@@ -67,7 +68,7 @@ pub struct AgentConfig {
     /// Aggregation of `edgeconv`.
     pub aggregation: Aggregation,
     /// Observation of every node.
-    pub observation: Observation,
+    pub observation: ObservationKind,
     /// Identity of a UAV.
     pub identity: Identity,
     /// Whether a UAV knows its own position.

@@ -2,7 +2,7 @@
 
 use super::config::{AgentConfig, Identity, TOKEN};
 use super::geometry::{Geometry, View};
-use crate::nn::{Embedding, EmbeddingGrad, HIDDEN, Layout, Real, Rows, Weights, simd};
+use crate::nn::{Embedding, EmbeddingGrad, HIDDEN, ParameterLayout, Real, Rows, Weights, simd};
 
 /// Last action of a UAV that has not acted yet.
 pub const NO_ACTION: u8 = u8::MAX;
@@ -24,10 +24,10 @@ pub struct Inputs<'a> {
 pub fn flat_observation<T: Real>(view: &View<'_>, scale: f64, out: &mut [T]) {
     out.fill(T::ZERO);
     let uavs = view.fleet.uavs;
-    let scaled = |x: f32| T::of(f64::from(x) * scale);
+    let scaled = |x: f32| T::from_f64(f64::from(x) * scale);
     let (seen_uavs, seen_users) = out.split_at_mut(2 * uavs);
     let mut user = |j: usize, rel: [f32; 2]| {
-        seen_users[3 * j..3 * j + 3].copy_from_slice(&[scaled(rel[0]), scaled(rel[1]), T::of(view.aoi[j].into())]);
+        seen_users[3 * j..3 * j + 3].copy_from_slice(&[scaled(rel[0]), scaled(rel[1]), T::from_f64(view.aoi[j].into())]);
     };
     if view.node >= uavs {
         user(view.node - uavs, [0.0; 2]);
@@ -44,9 +44,9 @@ pub fn flat_observation<T: Real>(view: &View<'_>, scale: f64, out: &mut [T]) {
 /// Writes the flat state (spec 2.3) of a fleet, 2M + 3N wide: positions as (x, y) each, AoI in slots, K slots.
 pub fn flat_state<T: Real>(uav_xy: &[f32], user_xy: &[f32], aoi: &[f32], slots: usize, out: &mut [T]) {
     let (uavs, users) = out.split_at_mut(uav_xy.len());
-    uavs.iter_mut().zip(uav_xy).for_each(|(s, &x)| *s = T::of(x.into()));
+    uavs.iter_mut().zip(uav_xy).for_each(|(s, &x)| *s = T::from_f64(x.into()));
     for (user, (xy, a)) in users.chunks_exact_mut(3).zip(user_xy.chunks_exact(2).zip(aoi)) {
-        user.copy_from_slice(&[T::of(xy[0].into()), T::of(xy[1].into()), T::of((a / slots as f32).into())]);
+        user.copy_from_slice(&[T::from_f64(xy[0].into()), T::from_f64(xy[1].into()), T::from_f64((a / slots as f32).into())]);
     }
 }
 
@@ -65,17 +65,17 @@ pub(super) fn write_rest<T: Real>(config: &AgentConfig, actions: usize, inputs: 
         Identity::Onehot => own[view.node] = T::ONE,
         Identity::Phase => {
             let turn = std::f64::consts::TAU * view.node as f64 / view.fleet.uavs as f64;
-            own.copy_from_slice(&[T::of(turn.cos()), T::of(turn.sin())]);
+            own.copy_from_slice(&[T::from_f64(turn.cos()), T::from_f64(turn.sin())]);
         }
         Identity::Token => {
             let token = &inputs.token[row * TOKEN..][..TOKEN];
-            own.iter_mut().zip(token).for_each(|(o, &t)| *o = T::of(t.into()));
+            own.iter_mut().zip(token).for_each(|(o, &t)| *o = T::from_f64(t.into()));
         }
     }
     if config.self_position {
         let own = &inputs.position[2 * row..][..2];
-        let scale = T::of(if config.normalise { 2.0 } else { 1.0 });
-        position.iter_mut().zip(own).for_each(|(o, &p)| *o = (T::of(p.into()) - T::of(0.5)) * scale);
+        let scale = T::from_f64(if config.normalise { 2.0 } else { 1.0 });
+        position.iter_mut().zip(own).for_each(|(o, &p)| *o = (T::from_f64(p.into()) - T::from_f64(0.5)) * scale);
     }
 }
 
@@ -102,14 +102,14 @@ impl SetEncoder {
     /// Width of the observation.
     pub const WIDTH: usize = 2 * HIDDEN;
 
-    pub(super) fn new(layout: &mut Layout, name: &str, range: f64) -> Self {
+    pub(super) fn new(layout: &mut ParameterLayout, name: &str, range: f64) -> Self {
         let uav = Embedding::new(layout, &format!("{name}.uav"));
         Self { uav, user: Embedding::new(layout, &format!("{name}.user")), scale: 1.0 / range }
     }
 
-    pub(super) fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
-        self.uav.prepare(flat, turned);
-        self.user.prepare(flat, turned);
+    pub(super) fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
+        self.uav.prepare(flat, transposed);
+        self.user.prepare(flat, transposed);
     }
 
     /// Observations of rows `first` and on, into the first columns of rows of `stride` numbers.
@@ -179,12 +179,12 @@ fn encode_back<T: Real>(
 #[inline(always)]
 fn each_seen<T: Real>(view: &View<'_>, scale: f64, mut uav: impl FnMut([T; 2]), mut user: impl FnMut([T; 3])) {
     let m = view.fleet.uavs;
-    let aoi = |node: usize| T::of(view.aoi[node - m].into());
+    let aoi = |node: usize| T::from_f64(view.aoi[node - m].into());
     if view.node >= m {
         user([T::ZERO, T::ZERO, aoi(view.node)]);
     }
     for d in view.detections {
-        let [x, y] = d.rel.map(|x| T::of(f64::from(x) * scale));
+        let [x, y] = d.rel.map(|x| T::from_f64(f64::from(x) * scale));
         let target = d.target as usize;
         if target < m {
             uav([x, y]);

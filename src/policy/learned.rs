@@ -10,17 +10,17 @@ use super::agent::{Agent, AgentCache, Dims};
 use super::config::{AgentConfig, Identity, TOKEN};
 use super::features::{Inputs, NO_ACTION};
 use super::geometry::Geometry;
-use super::{Needs, Policy, Turn};
+use super::{FleetStep, Policy, RequiredInput};
 use crate::invalid::Invalid;
-use crate::nn::{HIDDEN, Weights};
+use crate::nn::{HIDDEN, Weights, argmax};
 use crate::rng;
 
 /// A trained agent, its weights prepared once. Shared by threads.
 #[derive(Debug)]
-pub struct Learned {
+pub struct LearnedPolicy {
     agent: Agent,
     flat: Vec<f32>,
-    turned: Vec<f32>,
+    transposed: Vec<f32>,
     /// Buffers of calls that are over; a call takes one or makes one.
     buffers: Mutex<Vec<Buffers>>,
 }
@@ -34,7 +34,7 @@ struct Buffers {
     position: Vec<f32>,
 }
 
-impl Learned {
+impl LearnedPolicy {
     /// The policy of `params`, in the order of the agent's layout.
     ///
     /// # Errors
@@ -48,9 +48,9 @@ impl Learned {
         if let Some(bad) = params.iter().find(|x| !x.is_finite()) {
             return Err(Invalid::new("parameters", bad, "finite numbers"));
         }
-        let mut turned = vec![0.0; len];
-        agent.prepare(&params, &mut turned);
-        Ok(Self { agent, flat: params, turned, buffers: Mutex::default() })
+        let mut transposed = vec![0.0; len];
+        agent.prepare(&params, &mut transposed);
+        Ok(Self { agent, flat: params, transposed, buffers: Mutex::default() })
     }
 
     /// The architecture.
@@ -73,13 +73,13 @@ impl Learned {
     }
 }
 
-impl Policy for Learned {
+impl Policy for LearnedPolicy {
     fn actions(&self) -> usize {
         self.agent.dims().actions
     }
 
-    fn needs(&self) -> Needs {
-        if self.agent.config().self_position { Needs::OwnPositions } else { Needs::Detections }
+    fn needs(&self) -> RequiredInput {
+        if self.agent.config().self_position { RequiredInput::OwnPositions } else { RequiredInput::Detections }
     }
 
     fn detection_range(&self) -> f64 {
@@ -103,11 +103,11 @@ impl Policy for Learned {
         }
     }
 
-    fn is_linear(&self) -> bool {
+    fn is_cheap(&self) -> bool {
         self.agent.config().hops <= 1
     }
 
-    fn act(&self, turns: &mut [Turn<'_>]) {
+    fn act(&self, turns: &mut [FleetStep<'_>]) {
         let pool = || self.buffers.lock().unwrap_or_else(PoisonError::into_inner);
         let taken = pool().pop();
         let mut buffers = taken.unwrap_or_default();
@@ -116,8 +116,8 @@ impl Policy for Learned {
     }
 }
 
-impl Learned {
-    fn run(&self, turns: &mut [Turn<'_>], b: &mut Buffers) {
+impl LearnedPolicy {
+    fn run(&self, turns: &mut [FleetStep<'_>], b: &mut Buffers) {
         let stride = self.stride();
         let config = self.agent.geometry();
         b.geometry.clear();
@@ -143,13 +143,13 @@ impl Learned {
             h.copy_from_slice(&uav[..HIDDEN]);
         }
         let inputs = Inputs { geometry: &b.geometry, last: &b.last, token: &b.token, position: &b.position };
-        let weights = Weights { flat: &self.flat, turned: &self.turned };
+        let weights = Weights { flat: &self.flat, transposed: &self.transposed };
         self.agent.forward(weights, &inputs, 1, &mut b.cache);
         let mut after = b.cache.last_hidden(rows).chunks_exact(HIDDEN).zip(b.cache.q.as_slice().chunks_exact(self.actions()));
         for turn in turns {
             for (i, uav) in turn.memory.chunks_exact_mut(stride).enumerate() {
                 let (h, q) = after.next().expect("one row per UAV");
-                let best = (1..q.len()).fold(0, |best, a| if q[a] > q[best] { a } else { best });
+                let best = argmax(q);
                 uav[..HIDDEN].copy_from_slice(h);
                 uav[HIDDEN] = best as f32;
                 turn.headings[i] = best as u8;

@@ -13,17 +13,17 @@ mod vision;
 
 pub use actor::{Actor, StepInput};
 pub use agent::{Agent, AgentCache, Dims};
-pub use config::{AgentConfig, Aggregation, Gnn, HIDDEN, Identity, Observation, TOKEN};
+pub use config::{AgentConfig, Aggregation, Gnn, HIDDEN, Identity, ObservationKind, TOKEN};
 pub use features::{Inputs, NO_ACTION, SetEncoder, flat_observation, flat_state};
 pub use geometry::{Fleet, Geometry, GeometryConfig, View};
-pub use learned::Learned;
+pub use learned::LearnedPolicy;
 pub use slot::{Detection, Slot};
 
 use crate::invalid::Invalid;
 
 /// How much of a slot a policy must be told.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Needs {
+pub enum RequiredInput {
     /// Only what nodes detect.
     Detections,
     /// Detections, and each UAV's own position.
@@ -33,7 +33,7 @@ pub enum Needs {
 }
 
 /// One fleet's turn in a batch: what it sees, its memory, and where its answer goes.
-pub struct Turn<'a> {
+pub struct FleetStep<'a> {
     /// The slot as all nodes see it.
     pub slot: &'a Slot,
     /// Slots since the episode began.
@@ -52,9 +52,9 @@ pub trait Policy: Send + Sync {
     fn actions(&self) -> usize;
 
     /// What it must be told.
-    fn needs(&self) -> Needs;
+    fn needs(&self) -> RequiredInput;
 
-    /// d, the detection range that it works with; scenes are turned into detections with it.
+    /// d, the detection range that it works with; scenes are transposed into detections with it.
     fn detection_range(&self) -> f64;
 
     /// Whether it can fly this many UAVs among this many users.
@@ -71,11 +71,11 @@ pub trait Policy: Send + Sync {
 
     /// Whether a slot costs little more than a constant per node and detection, so that a small one need not be computed away
     /// from where it arrives.
-    fn is_linear(&self) -> bool {
+    fn is_cheap(&self) -> bool {
         false
     }
 
     /// Advances every fleet by one slot. Fleets may differ in size. Each answer is the same as if its fleet came alone.
     /// The caller has checked sizes with `check_fleet` and the slots with `needs`.
-    fn act(&self, turns: &mut [Turn<'_>]);
+    fn act(&self, turns: &mut [FleetStep<'_>]);
 }

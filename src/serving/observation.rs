@@ -7,7 +7,7 @@
 use super::Fleet;
 use crate::env::Point;
 use crate::invalid::Invalid;
-use crate::policy::{Detection, Needs, Policy, Slot};
+use crate::policy::{Detection, Policy, RequiredInput, Slot};
 
 /// Most nodes of one observation.
 pub const MAX_NODES: usize = 20_000;
@@ -138,12 +138,12 @@ fn within(rel: &Point, range: f64) -> bool {
 }
 
 impl Graph {
-    fn into_slot(self, needs: Needs, range: f64) -> Result<Slot, Invalid> {
-        if needs == Needs::FullScene {
+    fn into_slot(self, needs: RequiredInput, range: f64) -> Result<Slot, Invalid> {
+        if needs == RequiredInput::FullScene {
             return Err(Invalid::new("graph", "a graph", "a scene: this policy needs the positions of all UAVs and users"));
         }
         let uavs = self.positions.len();
-        if needs == Needs::OwnPositions
+        if needs == RequiredInput::OwnPositions
             && let Some(i) = self.positions.iter().position(Option::is_none)
         {
             let field = match self.form {

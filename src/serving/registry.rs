@@ -11,7 +11,7 @@ use serde_json::Value;
 use tokio::sync::{Mutex, MutexGuard};
 
 use super::{Error, PolicyRef, PolicySpec, Which};
-use crate::policy::{Needs, Policy};
+use crate::policy::{Policy, RequiredInput};
 
 /// Where a policy comes from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,7 +38,7 @@ pub struct About {
     /// A, the number of headings.
     pub headings: usize,
     /// What it must be told.
-    pub needs: Needs,
+    pub needs: RequiredInput,
     /// d, the detection range that it works with.
     pub detection_range: f64,
     /// Resolved training configuration of a checkpoint, an object; null for a baseline.

@@ -2,7 +2,7 @@
 #![allow(dead_code)] // each test binary uses its part
 
 use qedgix::learner::Episodes;
-use qedgix::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, Observation, TOKEN};
+use qedgix::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, ObservationKind, TOKEN};
 use qedgix::rng;
 use rand::RngExt;
 
@@ -11,7 +11,7 @@ pub const AGENT: AgentConfig = AgentConfig {
     gnn: Gnn::EdgeConv,
     layers: 2,
     aggregation: Aggregation::Mean,
-    observation: Observation::Flat,
+    observation: ObservationKind::Flat,
     identity: Identity::Onehot,
     self_position: false,
     self_loops: false,

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use bytes::Bytes;
-use qedgix::policy::Turn;
-use qedgix::policy::baselines::{LIST, World, by_name};
+use qedgix::policy::FleetStep;
+use qedgix::policy::baselines::{EnvParams, LIST, by_name};
 use qedgix::serving::Observation;
 use qedgix::wire::v1;
 use tonic::Code;
@@ -45,13 +45,13 @@ async fn a_session_flies_and_repeats() {
 
 /// Headings of `slots` slots of policy `name`, asked directly.
 fn offline(name: &str, slots: u64, seed: u64) -> Vec<Vec<u8>> {
-    let policy = by_name(name, World::default()).unwrap();
+    let policy = by_name(name, EnvParams::default()).unwrap();
     let mut memory = vec![0.0; policy.memory_len(3, 5)];
     policy.start(3, 5, seed, &mut memory);
     let fly = |step| {
         let slot = Observation::try_from(scene(3, 5, step)).unwrap().into_slot(&*policy).unwrap();
         let mut headings = vec![0; 3];
-        policy.act(&mut [Turn { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
+        policy.act(&mut [FleetStep { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
         headings
     };
     (0..slots).map(fly).collect()

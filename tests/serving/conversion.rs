@@ -1,8 +1,8 @@
 //! Observations: a graph and a scene of the same slot are the same slot, and nothing that can be sent panics.
 
 use proptest::prelude::*;
-use qedgix::policy::baselines::{LIST, World, by_name};
-use qedgix::policy::{Needs, Policy, Slot, Turn};
+use qedgix::policy::baselines::{EnvParams, LIST, by_name};
+use qedgix::policy::{FleetStep, Policy, RequiredInput, Slot};
 use qedgix::service::act;
 use qedgix::serving::Observation;
 use qedgix::wire::v1;
@@ -19,7 +19,7 @@ fn decide(policy: &dyn Policy, slot: &Slot) -> Vec<u8> {
     policy.start(uavs, users, 3, &mut memory);
     let mut headings = vec![0; uavs];
     let mut q_values = vec![0.0; uavs * policy.actions()];
-    policy.act(&mut [Turn { slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: Some(&mut q_values) }]);
+    policy.act(&mut [FleetStep { slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: Some(&mut q_values) }]);
     headings
 }
 
@@ -33,8 +33,8 @@ fn a_graph_and_a_scene_of_the_same_slot_are_the_same_slot() {
     for seed in 0..400 {
         let (uavs, users) = (1 + seed as usize % 6, 1 + seed as usize % 13);
         let scene = scene(uavs, users, seed);
-        for baseline in LIST.iter().filter(|b| b.needs != Needs::FullScene) {
-            let policy = by_name(baseline.name, World::default()).unwrap();
+        for baseline in LIST.iter().filter(|b| b.needs != RequiredInput::FullScene) {
+            let policy = by_name(baseline.name, EnvParams::default()).unwrap();
             let range = policy.detection_range();
             let by_scene = slot_of(scene.clone().try_into().unwrap(), &*policy);
             let mut sent = graph(&scene, range, true);
@@ -76,7 +76,7 @@ fn check_derived(derived: &Slot, whole: &Slot) {
 
 #[test]
 fn what_one_side_reports_is_mirrored() {
-    let policy = by_name("nearest", World::default()).unwrap();
+    let policy = by_name("nearest", EnvParams::default()).unwrap();
     for seed in 0..100 {
         let scene = scene(4, 8, seed);
         let whole = slot_of(graph(&scene, 0.28, true).try_into().unwrap(), &*policy);
@@ -160,7 +160,7 @@ proptest! {
         match act::Request::try_from(message) {
             Err(e) => prop_assert!(!e.field.is_empty() && !e.expected.is_empty()),
             Ok(request) => for baseline in &LIST {
-                let policy = by_name(baseline.name, World::default()).unwrap();
+                let policy = by_name(baseline.name, EnvParams::default()).unwrap();
                 let (uavs, users) = (request.observation.uavs(), request.observation.users());
                 if let Ok(slot) = request.observation.clone().into_slot(&*policy) {
                     prop_assert_eq!((slot.uavs(), slot.users()), (uavs, users));
@@ -176,12 +176,12 @@ proptest! {
     fn arbitrary_memory_is_flown(values in prop::collection::vec(number(), 400), step in any::<u64>(), seed in 0..50_u64) {
         let sent: Observation = scene(3, 5, seed).try_into().unwrap();
         for baseline in &LIST {
-            let policy = by_name(baseline.name, World::default()).unwrap();
+            let policy = by_name(baseline.name, EnvParams::default()).unwrap();
             let slot = slot_of(sent.clone(), &*policy);
             let len = policy.memory_len(3, 5);
             let mut memory: Vec<f32> = values.iter().cycle().take(len).map(|&x| x as f32).collect();
             let mut headings = vec![0; 3];
-            policy.act(&mut [Turn { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
+            policy.act(&mut [FleetStep { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
             prop_assert!(headings.iter().all(|&h| usize::from(h) < policy.actions()));
         }
     }

@@ -9,7 +9,7 @@ use jiff::Timestamp;
 use qedgix::config::Config;
 use qedgix::env::Point;
 use qedgix::invalid::Invalid;
-use qedgix::policy::{Needs, Policy, Turn};
+use qedgix::policy::{FleetStep, Policy, RequiredInput};
 use qedgix::server::{self, DataDir, Endpoints, Listeners};
 use qedgix::service::App;
 use qedgix::serving::{Clock, LoadedPolicy, PolicyRef};
@@ -143,8 +143,8 @@ impl Policy for Deed {
     fn actions(&self) -> usize {
         9
     }
-    fn needs(&self) -> Needs {
-        Needs::OwnPositions
+    fn needs(&self) -> RequiredInput {
+        RequiredInput::OwnPositions
     }
     fn detection_range(&self) -> f64 {
         0.28
@@ -158,7 +158,7 @@ impl Policy for Deed {
     fn start(&self, _: usize, _: usize, seed: u64, memory: &mut [f32]) {
         memory[0] = (seed % 9) as f32;
     }
-    fn act(&self, turns: &mut [Turn<'_>]) {
+    fn act(&self, turns: &mut [FleetStep<'_>]) {
         match self {
             Self::Count => {}
             Self::Panic => panic!("a policy of the tests panics"),

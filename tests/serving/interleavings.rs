@@ -11,7 +11,7 @@ use futures::future::BoxFuture;
 use proptest::prelude::*;
 use proptest::test_runner::TestRunner;
 use qedgix::invalid::Invalid;
-use qedgix::policy::{Needs, Policy, Turn};
+use qedgix::policy::{FleetStep, Policy, RequiredInput};
 use qedgix::service::{App, Error, act, sessions};
 use qedgix::serving::{Observation, Opened};
 
@@ -28,8 +28,8 @@ impl Policy for Stamped {
     fn actions(&self) -> usize {
         3
     }
-    fn needs(&self) -> Needs {
-        Needs::Detections
+    fn needs(&self) -> RequiredInput {
+        RequiredInput::Detections
     }
     fn detection_range(&self) -> f64 {
         0.28
@@ -43,10 +43,10 @@ impl Policy for Stamped {
     fn start(&self, _: usize, _: usize, seed: u64, memory: &mut [f32]) {
         memory.copy_from_slice(&[seed as f32, 0.0]);
     }
-    fn is_linear(&self) -> bool {
+    fn is_cheap(&self) -> bool {
         self.by_callers
     }
-    fn act(&self, turns: &mut [Turn<'_>]) {
+    fn act(&self, turns: &mut [FleetStep<'_>]) {
         for turn in turns {
             turn.headings.fill(turn.memory[0] as u8 % 3);
             if let Some(q) = &mut turn.q_values {

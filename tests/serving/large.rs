@@ -1,7 +1,7 @@
 //! A fleet of 1 000 UAVs among 10 000 users is an ordinary one.
 
 use bytes::Bytes;
-use qedgix::policy::Turn;
+use qedgix::policy::FleetStep;
 use qedgix::serving::Observation;
 use qedgix::wire::v1;
 
@@ -46,7 +46,7 @@ async fn a_thousand_uavs_among_ten_thousand_users_are_answered() {
     let mut memory = vec![0.0; policy.memory_len(uavs, users)];
     policy.start(uavs, users, 0, &mut memory);
     let mut expected = vec![0; uavs];
-    policy.act(&mut [Turn { slot: &slot, step: 0, memory: &mut memory, headings: &mut expected, q_values: None }]);
+    policy.act(&mut [FleetStep { slot: &slot, step: 0, memory: &mut memory, headings: &mut expected, q_values: None }]);
     let mut request = held("qedgix", Bytes::new(), v1::Scene::default());
     request.observation = Some(v1::act_request::Observation::Graph(graph));
     let answer = server.grpc().await.act(request).await.unwrap().into_inner();

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use bytes::Bytes;
-use qedgix::policy::Turn;
+use qedgix::policy::FleetStep;
 use qedgix::service::policies::{self, Target};
 use qedgix::service::{App, PageRequest};
 use qedgix::serving::Observation;
@@ -131,7 +131,7 @@ fn offline() -> [Vec<Vec<u8>>; 2] {
         let flown = (0..SLOTS).map(|step| {
             let slot = Observation::try_from(scene(3, 5, step)).unwrap().into_slot(policy).unwrap();
             let mut headings = vec![0; 3];
-            policy.act(&mut [Turn { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
+            policy.act(&mut [FleetStep { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
             headings
         });
         flown.collect()

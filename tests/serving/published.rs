@@ -2,7 +2,7 @@
 
 use bytes::Bytes;
 use qedgix::checkpoint::{Checkpoint, layout};
-use qedgix::policy::Turn;
+use qedgix::policy::FleetStep;
 use qedgix::recipe::{Algorithm, Preset, TrainConfig};
 use qedgix::service::{Error, policies};
 use qedgix::serving::{Observation, PolicyRef};
@@ -100,7 +100,7 @@ async fn a_learned_policy_flies_like_all_others() {
             let slot = Observation::try_from(sent.clone()).unwrap().into_slot(policy).unwrap();
             let (mut expected, mut q) = (vec![0; 3], vec![0.0; 3 * policy.actions()]);
             let (memory, headings) = (&mut memory[..], &mut expected[..]);
-            policy.act(&mut [Turn { slot: &slot, step, memory, headings, q_values: Some(&mut q) }]);
+            policy.act(&mut [FleetStep { slot: &slot, step, memory, headings, q_values: Some(&mut q) }]);
 
             let by_graph = v1::act_request::Observation::Graph(graph(&sent, policy.detection_range(), true));
             let requests = [

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use qedgix::checkpoint::{Checkpoint, digest, layout};
-use qedgix::policy::{Learned, Policy, Turn};
+use qedgix::policy::{FleetStep, LearnedPolicy, Policy};
 use qedgix::recipe::{Algorithm, Preset, TrainConfig};
 use qedgix::serving::Observation;
 use qedgix::wire::v1;
@@ -83,7 +83,7 @@ impl Drop for Process {
 
 /// The policies that may answer, by digest.
 struct Truth {
-    policies: HashMap<String, Arc<Learned>>,
+    policies: HashMap<String, Arc<LearnedPolicy>>,
     files: Vec<Vec<u8>>,
 }
 
@@ -107,7 +107,7 @@ impl Truth {
 
 /// One episode flown here.
 struct Replay {
-    policy: Arc<Learned>,
+    policy: Arc<LearnedPolicy>,
     digest: String,
     memory: Vec<f32>,
 }
@@ -131,7 +131,7 @@ impl Replay {
         let actions = self.policy.actions();
         let (mut headings, mut values) = (vec![0; ids.len()], vec![0.0; ids.len() * actions]);
         let (memory, headings_out, q_values) = (&mut self.memory[..], &mut headings[..], Some(&mut values[..]));
-        self.policy.act(&mut [Turn { slot: &slot, step: 0, memory, headings: headings_out, q_values }]);
+        self.policy.act(&mut [FleetStep { slot: &slot, step: 0, memory, headings: headings_out, q_values }]);
         let told = headings.iter().zip(values.chunks_exact(actions)).map(|(&heading, q)| (u32::from(heading), q.to_vec()));
         ids.into_iter().zip(told).collect()
     }

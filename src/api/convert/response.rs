@@ -5,7 +5,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 
 use super::structs::to_struct;
-use crate::policy::Needs;
+use crate::policy::RequiredInput;
 use crate::service::act;
 use crate::serving::{Described, Kind, PolicyRef, SessionInfo};
 use crate::wire::v1;
@@ -74,9 +74,9 @@ impl From<Described> for v1::Policy {
     fn from(described: Described) -> Self {
         let Described { about, loaded, aliases, versions } = described;
         let needs = match about.needs {
-            Needs::Detections => v1::Needs::Detections,
-            Needs::OwnPositions => v1::Needs::OwnPositions,
-            Needs::FullScene => v1::Needs::FullScene,
+            RequiredInput::Detections => v1::Needs::Detections,
+            RequiredInput::OwnPositions => v1::Needs::OwnPositions,
+            RequiredInput::FullScene => v1::Needs::FullScene,
         };
         let kind = match about.kind {
             Kind::Checkpoint => v1::PolicyKind::Checkpoint,

@@ -3,7 +3,7 @@
 use super::{STATE, outputs};
 use crate::api::convert::tensors::{Datatype, Dimension, INPUTS, TensorShape};
 use crate::invalid::Invalid;
-use crate::policy::Needs;
+use crate::policy::RequiredInput;
 use crate::service::policies::{self, IndexEntry};
 use crate::service::{App, Error};
 use crate::serving::{Kind, PolicySpec, Which};
@@ -76,8 +76,8 @@ pub fn describe(app: &App, name: &str, version: &str) -> Result<Model, Error> {
         let of_graph = name == "uav_count" || dimensions.contains(&Dimension::Edges);
         let optional = match name {
             "user_aoi" => false,
-            "uav_positions" => needs == Needs::Detections,
-            "user_positions" => needs != Needs::FullScene,
+            "uav_positions" => needs == RequiredInput::Detections,
+            "user_positions" => needs != RequiredInput::FullScene,
             _ => true,
         };
         let shape = dimensions.iter().map(|dimension| match dimension {
@@ -88,7 +88,7 @@ pub fn describe(app: &App, name: &str, version: &str) -> Result<Model, Error> {
             Dimension::Edges => -1,
         });
         let input = TensorShape { name, datatype, shape: shape.collect(), optional };
-        (needs != Needs::FullScene || !of_graph).then_some(input)
+        (needs != RequiredInput::FullScene || !of_graph).then_some(input)
     };
     let state = TensorShape { name: STATE, datatype: Datatype::Bytes, shape: vec![1], optional: true };
     let outputs = outputs::described(uavs, policy.headings as i64, policy.kind == Kind::Checkpoint);

@@ -8,7 +8,7 @@ use std::time::Instant;
 
 use crate::learner::Episodes;
 use crate::learner::objective::chunk_of;
-use crate::nn::matmul::{Lhs, Out, Rhs, Start, matmul};
+use crate::nn::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
 use crate::policy::{Agent, Geometry};
 
 /// What an update cannot do without.
@@ -63,12 +63,12 @@ fn multiply(products: &[[usize; 3]], chunks: usize, threads: usize) -> f64 {
                     for &[m, k, n] in products {
                         for _ in 0..2 {
                             let out = Out { data: &mut y, stride: n };
-                            matmul((m, k, n), Lhs::rows(&x, k), Rhs { data: &w, stride: n }, out, Start::Zero);
+                            matmul((m, k, n), Lhs::rows(&x, k), Rhs { data: &w, stride: n }, out, Accumulate::Zero);
                         }
                         let out = Out { data: &mut dw, stride: k };
-                        matmul((n, m, k), Lhs::transposed(&x, n), Rhs { data: &x, stride: k }, out, Start::Add);
+                        matmul((n, m, k), Lhs::transposed(&x, n), Rhs { data: &x, stride: k }, out, Accumulate::Add);
                         let out = Out { data: &mut y, stride: k };
-                        matmul((m, n, k), Lhs::rows(&x, n), Rhs { data: &w, stride: k }, out, Start::Zero);
+                        matmul((m, n, k), Lhs::rows(&x, n), Rhs { data: &w, stride: k }, out, Accumulate::Zero);
                     }
                 }
                 black_box((y, dw));

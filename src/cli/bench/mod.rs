@@ -10,7 +10,7 @@ use serde_json::json;
 
 use super::run_args::{RunArgs, all_cores};
 use crate::learner::{Episodes, Learner, Rollout, TrainConfig};
-use crate::recipe::MixerKind;
+use crate::policy::mixer::MixerKind;
 
 /// What to measure.
 #[derive(Args, Debug)]

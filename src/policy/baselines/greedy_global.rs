@@ -1,7 +1,7 @@
 //! `greedy-global`: knows all positions and ages; pairs UAVs with the users that promise most AoI per slot of flight.
 
 use super::geometry::{heading_toward, travel_slots};
-use super::{Needs, Rule, World, own_positions};
+use super::{EnvParams, RequiredInput, Rule, own_positions};
 use crate::policy::Slot;
 
 /// Has no memory.
@@ -11,7 +11,7 @@ pub(super) struct GreedyGlobal;
 impl Rule for GreedyGlobal {
     const NAME: &'static str = "greedy-global";
     const TEXT: &'static str = "Full information: pairs UAVs with the users that promise most AoI per slot of flight.";
-    const NEEDS: Needs = Needs::FullScene;
+    const NEEDS: RequiredInput = RequiredInput::FullScene;
 
     fn memory_len(&self, _uavs: usize, _users: usize) -> usize {
         0
@@ -19,7 +19,7 @@ impl Rule for GreedyGlobal {
 
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}
 
-    fn fly(&self, world: &World, slot: &Slot, _step: u64, _memory: &mut [f32], headings: &mut [u8]) {
+    fn fly(&self, world: &EnvParams, slot: &Slot, _step: u64, _memory: &mut [f32], headings: &mut [u8]) {
         let uavs = own_positions(slot);
         let users = slot.user_positions().expect("the caller gives what `needs` asks for");
         let mut pairs = Vec::with_capacity(uavs.len() * users.len());

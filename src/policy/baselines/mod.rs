@@ -18,14 +18,14 @@ use std::sync::Arc;
 use rand_chacha::ChaCha8Rng;
 
 use self::search::Search;
-use super::{Needs, Policy, Slot, Turn};
+use super::{FleetStep, Policy, RequiredInput, Slot};
 use crate::env::{EnvConfig, Point};
 use crate::invalid::{Invalid, in_range};
 use crate::rng;
 
 /// What a baseline knows of the world it flies in.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct World {
+pub struct EnvParams {
     /// v, distance per slot.
     pub speed: f64,
     /// t, range within which data is collected.
@@ -38,7 +38,7 @@ pub struct World {
     pub slots: usize,
 }
 
-impl From<&EnvConfig> for World {
+impl From<&EnvConfig> for EnvParams {
     fn from(env: &EnvConfig) -> Self {
         Self {
             speed: env.speed,
@@ -50,7 +50,7 @@ impl From<&EnvConfig> for World {
     }
 }
 
-impl Default for World {
+impl Default for EnvParams {
     fn default() -> Self {
         Self::from(&EnvConfig::default())
     }
@@ -58,18 +58,18 @@ impl Default for World {
 
 /// A baseline as a list of policies shows it.
 #[derive(Clone, Copy, Debug)]
-pub struct Description {
+pub struct BaselineInfo {
     /// The name it is asked for by.
     pub name: &'static str,
     /// One sentence on what it does.
     pub text: &'static str,
     /// What it must be told.
-    pub needs: Needs,
-    open: fn(World) -> Arc<dyn Policy>,
+    pub needs: RequiredInput,
+    open: fn(EnvParams) -> Arc<dyn Policy>,
 }
 
 /// All baselines, from the least to the best informed.
-pub const LIST: [Description; 7] = [
+pub const LIST: [BaselineInfo; 7] = [
     describe::<random::Random>(),
     describe::<Search<persistent::Persistent>>(),
     describe::<Search<max_aoi::MaxAoi>>(),
@@ -80,19 +80,19 @@ pub const LIST: [Description; 7] = [
 ];
 
 /// The baseline called `name`, if there is one.
-pub fn by_name(name: &str, world: World) -> Option<Arc<dyn Policy>> {
+pub fn by_name(name: &str, world: EnvParams) -> Option<Arc<dyn Policy>> {
     LIST.iter().find(|baseline| baseline.name == name).map(|baseline| (baseline.open)(world))
 }
 
-const fn describe<R: Rule + 'static>() -> Description {
-    Description { name: R::NAME, text: R::TEXT, needs: R::NEEDS, open: |world| Arc::new(Baseline { rule: R::default(), world }) }
+const fn describe<R: Rule + 'static>() -> BaselineInfo {
+    BaselineInfo { name: R::NAME, text: R::TEXT, needs: R::NEEDS, open: |world| Arc::new(Baseline { rule: R::default(), world }) }
 }
 
 /// How one fleet decides one slot.
 trait Rule: Default + Send + Sync {
     const NAME: &'static str;
     const TEXT: &'static str;
-    const NEEDS: Needs;
+    const NEEDS: RequiredInput;
 
     /// Length of a fleet's memory.
     fn memory_len(&self, uavs: usize, users: usize) -> usize;
@@ -101,13 +101,13 @@ trait Rule: Default + Send + Sync {
     fn start(&self, seed: u64, memory: &mut [f32]);
 
     /// Writes a heading per UAV and advances the memory.
-    fn fly(&self, world: &World, slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]);
+    fn fly(&self, world: &EnvParams, slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]);
 }
 
 /// A rule in a world: a policy.
 struct Baseline<R> {
     rule: R,
-    world: World,
+    world: EnvParams,
 }
 
 /// Largest M * N that baselines fly: their work and memory grow with it.
@@ -118,7 +118,7 @@ impl<R: Rule> Policy for Baseline<R> {
         self.world.headings
     }
 
-    fn needs(&self) -> Needs {
+    fn needs(&self) -> RequiredInput {
         R::NEEDS
     }
 
@@ -140,7 +140,7 @@ impl<R: Rule> Policy for Baseline<R> {
         self.rule.start(seed, memory);
     }
 
-    fn act(&self, turns: &mut [Turn<'_>]) {
+    fn act(&self, turns: &mut [FleetStep<'_>]) {
         for turn in turns {
             self.rule.fly(&self.world, turn.slot, turn.step, turn.memory, turn.headings);
             if let Some(q) = &mut turn.q_values {

@@ -7,7 +7,7 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
 use super::geometry::{heading_toward, inside, moved};
-use super::{Needs, Rule, SEED_LEN, World, own_positions, slot_rng, store_seed};
+use super::{EnvParams, RequiredInput, Rule, SEED_LEN, own_positions, slot_rng, store_seed};
 use crate::env::{EnvConfig, Point};
 use crate::policy::Slot;
 
@@ -38,7 +38,7 @@ pub(super) struct Search<T>(PhantomData<T>);
 impl<T: Target> Rule for Search<T> {
     const NAME: &'static str = T::NAME;
     const TEXT: &'static str = T::TEXT;
-    const NEEDS: Needs = Needs::OwnPositions;
+    const NEEDS: RequiredInput = RequiredInput::OwnPositions;
 
     fn memory_len(&self, uavs: usize, _users: usize) -> usize {
         SEED_LEN + uavs
@@ -48,7 +48,7 @@ impl<T: Target> Rule for Search<T> {
         store_seed(seed, memory);
     }
 
-    fn fly(&self, world: &World, slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]) {
+    fn fly(&self, world: &EnvParams, slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]) {
         let mut rng = slot_rng(memory, T::NAME, step);
         for (i, (course, heading)) in memory[SEED_LEN..].iter_mut().zip(headings).enumerate() {
             let at = own_positions(slot)[i];
@@ -75,7 +75,7 @@ fn sights(slot: &Slot, i: usize, at: Point) -> impl Iterator<Item = Sight> {
 
 /// The heading of a UAV that flies straight on. `course` is 1 + its heading, 0 before it has one. Where the move would leave
 /// the square it draws among the headings that do not, or among all if none does.
-fn cruise(world: &World, rng: &mut ChaCha8Rng, at: Point, course: &mut f32) -> u8 {
+fn cruise(world: &EnvParams, rng: &mut ChaCha8Rng, at: Point, course: &mut f32) -> u8 {
     let stays = |h: usize| inside(moved(world, at, h));
     let heading = *course as usize;
     if !(1..=EnvConfig::COMPASS).contains(&heading) || !stays(heading - 1) {

@@ -7,7 +7,7 @@
 use std::f64::consts::{PI, TAU};
 
 use super::geometry::{distance, heading_toward, travel_slots};
-use super::{Needs, Rule, World, own_positions};
+use super::{EnvParams, RequiredInput, Rule, own_positions};
 use crate::env::Point;
 use crate::policy::Slot;
 
@@ -33,7 +33,7 @@ const HASTE: f64 = 1.25;
 impl Rule for Sweep {
     const NAME: &'static str = "sweep";
     const TEXT: &'static str = "No prior knowledge: UAVs fan out, search, and serve the users that each found itself.";
-    const NEEDS: Needs = Needs::OwnPositions;
+    const NEEDS: RequiredInput = RequiredInput::OwnPositions;
 
     fn memory_len(&self, uavs: usize, users: usize) -> usize {
         uavs * (CELLS + USER * users)
@@ -41,7 +41,7 @@ impl Rule for Sweep {
 
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}
 
-    fn fly(&self, world: &World, slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]) {
+    fn fly(&self, world: &EnvParams, slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]) {
         let memories = memory.chunks_exact_mut(CELLS + USER * slot.users());
         for ((i, memory), heading) in memories.enumerate().zip(headings) {
             let (seen, users) = memory.split_at_mut(CELLS);
@@ -63,7 +63,7 @@ const HOME: Goal = (0.0, [0.5, 0.5]);
 
 /// One UAV in one slot.
 struct Uav<'a> {
-    world: &'a World,
+    world: &'a EnvParams,
     index: usize,
     fleet: usize,
     at: Point,

@@ -9,10 +9,10 @@
 //! The share of g in w1's first layer is the same for all UAVs of a slot and computed once.
 
 use super::E;
-use super::hyper::{Hyper, HyperCache};
+use super::hyper_net::{HyperNet, HyperNetCache};
 use super::qmix::{mix, mix_back};
-use crate::nn::matmul::Start;
-use crate::nn::{Batch, Embedding, EmbeddingGrad, HIDDEN, Layout, Linear, Real, Rows, Weights, simd};
+use crate::nn::matmul::Accumulate;
+use crate::nn::{Batch, Embedding, EmbeddingGrad, HIDDEN, Linear, ParameterLayout, Real, Rows, Weights, simd};
 use crate::policy::agent::Dims;
 
 #[derive(Clone, Copy, Debug)]
@@ -20,10 +20,10 @@ pub(super) struct Invariant {
     uavs: usize,
     uav: Embedding<2>,
     user: Embedding<3>,
-    w1: Hyper,
+    w1: HyperNet,
     b1: Linear,
-    w2: Hyper,
-    b2: Hyper,
+    w2: HyperNet,
+    b2: HyperNet,
 }
 
 #[derive(Debug, Default)]
@@ -33,31 +33,31 @@ pub(super) struct InvariantCache<T: Real> {
     positions: Batch<T>,
     /// g's share of w1's first layer, and later its gradient.
     share: Batch<T>,
-    w1: HyperCache<T>,
-    w2: HyperCache<T>,
-    b2: HyperCache<T>,
+    w1: HyperNetCache<T>,
+    w2: HyperNetCache<T>,
+    b2: HyperNetCache<T>,
     mixed: Batch<T>,
     dg: Batch<T>,
 }
 
 impl Invariant {
-    pub(super) fn new(layout: &mut Layout, dims: &Dims) -> Self {
+    pub(super) fn new(layout: &mut ParameterLayout, dims: &Dims) -> Self {
         Self {
             uavs: dims.uavs,
             uav: Embedding::new(layout, "mixer.uav"),
             user: Embedding::new(layout, "mixer.user"),
-            w1: Hyper::new(layout, "mixer.w1", [2 + HIDDEN, HIDDEN, E]),
+            w1: HyperNet::new(layout, "mixer.w1", [2 + HIDDEN, HIDDEN, E]),
             b1: Linear::new(layout, "mixer.b1", HIDDEN, E),
-            w2: Hyper::new(layout, "mixer.w2", [HIDDEN, HIDDEN, E]),
-            b2: Hyper::new(layout, "mixer.b2", [HIDDEN, E, 1]),
+            w2: HyperNet::new(layout, "mixer.w2", [HIDDEN, HIDDEN, E]),
+            b2: HyperNet::new(layout, "mixer.b2", [HIDDEN, E, 1]),
         }
     }
 
-    pub(super) fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
-        self.uav.prepare(flat, turned);
-        self.user.prepare(flat, turned);
-        [&self.w1, &self.w2, &self.b2].iter().for_each(|net| net.prepare(flat, turned));
-        self.b1.prepare(flat, turned);
+    pub(super) fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
+        self.uav.prepare(flat, transposed);
+        self.user.prepare(flat, transposed);
+        [&self.w1, &self.w2, &self.b2].iter().for_each(|net| net.prepare(flat, transposed));
+        self.b1.prepare(flat, transposed);
     }
 
     pub(super) fn forward<T: Real>(
@@ -83,12 +83,12 @@ impl Invariant {
             p.copy_from_slice(&state[..2 * m]);
         }
         let first = &self.w1.first;
-        first.forward_part(w, (2, HIDDEN), c.g.rows(), c.share.rows_mut(), Start::Bias(first.bias(w)));
+        first.forward_part(w, (2, HIDDEN), c.g.rows(), c.share.rows_mut(), Accumulate::Bias(first.bias(w)));
         for (rows, share) in c.w1.hidden.as_mut_slice().chunks_exact_mut(m * HIDDEN).zip(c.share.as_slice().chunks_exact(HIDDEN))
         {
             rows.chunks_exact_mut(HIDDEN).for_each(|row| row.copy_from_slice(share));
         }
-        first.forward_part(w, (0, 2), c.positions.rows(), c.w1.hidden.rows_mut(), Start::Add);
+        first.forward_part(w, (0, 2), c.positions.rows(), c.w1.hidden.rows_mut(), Accumulate::Add);
         self.w1.finish(w, &mut c.w1);
         self.w2.forward(w, c.g.rows(), &mut c.w2);
         self.b2.forward(w, c.g.rows(), &mut c.b2);
@@ -131,7 +131,7 @@ impl Invariant {
         }
         first.backward_bias(c.share.rows(), grads);
         first.backward_part((2, HIDDEN), c.g.rows(), c.share.rows(), grads);
-        first.backward_input(flat, (2, HIDDEN), c.share.rows(), c.dg.rows_mut(), Start::Add);
+        first.backward_input(flat, (2, HIDDEN), c.share.rows(), c.dg.rows_mut(), Accumulate::Add);
         let (uav, user) = (self.uav.load(w), self.user.load(w));
         let (mut uav_sums, mut user_sums) = (EmbeddingGrad::zero(), EmbeddingGrad::zero());
         simd(
@@ -182,5 +182,5 @@ fn summarise_back<T: Real>(
 #[inline(always)]
 fn shares<T: Real>(states: usize, uavs: usize) -> (T, T) {
     let users = (states - 2 * uavs) / 3;
-    (T::of(1.0 / uavs as f64), T::of(1.0 / users.max(1) as f64))
+    (T::from_f64(1.0 / uavs as f64), T::from_f64(1.0 / users.max(1) as f64))
 }

@@ -3,28 +3,32 @@
 //! The weights of a mixing network depend on the state and never on the values, and enter as absolute values, so Q_tot
 //! does not fall when any Q_i rises.
 
-mod hyper;
+mod hyper_net;
 mod invariant;
 mod qmix;
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
 use self::invariant::{Invariant, InvariantCache};
 use self::qmix::{Qmix, QmixCache};
 use super::agent::Dims;
-use crate::nn::{Batch, Layout, Real, Rows, RowsMut, Weights};
+use crate::nn::{Batch, ParameterLayout, Real, Rows, RowsMut, Weights};
 
 /// E, the width of the mixing layer.
 const E: usize = 32;
 
-/// Which mixing network.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Mixing {
-    /// Spec 4.1: hypernetworks on the flat state.
+/// How the UAVs' values become joint values.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum MixerKind {
+    /// Hypernetworks on the flat state.
     Qmix,
-    /// Spec 4.2: hypernetworks on a permutation-invariant summary of the state.
+    /// Hypernetworks on a permutation-invariant summary of the state.
     Invariant,
-    /// Spec 4.3: the sum.
+    /// The sum.
     Vdn,
-    /// None: every UAV keeps its own value.
+    /// No mixing: each UAV has its own target (`iql`).
     None,
 }
 
@@ -52,12 +56,12 @@ pub struct MixerCache<T: Real> {
 
 impl Mixer {
     /// Adds `mixer.*` to the layout.
-    pub fn new(mixing: Mixing, dims: &Dims, layout: &mut Layout) -> Self {
-        let net = match mixing {
-            Mixing::Qmix => Net::Qmix(Qmix::new(layout, dims)),
-            Mixing::Invariant => Net::Invariant(Invariant::new(layout, dims)),
-            Mixing::Vdn => Net::Vdn,
-            Mixing::None => Net::None,
+    pub fn new(kind: MixerKind, dims: &Dims, layout: &mut ParameterLayout) -> Self {
+        let net = match kind {
+            MixerKind::Qmix => Net::Qmix(Qmix::new(layout, dims)),
+            MixerKind::Invariant => Net::Invariant(Invariant::new(layout, dims)),
+            MixerKind::Vdn => Net::Vdn,
+            MixerKind::None => Net::None,
         };
         Self { uavs: dims.uavs, net }
     }
@@ -68,10 +72,10 @@ impl Mixer {
     }
 
     /// See [`crate::nn::Weights`].
-    pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
+    pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
         match &self.net {
-            Net::Qmix(net) => net.prepare(flat, turned),
-            Net::Invariant(net) => net.prepare(flat, turned),
+            Net::Qmix(net) => net.prepare(flat, transposed),
+            Net::Invariant(net) => net.prepare(flat, transposed),
             Net::Vdn | Net::None => {}
         }
     }

@@ -6,42 +6,42 @@
 //! Q_tot = w2 . ELU(q W1 + b1) + b2
 //! ```
 
-use super::hyper::{Hyper, HyperCache};
+use super::hyper_net::{HyperNet, HyperNetCache};
 use super::{E, elu_slope, sign};
-use crate::nn::{Batch, HIDDEN, Layout, Linear, Real, Rows, Weights, elu, simd};
+use crate::nn::{Batch, HIDDEN, Linear, ParameterLayout, Real, Rows, Weights, elu, simd};
 use crate::policy::agent::Dims;
 
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Qmix {
-    w1: Hyper,
+    w1: HyperNet,
     b1: Linear,
-    w2: Hyper,
-    b2: Hyper,
+    w2: HyperNet,
+    b2: HyperNet,
 }
 
 #[derive(Debug, Default)]
 pub(super) struct QmixCache<T: Real> {
-    w1: HyperCache<T>,
-    w2: HyperCache<T>,
-    b2: HyperCache<T>,
+    w1: HyperNetCache<T>,
+    w2: HyperNetCache<T>,
+    b2: HyperNetCache<T>,
     /// b1, then ELU(q W1 + b1).
     mixed: Batch<T>,
 }
 
 impl Qmix {
-    pub(super) fn new(layout: &mut Layout, dims: &Dims) -> Self {
+    pub(super) fn new(layout: &mut ParameterLayout, dims: &Dims) -> Self {
         let states = 2 * dims.uavs + 3 * dims.users;
         Self {
-            w1: Hyper::new(layout, "mixer.w1", [states, HIDDEN, dims.uavs * E]),
+            w1: HyperNet::new(layout, "mixer.w1", [states, HIDDEN, dims.uavs * E]),
             b1: Linear::new(layout, "mixer.b1", states, E),
-            w2: Hyper::new(layout, "mixer.w2", [states, HIDDEN, E]),
-            b2: Hyper::new(layout, "mixer.b2", [states, E, 1]),
+            w2: HyperNet::new(layout, "mixer.w2", [states, HIDDEN, E]),
+            b2: HyperNet::new(layout, "mixer.b2", [states, E, 1]),
         }
     }
 
-    pub(super) fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
-        [&self.w1, &self.w2, &self.b2].iter().for_each(|net| net.prepare(flat, turned));
-        self.b1.prepare(flat, turned);
+    pub(super) fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
+        [&self.w1, &self.w2, &self.b2].iter().for_each(|net| net.prepare(flat, transposed));
+        self.b1.prepare(flat, transposed);
     }
 
     pub(super) fn forward<T: Real>(

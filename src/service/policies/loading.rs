@@ -8,7 +8,7 @@ use sha2::{Digest, Sha256};
 use super::publish::{Stored, publish};
 use super::{Shelf, in_turn};
 use crate::invalid::Invalid;
-use crate::policy::baselines::{self, World};
+use crate::policy::baselines::{self, EnvParams};
 use crate::service::{App, Error};
 use crate::serving::bundled::BUNDLED;
 use crate::serving::{About, Kind, LoadedPolicy, PolicyRef, PolicySpec, Registry, Which};
@@ -51,7 +51,7 @@ pub async fn load_policy(app: &App, name: &str) -> Result<(), Error> {
                 (true, _) => continue,
                 (false, Kind::Baseline) => {
                     let missing = || Error::not_found("policy", about.reference.to_string());
-                    let policy = baselines::by_name(&spec.name, World::default()).ok_or_else(missing)?;
+                    let policy = baselines::by_name(&spec.name, EnvParams::default()).ok_or_else(missing)?;
                     LoadedPolicy { about, policy }
                 }
                 (false, Kind::Checkpoint) => Stored::new(&store, &spec.name, about.reference.version).await?.load().await?,
@@ -112,7 +112,7 @@ fn versions(registry: &Registry, spec: &PolicySpec) -> Result<Vec<(Arc<About>, b
 /// The store cannot be read, or a bundled policy is no checkpoint. A published version that cannot be read any more is left
 /// out and logged: the others are served.
 pub async fn load(app: &App) -> Result<(), Error> {
-    let world = World::default();
+    let world = EnvParams::default();
     for baseline in &baselines::LIST {
         let Some(policy) = baselines::by_name(baseline.name, world) else { continue };
         // The digest says what a checkpoint's does: equal digests, equal answers.

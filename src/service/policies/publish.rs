@@ -11,7 +11,7 @@ use super::{Shelf, in_turn};
 use crate::checkpoint::Checkpoint;
 use crate::invalid::Invalid;
 use crate::policy::baselines;
-use crate::policy::{Identity, Observation, Policy};
+use crate::policy::{Identity, ObservationKind, Policy};
 use crate::service::{App, Error, jobs};
 use crate::serving::{About, Described, Kind, LoadedPolicy, PolicyRef, PolicySpec, Which, check_name};
 use crate::store::{NewPolicyVersion, PolicyVersion, Store};

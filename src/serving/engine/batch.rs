@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use super::reply::Promise;
 use super::{Outcome, Task, Timings};
-use crate::policy::Turn;
+use crate::policy::FleetStep;
 use crate::serving::meters::Meters;
 use crate::serving::{Error, LoadedPolicy};
 
@@ -22,7 +22,7 @@ pub(super) struct Queued {
 #[derive(Default)]
 pub(super) struct Batch {
     pub(super) fleets: Vec<Queued>,
-    turns: Vec<Turn<'static>>,
+    turns: Vec<FleetStep<'static>>,
 }
 
 impl Batch {
@@ -93,7 +93,7 @@ fn panicked(policy: &LoadedPolicy) -> Error {
 }
 
 /// The room of `turns`, for turns of another time: a vector that is collected from its own elements keeps its allocation.
-fn recycled<'to>(mut turns: Vec<Turn<'_>>) -> Vec<Turn<'to>> {
+fn recycled<'to>(mut turns: Vec<FleetStep<'_>>) -> Vec<FleetStep<'to>> {
     turns.clear();
     turns.into_iter().map(|_| unreachable!("it was cleared")).collect()
 }

@@ -21,7 +21,7 @@ use reply::{Expected, Places};
 
 use super::meters::Meters;
 use super::{Error, LoadedPolicy};
-use crate::policy::{Slot, Turn};
+use crate::policy::{FleetStep, Slot};
 
 /// Work of a batch beyond which no further fleet joins it: company must not make a small fleet wait for large ones.
 const WORK: usize = 1 << 17;
@@ -76,9 +76,9 @@ impl Task {
         &self.policy
     }
 
-    fn turn(&mut self) -> Turn<'_> {
+    fn turn(&mut self) -> FleetStep<'_> {
         let Outcome { memory, headings, q_values, .. } = &mut self.out;
-        Turn { slot: &self.slot, step: self.step, memory, headings, q_values: Some(q_values) }
+        FleetStep { slot: &self.slot, step: self.step, memory, headings, q_values: Some(q_values) }
     }
 
     fn done(self, timings: Timings) -> Outcome {
@@ -92,7 +92,7 @@ impl Task {
 
     /// Whether a caller may compute it.
     fn is_small(&self) -> bool {
-        self.policy.policy.is_linear() && self.work() <= SMALL
+        self.policy.policy.is_cheap() && self.work() <= SMALL
     }
 }
 

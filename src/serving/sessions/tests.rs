@@ -2,7 +2,7 @@ use std::sync::Mutex;
 
 use super::*;
 use crate::invalid::Invalid;
-use crate::policy::{Needs, Policy};
+use crate::policy::{Policy, RequiredInput};
 use crate::serving::{Clock, Fleet, Limits, Outcome, Timings};
 
 struct Nothing;
@@ -11,8 +11,8 @@ impl Policy for Nothing {
     fn actions(&self) -> usize {
         8
     }
-    fn needs(&self) -> Needs {
-        Needs::Detections
+    fn needs(&self) -> RequiredInput {
+        RequiredInput::Detections
     }
     fn detection_range(&self) -> f64 {
         0.28
@@ -26,7 +26,7 @@ impl Policy for Nothing {
     fn start(&self, _: usize, _: usize, seed: u64, memory: &mut [f32]) {
         memory.fill(seed as f32);
     }
-    fn act(&self, _: &mut [crate::policy::Turn<'_>]) {}
+    fn act(&self, _: &mut [crate::policy::FleetStep<'_>]) {}
 }
 
 fn policy(name: &str) -> Arc<LoadedPolicy> {

@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use proptest::prelude::*;
 use qedgix::api::convert::tensors::{Data, Tensor, observation};
-use qedgix::policy::baselines::{LIST, World, by_name};
-use qedgix::policy::{Needs, Turn};
+use qedgix::policy::baselines::{EnvParams, LIST, by_name};
+use qedgix::policy::{FleetStep, RequiredInput};
 use tonic::Code;
 
 use super::*;
@@ -369,13 +369,13 @@ proptest! {
         };
         let (uavs, users) = (observation.uavs(), observation.users());
         prop_assert_eq!(observation.uav_order.len(), uavs);
-        for baseline in LIST.iter().filter(|baseline| baseline.needs != Needs::FullScene) {
-            let policy = by_name(baseline.name, World::default()).unwrap();
+        for baseline in LIST.iter().filter(|baseline| baseline.needs != RequiredInput::FullScene) {
+            let policy = by_name(baseline.name, EnvParams::default()).unwrap();
             let Ok(slot) = observation.clone().into_slot(&*policy) else { continue };
             let mut memory = vec![0.0; policy.memory_len(uavs, users)];
             policy.start(uavs, users, 3, &mut memory);
             let mut headings = vec![0; uavs];
-            policy.act(&mut [Turn { slot: &slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: None }]);
+            policy.act(&mut [FleetStep { slot: &slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: None }]);
         }
     }
 }

@@ -3,14 +3,14 @@
 //! The pilot flies to the next user of its tour by a shortest path along the eight headings, and of the shortest ones takes
 //! that which comes nearest to the user after. A user is reached as soon as it is in range, so discs are toured, not points.
 
-use super::super::World;
+use super::super::EnvParams;
 use super::super::geometry::{distance, inside, moved};
 use crate::env::{EnvConfig, Point};
 
 /// A fleet among users, and the number of slots to plan for.
 #[derive(Clone, Copy)]
 pub struct Scene<'a> {
-    pub world: &'a World,
+    pub world: &'a EnvParams,
     pub uavs: &'a [Point],
     pub users: &'a [Point],
     pub aoi: &'a [f32],
@@ -29,12 +29,12 @@ const SURE: f64 = 1.0 - 1e-6;
 
 /// The pilot.
 pub struct Pilot<'a> {
-    world: &'a World,
+    world: &'a EnvParams,
     range: f64,
 }
 
 impl<'a> Pilot<'a> {
-    pub fn new(world: &'a World) -> Self {
+    pub fn new(world: &'a EnvParams) -> Self {
         Self { world, range: world.transmission_range * SURE }
     }
 

@@ -11,7 +11,7 @@ mod plan;
 
 use self::flight::{Leg, Pilot, Scene};
 use super::geometry::distance;
-use super::{Needs, Rule, World, own_positions};
+use super::{EnvParams, RequiredInput, Rule, own_positions};
 use crate::env::Point;
 use crate::policy::Slot;
 
@@ -31,7 +31,7 @@ impl Rule for Tour {
     const NAME: &'static str = "tour";
     const TEXT: &'static str =
         "Full information: shares users out among UAVs and flies round each UAV's own. A reference, not a bound.";
-    const NEEDS: Needs = Needs::FullScene;
+    const NEEDS: RequiredInput = RequiredInput::FullScene;
 
     fn memory_len(&self, uavs: usize, users: usize) -> usize {
         2 * uavs + 2 * users + capacity(uavs, users)
@@ -39,7 +39,7 @@ impl Rule for Tour {
 
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}
 
-    fn fly(&self, world: &World, slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]) {
+    fn fly(&self, world: &EnvParams, slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]) {
         let uavs = own_positions(slot);
         let users = slot.user_positions().expect("the caller gives what `needs` asks for");
         let mut legs = recall(world, uavs.len(), users, memory).unwrap_or_else(|| {
@@ -78,7 +78,7 @@ fn remember(tours: &[Vec<u32>], users: &[Point], memory: &mut [f32]) {
 }
 
 /// The plan in `memory`, where it still holds. Callers may keep the memory themselves, so nothing in it is taken on trust.
-fn recall(world: &World, uavs: usize, users: &[Point], memory: &[f32]) -> Option<Vec<Leg>> {
+fn recall(world: &EnvParams, uavs: usize, users: &[Point], memory: &[f32]) -> Option<Vec<Leg>> {
     let (counts, rest) = memory.split_at(2 * uavs);
     let (places, mut entries) = rest.split_at(2 * users.len());
     let near =

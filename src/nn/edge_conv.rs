@@ -14,12 +14,12 @@
 use super::HIDDEN as H;
 use super::batch::{Batch, Rows, RowsMut};
 use super::graph::Graph;
-use super::kernels::simd;
+use super::layer_norm::{self, Affine, LayerNorm, Stats};
 use super::linear::Linear;
-use super::matmul::{Lhs, Out, Rhs, Start, matmul};
-use super::norm::{self, Affine, Norm, Stats};
-use super::params::{Layout, Weights};
+use super::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
+use super::params::{ParameterLayout, Weights};
 use super::real::Real;
+use super::simd::simd;
 
 /// Width of f's hidden layer.
 const W: usize = 96;
@@ -37,7 +37,7 @@ pub enum Pairing {
 #[derive(Clone, Copy, Debug)]
 pub struct EdgeNet {
     first: Linear,
-    norm: Norm<W>,
+    norm: LayerNorm<W>,
     last: Linear,
     pairing: Pairing,
     mean: bool,
@@ -62,10 +62,10 @@ pub struct EdgeScratch<T: Real> {
 
 impl EdgeNet {
     /// Adds `name.0`, `name.1`, `name.3`; aggregation is the mean or the sum over neighbours.
-    pub fn new(layout: &mut Layout, name: &str, pairing: Pairing, mean: bool) -> Self {
+    pub fn new(layout: &mut ParameterLayout, name: &str, pairing: Pairing, mean: bool) -> Self {
         Self {
             first: Linear::new(layout, &format!("{name}.0"), 2 * H, W),
-            norm: Norm::new(layout, &format!("{name}.1")),
+            norm: LayerNorm::new(layout, &format!("{name}.1")),
             last: Linear::new(layout, &format!("{name}.3"), W, H),
             pairing,
             mean,
@@ -73,9 +73,9 @@ impl EdgeNet {
     }
 
     /// Writes what makes u and v of x, transposed, (H, W) each, and the last layer's transposed weight.
-    pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
-        self.last.prepare(flat, turned);
-        let (own, neighbour) = self.first.weight_grad(turned).split_at_mut(H * W);
+    pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
+        self.last.prepare(flat, transposed);
+        let (own, neighbour) = self.first.weight_grad(transposed).split_at_mut(H * W);
         for (o, row) in self.first.weight(flat).as_chunks::<{ 2 * H }>().0.iter().enumerate() {
             for i in 0..H {
                 own[i * W + o] = if self.pairing == Pairing::Difference { row[i] - row[H + i] } else { row[i] };
@@ -103,12 +103,12 @@ impl EdgeNet {
         cache.v.reset(W, x.len);
         cache.a.reset(W, nodes);
         cache.stats.resize(graph.offsets[nodes] as usize, [T::ZERO; 2]);
-        let (own, neighbour) = self.first.weight_turned(w).split_at(H * W);
+        let (own, neighbour) = self.first.weight_transposed(w).split_at(H * W);
         let lhs = Lhs::rows(x.data, x.stride);
         let out = Out { data: cache.u.as_mut_slice(), stride: W };
-        matmul((nodes, H, W), lhs, Rhs { data: own, stride: W }, out, Start::Bias(self.first.bias(w)));
+        matmul((nodes, H, W), lhs, Rhs { data: own, stride: W }, out, Accumulate::Bias(self.first.bias(w)));
         let out = Out { data: cache.v.as_mut_slice(), stride: W };
-        matmul((x.len, H, W), lhs, Rhs { data: neighbour, stride: W }, out, Start::Zero);
+        matmul((x.len, H, W), lhs, Rhs { data: neighbour, stride: W }, out, Accumulate::Zero);
         let affine = self.norm.affine(w.flat);
         let EdgeCache { u, v, a, stats } = cache;
         let (u, v) = (u.as_slice().as_chunks().0, v.as_slice().as_chunks().0);
@@ -125,7 +125,7 @@ impl EdgeNet {
             if degree == 0 {
                 y.data[i * stride..][..H].fill(T::ZERO);
             } else if !self.mean {
-                let more = T::of((degree - 1) as f64);
+                let more = T::from_f64((degree - 1) as f64);
                 y.data[i * stride..][..H].iter_mut().zip(bias).for_each(|(y, &b)| *y += more * b);
             }
         }
@@ -151,7 +151,7 @@ impl EdgeNet {
             || last_bias_back(graph, self.mean, dy.as_mut_slice().as_chunks_mut().0, bias),
         );
         self.last.backward_part((0, W), cache.a.rows(), dy.rows(), grads);
-        self.last.backward_input(flat, (0, W), dy.rows(), da.rows_mut(), Start::Zero);
+        self.last.backward_input(flat, (0, W), dy.rows(), da.rows_mut(), Accumulate::Zero);
 
         let affine = self.norm.affine(flat);
         let mut sums = Affine::zero();
@@ -176,8 +176,8 @@ impl EdgeNet {
         }
         self.first.backward_part((H, H), x, dv.rows(), grads);
         dx.reset(H, x.len);
-        self.first.backward_input(flat, (H, H), dv.rows(), dx.rows_mut(), Start::Zero);
-        self.first.backward_input(flat, (0, H), du.rows(), dx.range_mut(0..nodes), Start::Add);
+        self.first.backward_input(flat, (H, H), dv.rows(), dx.rows_mut(), Accumulate::Zero);
+        self.first.backward_input(flat, (0, H), du.rows(), dx.range_mut(0..nodes), Accumulate::Add);
     }
 }
 
@@ -190,7 +190,7 @@ fn last_bias_back<T: Real>(graph: &Graph, mean: bool, dy: &mut [[T; H]], bias: &
             *dy = [T::ZERO; H];
             continue;
         }
-        let times = if mean { T::ONE } else { T::of(degree as f64) };
+        let times = if mean { T::ONE } else { T::from_f64(degree as f64) };
         for c in 0..H {
             bias[c] = times.mul_add(dy[c], bias[c]);
         }
@@ -216,10 +216,10 @@ fn aggregate<T: Real>(
             for c in 0..W {
                 x[c] = u[c] + v[c];
             }
-            let s = norm::stats(&x);
-            *stats = [s.mean, s.inverse];
+            let s = layer_norm::stats(&x);
+            *stats = [s.mean, s.rstd];
             let mut y = [T::ZERO; W];
-            norm::forward(&x, s, affine, &mut y);
+            layer_norm::forward(&x, s, affine, &mut y);
             for c in 0..W {
                 sum[c] += y[c];
             }
@@ -255,8 +255,8 @@ fn aggregate_back<T: Real>(
             for c in 0..W {
                 x[c] = u[c] + v[c];
             }
-            let s = Stats { mean: stats[0], inverse: stats[1] };
-            let d = norm::backward(&x, s, affine, &da, sums);
+            let s = Stats { mean: stats[0], rstd: stats[1] };
+            let d = layer_norm::backward(&x, s, affine, &da, sums);
             let dv = &mut dv[j as usize];
             for c in 0..W {
                 sum[c] += d[c];
@@ -270,5 +270,5 @@ fn aggregate_back<T: Real>(
 /// Weight of a neighbour in the aggregate.
 #[inline(always)]
 fn share<T: Real>(neighbours: &[u32], mean: bool) -> T {
-    if mean { T::ONE / T::of(neighbours.len().max(1) as f64) } else { T::ONE }
+    if mean { T::ONE / T::from_f64(neighbours.len().max(1) as f64) } else { T::ONE }
 }

@@ -1,12 +1,7 @@
-//! Elementwise functions over whole batches, compiled for the processor's vector units and chosen at run time.
+//! Activation functions and their derivatives, over whole batches.
 
 use super::real::Real;
-
-/// Runs `f` compiled for the widest vector unit of this processor. What `f` calls must be `inline(always)` to profit.
-#[inline(always)]
-pub fn simd<R>(f: impl FnOnce() -> R) -> R {
-    pulp::Arch::new().dispatch(f)
-}
+use super::simd::simd;
 
 /// Slope of the leaky ReLU below 0.
 const LEAK: f64 = 0.01;
@@ -29,7 +24,7 @@ pub fn relu_back<T: Real>(y: &[T], dy: &mut [T]) {
 
 /// x = x above 0, 0.01 x below.
 pub fn leaky_relu<T: Real>(x: &mut [T]) {
-    let leak = T::of(LEAK);
+    let leak = T::from_f64(LEAK);
     simd(
         #[inline(always)]
         || x.iter_mut().for_each(|x| *x = if *x > T::ZERO { *x } else { leak * *x }),
@@ -38,7 +33,7 @@ pub fn leaky_relu<T: Real>(x: &mut [T]) {
 
 /// Gradient of the leaky ReLU from its output, in place.
 pub fn leaky_relu_back<T: Real>(y: &[T], dy: &mut [T]) {
-    let leak = T::of(LEAK);
+    let leak = T::from_f64(LEAK);
     simd(
         #[inline(always)]
         || dy.iter_mut().zip(y).for_each(|(d, &y)| *d = if y > T::ZERO { *d } else { leak * *d }),
@@ -52,15 +47,7 @@ pub fn elu<T: Real>(x: T) -> T {
     if x > T::ZERO { x } else { below }
 }
 
-/// sums += the sum of `rows`, each as wide as `sums`.
-pub(super) fn add_rows<T: Real>(rows: super::Rows<'_, T>, sums: &mut [T]) {
-    let width = sums.len();
-    simd(
-        #[inline(always)]
-        || {
-            for row in rows.data.chunks(rows.stride.max(1)).take(rows.len) {
-                sums.iter_mut().zip(&row[..width]).for_each(|(s, &x)| *s += x);
-            }
-        },
-    );
+/// Index of the largest value; of equal values the first; 0 for an empty slice.
+pub fn argmax<T: PartialOrd>(x: &[T]) -> usize {
+    (1..x.len()).fold(0, |best, i| if x[i] > x[best] { i } else { best })
 }

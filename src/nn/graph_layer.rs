@@ -2,11 +2,11 @@
 
 use super::HIDDEN as H;
 use super::batch::{Batch, Rows, RowsMut};
-use super::edge::{EdgeCache, EdgeNet, EdgeScratch, Pairing};
+use super::edge_conv::{EdgeCache, EdgeNet, EdgeScratch, Pairing};
 use super::graph::Graph;
-use super::matmul::Start;
+use super::matmul::Accumulate;
 use super::mlp::{Mlp, MlpCache};
-use super::params::{Layout, Weights};
+use super::params::{ParameterLayout, Weights};
 use super::real::Real;
 use super::rgcn::{Rgcn, RgcnCache};
 
@@ -47,30 +47,30 @@ pub struct LayerScratch<T: Real> {
 
 impl GraphLayer {
     /// `name.f.*`.
-    pub fn edge_conv(layout: &mut Layout, name: &str, mean: bool) -> Self {
+    pub fn edge_conv(layout: &mut ParameterLayout, name: &str, mean: bool) -> Self {
         Self::EdgeConv(EdgeNet::new(layout, &format!("{name}.f"), Pairing::Difference, mean))
     }
 
     /// `name.com.*` and `name.update.*`.
-    pub fn agg_gnn(layout: &mut Layout, name: &str) -> Self {
+    pub fn agg_gnn(layout: &mut ParameterLayout, name: &str) -> Self {
         let com = EdgeNet::new(layout, &format!("{name}.com"), Pairing::Plain, true);
         Self::AggGnn { com, update: Mlp::new(layout, &format!("{name}.update"), 2 * H, H) }
     }
 
     /// `name.root.*` and `name.rel`.
-    pub fn rgcn(layout: &mut Layout, name: &str) -> Self {
+    pub fn rgcn(layout: &mut ParameterLayout, name: &str) -> Self {
         Self::Rgcn(Rgcn::new(layout, name))
     }
 
     /// See [`Weights`].
-    pub fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
+    pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
         match self {
-            Self::EdgeConv(net) => net.prepare(flat, turned),
+            Self::EdgeConv(net) => net.prepare(flat, transposed),
             Self::AggGnn { com, update } => {
-                com.prepare(flat, turned);
-                update.prepare(flat, turned);
+                com.prepare(flat, transposed);
+                update.prepare(flat, transposed);
             }
-            Self::Rgcn(net) => net.prepare(flat, turned),
+            Self::Rgcn(net) => net.prepare(flat, transposed),
         }
     }
 
@@ -114,9 +114,9 @@ impl GraphLayer {
                 update.backward(w.flat, (own, c.message.rows(), H), dy.rows(), &mut c.update, grads);
                 let d = update.d_first(&c.update);
                 s.message.reset(H, dy.len());
-                update.first.backward_input(w.flat, (H, H), d, s.message.rows_mut(), Start::Zero);
+                update.first.backward_input(w.flat, (H, H), d, s.message.rows_mut(), Accumulate::Zero);
                 com.backward(w.flat, (graph, x, &c.edge), &mut s.message, &mut s.edge, (grads, dx));
-                update.first.backward_input(w.flat, (0, H), d, dx.range_mut(0..dy.len()), Start::Add);
+                update.first.backward_input(w.flat, (0, H), d, dx.range_mut(0..dy.len()), Accumulate::Add);
             }
             Self::Rgcn(net) => net.backward(w, (graph, x, &mut c.rgcn), dy.rows(), (grads, dx)),
         }

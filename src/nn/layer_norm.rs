@@ -3,7 +3,7 @@
 //! y = relu(g n + b) with n = (x - mean) / deviation. Backward, with e = dy g where y > 0 and means over the width:
 //! dx = (e - mean(e) - n mean(e n)) / deviation.
 
-use super::params::{Init, Layout};
+use super::params::{Init, ParameterLayout};
 use super::real::Real;
 
 /// Lanes of a reduction: fixed, so that sums have a fixed order that vector units like.
@@ -12,7 +12,7 @@ const EPS: f64 = 1e-5;
 
 /// Offsets of scale and shift.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Norm<const W: usize> {
+pub(super) struct LayerNorm<const W: usize> {
     scale: usize,
     shift: usize,
 }
@@ -21,7 +21,7 @@ pub(super) struct Norm<const W: usize> {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Stats<T> {
     pub(super) mean: T,
-    pub(super) inverse: T,
+    pub(super) rstd: T,
 }
 
 /// Scale and shift, or their gradients.
@@ -31,8 +31,8 @@ pub(super) struct Affine<T, const W: usize> {
     pub(super) shift: [T; W],
 }
 
-impl<const W: usize> Norm<W> {
-    pub(super) fn new(layout: &mut Layout, name: &str) -> Self {
+impl<const W: usize> LayerNorm<W> {
+    pub(super) fn new(layout: &mut ParameterLayout, name: &str) -> Self {
         let scale = layout.add(format!("{name}.weight"), &[W], Init::Constant(1.0));
         let shift = layout.add(format!("{name}.bias"), &[W], Init::Constant(0.0));
         Self { scale, shift }
@@ -71,7 +71,7 @@ fn fold<T: Real>(mut lanes: [T; LANES]) -> T {
 
 #[inline(always)]
 pub(super) fn stats<T: Real, const W: usize>(x: &[T; W]) -> Stats<T> {
-    let share = T::of(1.0 / W as f64);
+    let share = T::from_f64(1.0 / W as f64);
     let mut sum = [T::ZERO; LANES];
     for c in x.chunks_exact(LANES) {
         for l in 0..LANES {
@@ -87,14 +87,14 @@ pub(super) fn stats<T: Real, const W: usize>(x: &[T; W]) -> Stats<T> {
         }
     }
     let variance = fold(square) * share;
-    Stats { mean, inverse: T::ONE / (variance + T::of(EPS)).sqrt() }
+    Stats { mean, rstd: T::ONE / (variance + T::from_f64(EPS)).sqrt() }
 }
 
 /// y = relu(g n + b).
 #[inline(always)]
 pub(super) fn forward<T: Real, const W: usize>(x: &[T; W], s: Stats<T>, p: &Affine<T, W>, y: &mut [T; W]) {
     for c in 0..W {
-        let n = (x[c] - s.mean) * s.inverse;
+        let n = (x[c] - s.mean) * s.rstd;
         y[c] = n.mul_add(p.scale[c], p.shift[c]).relu();
     }
 }
@@ -108,11 +108,11 @@ pub(super) fn backward<T: Real, const W: usize>(
     dy: &[T; W],
     grads: &mut Affine<T, W>,
 ) -> [T; W] {
-    let share = T::of(1.0 / W as f64);
+    let share = T::from_f64(1.0 / W as f64);
     let mut n = [T::ZERO; W];
     let mut e = [T::ZERO; W];
     for c in 0..W {
-        n[c] = (x[c] - s.mean) * s.inverse;
+        n[c] = (x[c] - s.mean) * s.rstd;
         let open = n[c].mul_add(p.scale[c], p.shift[c]) > T::ZERO;
         let d = if open { dy[c] } else { T::ZERO };
         grads.scale[c] = d.mul_add(n[c], grads.scale[c]);
@@ -129,7 +129,7 @@ pub(super) fn backward<T: Real, const W: usize>(
     let (mean, slope) = (fold(sum) * share, fold(product) * share);
     let mut dx = [T::ZERO; W];
     for c in 0..W {
-        dx[c] = s.inverse * ((e[c] - mean) - n[c] * slope);
+        dx[c] = s.rstd * ((e[c] - mean) - n[c] * slope);
     }
     dx
 }

@@ -1,15 +1,15 @@
 //! Linear, ReLU, Linear: the hypernetworks of the mixers.
 
-use crate::nn::{Batch, Layout, Linear, Real, Rows, Weights, matmul::Start, relu, relu_back};
+use crate::nn::{Batch, Linear, ParameterLayout, Real, Rows, Weights, matmul::Accumulate, relu, relu_back};
 
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Hyper {
+pub(super) struct HyperNet {
     pub(super) first: Linear,
     pub(super) last: Linear,
 }
 
 #[derive(Debug, Default)]
-pub(super) struct HyperCache<T: Real> {
+pub(super) struct HyperNetCache<T: Real> {
     pub(super) hidden: Batch<T>,
     /// The output; before backward the caller puts its gradient here.
     pub(super) out: Batch<T>,
@@ -17,46 +17,46 @@ pub(super) struct HyperCache<T: Real> {
     pub(super) d_first: Batch<T>,
 }
 
-impl Hyper {
-    pub(super) fn new(layout: &mut Layout, name: &str, [inputs, hidden, outputs]: [usize; 3]) -> Self {
+impl HyperNet {
+    pub(super) fn new(layout: &mut ParameterLayout, name: &str, [inputs, hidden, outputs]: [usize; 3]) -> Self {
         Self {
             first: Linear::new(layout, &format!("{name}.0"), inputs, hidden),
             last: Linear::new(layout, &format!("{name}.2"), hidden, outputs),
         }
     }
 
-    pub(super) fn prepare<T: Real>(&self, flat: &[T], turned: &mut [T]) {
-        self.first.prepare(flat, turned);
-        self.last.prepare(flat, turned);
+    pub(super) fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
+        self.first.prepare(flat, transposed);
+        self.last.prepare(flat, transposed);
     }
 
-    pub(super) fn forward<T: Real>(&self, w: Weights<'_, T>, x: Rows<'_, T>, c: &mut HyperCache<T>) {
+    pub(super) fn forward<T: Real>(&self, w: Weights<'_, T>, x: Rows<'_, T>, c: &mut HyperNetCache<T>) {
         c.hidden.reset(self.first.outputs, x.len);
         self.first.forward(w, x, c.hidden.rows_mut());
         self.finish(w, c);
     }
 
     /// From the output of the first layer, already in `hidden`.
-    pub(super) fn finish<T: Real>(&self, w: Weights<'_, T>, c: &mut HyperCache<T>) {
+    pub(super) fn finish<T: Real>(&self, w: Weights<'_, T>, c: &mut HyperNetCache<T>) {
         relu(c.hidden.as_mut_slice());
         c.out.reset(self.last.outputs, c.hidden.len());
         self.last.forward(w, c.hidden.rows(), c.out.rows_mut());
     }
 
-    pub(super) fn backward<T: Real>(&self, flat: &[T], x: Rows<'_, T>, c: &mut HyperCache<T>, grads: &mut [T]) {
+    pub(super) fn backward<T: Real>(&self, flat: &[T], x: Rows<'_, T>, c: &mut HyperNetCache<T>, grads: &mut [T]) {
         self.backward_last(flat, c, grads);
         self.first.backward(flat, x, c.d_first.rows(), grads, None);
     }
 
     /// Up to the output of the first layer.
-    pub(super) fn backward_last<T: Real>(&self, flat: &[T], c: &mut HyperCache<T>, grads: &mut [T]) {
+    pub(super) fn backward_last<T: Real>(&self, flat: &[T], c: &mut HyperNetCache<T>, grads: &mut [T]) {
         c.d_first.reset(self.first.outputs, c.hidden.len());
         self.last.backward(flat, c.hidden.rows(), c.out.rows(), grads, Some(c.d_first.rows_mut()));
         relu_back(c.hidden.as_slice(), c.d_first.as_mut_slice());
     }
 
     /// Adds to dx, after backward.
-    pub(super) fn backward_input<T: Real>(&self, flat: &[T], c: &HyperCache<T>, dx: &mut Batch<T>) {
-        self.first.backward_input(flat, (0, self.first.inputs), c.d_first.rows(), dx.rows_mut(), Start::Add);
+    pub(super) fn backward_input<T: Real>(&self, flat: &[T], c: &HyperNetCache<T>, dx: &mut Batch<T>) {
+        self.first.backward_input(flat, (0, self.first.inputs), c.d_first.rows(), dx.rows_mut(), Accumulate::Add);
     }
 }
