@@ -3,11 +3,9 @@
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use super::point::Point;
 use super::schema::Weight;
 use crate::invalid::{Invalid, in_range};
-
-/// A point in the plane, in units of the square's side.
-pub type Point = [f64; 2];
 
 /// What happens at the border of the unit square.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]

@@ -1,6 +1,6 @@
 //! One environment for one caller: points and checked actions instead of batches. Whoever hosts environments builds on this.
 
-use super::{BatchEnv, EnvConfig, EpisodeMetrics, Point, StepError};
+use super::{BatchEnv, EnvConfig, EpisodeMetrics, Point, StepError, points};
 use crate::invalid::Invalid;
 
 /// A single running episode.
@@ -57,12 +57,12 @@ impl Episode {
 
     /// Position of each UAV.
     pub fn uavs(&self) -> Vec<Point> {
-        points(self.env.uav_xy())
+        points(self.env.uav_xy()).collect()
     }
 
     /// Position of each user.
     pub fn users(&self) -> Vec<Point> {
-        points(self.env.user_xy())
+        points(self.env.user_xy()).collect()
     }
 
     /// AoI of each user in slots.
@@ -74,8 +74,4 @@ impl Episode {
     pub fn metrics(&self) -> EpisodeMetrics {
         self.env.metrics(0)
     }
-}
-
-fn points(xy: &[f32]) -> Vec<Point> {
-    xy.chunks_exact(2).map(|p| [f64::from(p[0]), f64::from(p[1])]).collect()
 }

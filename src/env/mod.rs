@@ -4,13 +4,15 @@ mod batch;
 mod config;
 mod episode;
 mod metrics;
+mod point;
 mod schema;
 mod walk;
 
 pub use batch::{BatchEnv, StepError};
-pub use config::{Boundary, EnvConfig, Layout, Point, Start};
+pub use config::{Boundary, EnvConfig, Layout, Start};
 pub use episode::Episode;
 pub use metrics::EpisodeMetrics;
+pub use point::{Point, points};
 
 /// Unit vector of each action: headings 45 h degrees, counter-clockwise from +x, then hovering.
 pub const DIRECTIONS: [Point; EnvConfig::COMPASS + 1] = {

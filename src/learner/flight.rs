@@ -4,7 +4,7 @@
 //! so splitting them among threads changes no bit.
 
 use super::disturbance::Disturbance;
-use crate::env::{BatchEnv, EnvConfig, EpisodeMetrics, Point};
+use crate::env::{BatchEnv, EnvConfig, EpisodeMetrics, Point, points};
 use crate::invalid::{Invalid, in_range};
 use crate::policy::{FleetStep, Policy, Slot};
 
@@ -104,10 +104,10 @@ impl Observer for Record {
         track.uavs.resize(m, Vec::new());
         track.users.resize(n, Vec::new());
         track.aoi.resize(n, Vec::new());
-        for (path, at) in track.uavs.iter_mut().zip(points(env.uav_xy(), b, m)) {
+        for (path, at) in track.uavs.iter_mut().zip(points(&env.uav_xy()[b * m * 2..][..m * 2])) {
             path.push(at);
         }
-        for (path, at) in track.users.iter_mut().zip(points(env.user_xy(), b, n)) {
+        for (path, at) in track.users.iter_mut().zip(points(&env.user_xy()[b * n * 2..][..n * 2])) {
             path.push(at);
         }
         for (ages, &age) in track.aoi.iter_mut().zip(&env.aoi()[b * n..(b + 1) * n]) {
@@ -176,9 +176,9 @@ fn fly(
         }
         for ((b, slot), &seed) in slots.iter_mut().enumerate().zip(seeds) {
             uavs.clear();
-            uavs.extend(points(env.uav_xy(), b, m));
+            uavs.extend(points(&env.uav_xy()[b * m * 2..][..m * 2]));
             users.clear();
-            users.extend(points(env.user_xy(), b, n));
+            users.extend(points(&env.user_xy()[b * n * 2..][..n * 2]));
             disturbance.distort(config, seed, step, &mut uavs, &mut users);
             slot.set_scene(&uavs, &users, &env.aoi()[b * n..(b + 1) * n], config.detection_range);
         }
@@ -201,9 +201,4 @@ fn split(all: &mut [f32], width: usize, count: usize) -> Vec<&mut [f32]> {
         return (0..count).map(|_| Default::default()).collect();
     }
     all.chunks_exact_mut(width).collect()
-}
-
-/// The `count` positions of copy `b`.
-fn points(xy: &[f32], b: usize, count: usize) -> impl Iterator<Item = Point> + '_ {
-    xy[b * count * 2..(b + 1) * count * 2].chunks_exact(2).map(|xy| [f64::from(xy[0]), f64::from(xy[1])])
 }

@@ -1,6 +1,6 @@
 //! What an environment answers: what each copy shows, and what its last slot brought.
 
-use crate::env::{EnvConfig, EpisodeMetrics, Point};
+use crate::env::{EnvConfig, EpisodeMetrics, Point, points};
 use crate::policy::Slot;
 
 /// All copies after a reset or a step.
@@ -65,7 +65,7 @@ impl Sight {
         let (m, n, range) = (config.uavs, config.users, config.detection_range);
         let fleets = uav_xy.chunks_exact(2 * m).zip(user_xy.chunks_exact(2 * n)).zip(aoi.chunks_exact(n));
         fleets.map(move |((uavs, users), aoi)| {
-            let (uavs, users) = (points(uavs), points(users));
+            let (uavs, users): (Vec<Point>, Vec<Point>) = (points(uavs).collect(), points(users).collect());
             let graph = graph.then(|| Slot::from_scene(&uavs, &users, aoi, range));
             Self { uavs, users, aoi: aoi.to_vec(), graph }
         })
@@ -76,8 +76,4 @@ impl Sight {
         let nodes = self.uavs.len() + self.users.len();
         nodes + self.graph.as_ref().map_or(0, |graph| (0..nodes).map(|i| graph.detections(i).len()).sum())
     }
-}
-
-fn points(xy: &[f32]) -> Vec<Point> {
-    xy.chunks_exact(2).map(|p| [f64::from(p[0]), f64::from(p[1])]).collect()
 }
