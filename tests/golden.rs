@@ -14,7 +14,8 @@ use qedgix::learner::objective::{Objective, Returns, Trace};
 use qedgix::nn::Adam;
 use qedgix::policy::mixer::MixerKind;
 use qedgix::policy::{
-    AgentConfig, Aggregation, Dims, Geometry, GeometryConfig, Gnn, Identity, ObservationKind, TOKEN, flat_observation, flat_state,
+    AgentConfig, Aggregation, Dims, Geometry, GeometryConfig, Gnn, HopSearch, Identity, ObservationKind, TOKEN, flat_observation,
+    flat_state,
 };
 use safetensors::{Dtype, SafeTensors};
 
@@ -272,7 +273,7 @@ fn check_features(config: &Config, episodes: &Episodes, tensors: &mut Tensors<'_
     let (b, nodes, width) = (episodes.len, m + n, 2 * m + 3 * n);
     // One layer, so that the geometry has the users' view too.
     let wanted = GeometryConfig { range, slots: k, layers: 1, self_loops: config.agent.self_loops, hops: 1 };
-    let mut geometry = Geometry::default();
+    let (mut geometry, mut search) = (Geometry::default(), HopSearch::default());
     geometry.clear();
     let mut state = vec![0.0; b * (k + 1) * width];
     for (at, state) in state.chunks_exact_mut(width).enumerate() {
@@ -287,7 +288,7 @@ fn check_features(config: &Config, episodes: &Episodes, tensors: &mut Tensors<'_
     let mut observations = vec![0.0_f32; b * (k + 1) * nodes * width];
     let rows = visible.chunks_exact_mut(nodes).zip(observations.chunks_exact_mut(width));
     for (at, (visible, observation)) in rows.enumerate() {
-        let view = geometry.node(at / nodes, at % nodes);
+        let view = geometry.node(at / nodes, at % nodes, &mut search);
         visible[view.node] = 1.0;
         view.detections.iter().for_each(|d| visible[d.target as usize] = 1.0);
         flat_observation(&view, 1.0, observation);

@@ -8,8 +8,8 @@ use qedgix::learner::{Algorithm, Learner, Preset, TrainConfig};
 use qedgix::nn::{Batch, Graph, GraphLayer, HIDDEN, LayerCache, ParameterLayout, Rows, Weights};
 use qedgix::policy::mixer::{Mixer, MixerCache, MixerKind};
 use qedgix::policy::{
-    Actor, Agent, AgentConfig, Dims, FleetStep, Geometry, GeometryConfig, Gnn, Identity, LearnedPolicy, ObservationKind, Policy,
-    RequiredInput, Slot, StepInput, TOKEN,
+    Actor, Agent, AgentConfig, Dims, FleetStep, Geometry, GeometryConfig, Gnn, HopSearch, Identity, LearnedPolicy,
+    ObservationKind, Policy, RequiredInput, Slot, StepInput, TOKEN,
 };
 use qedgix::rng;
 use rand::RngExt;
@@ -98,22 +98,40 @@ fn more_hops_see_exactly_what_links_lead_to() {
     let slot = Slot::from_scene(&[[0.0, 0.0], [1.0, 0.0]], &users, &[8.0, 16.0, 24.0, 32.0], 0.25);
     for (hops, reach) in [(1, [2].as_slice()), (2, &[2, 3]), (3, &[2, 3, 4]), (4, &[2, 3, 4, 5]), (5, &[1, 2, 3, 4, 5])] {
         let config = GeometryConfig { range: 0.25, slots: 80, layers: 0, self_loops: false, hops };
-        let mut geometry = Geometry::default();
+        let (mut geometry, mut search) = (Geometry::default(), HopSearch::default());
         geometry.clear();
         // Fleets before and after change nothing.
         (0..3).for_each(|_| geometry.push_slot(&config, &slot));
         geometry.finish(&config);
         for fleet in 0..3 {
-            let view = geometry.node(fleet, 0);
+            let view = geometry.node(fleet, 0, &mut search);
             let seen: Vec<u32> = view.detections.iter().map(|d| d.target).collect();
             assert_eq!(seen, reach, "{hops} hops");
             for d in view.detections {
                 let x = if d.target == 1 { 1.0 } else { 0.2 * (d.target - 1) as f32 };
                 assert!((d.rel[0] - x).abs() < 1e-6 && d.rel[1] == 0.0, "{d:?}");
             }
-            assert_eq!(geometry.node(fleet, 1).detections.len(), reach.len(), "the chain from its other end");
+            assert_eq!(geometry.node(fleet, 1, &mut search).detections.len(), reach.len(), "the chain from its other end");
         }
     }
+}
+
+#[test]
+fn more_hops_hold_no_more_detections() {
+    // A square lattice of 400 UAVs: each has up to 4 links, and observes up to 180 nodes over 9 links.
+    let uavs: Vec<Point> = (0..400).map(|i| [0.04 * f64::from(i % 20), 0.04 * f64::from(i / 20)]).collect();
+    let slot = Slot::from_scene(&uavs, &[], &[], 0.05);
+    let mut held = Vec::new();
+    for (hops, observed) in [(1, 4), (9, 180)] {
+        let config = GeometryConfig { range: 0.05, slots: 80, layers: 0, self_loops: false, hops };
+        let (mut geometry, mut search) = (Geometry::default(), HopSearch::default());
+        geometry.clear();
+        geometry.push_slot(&config, &slot);
+        geometry.finish(&config);
+        assert_eq!(geometry.node(0, 210, &mut search).detections.len(), observed, "{hops} hops");
+        held.push(geometry.detection_count());
+    }
+    assert_eq!(held, [4 * 19 * 20; 2]);
 }
 
 #[test]

@@ -11,6 +11,7 @@
 use super::config::{AgentConfig, Aggregation, Gnn, Identity, ObservationKind};
 use super::features::{Inputs, SetEncoder, flat_observation, identity_width, write_rest};
 use super::geometry::{Geometry, GeometryConfig};
+use super::hop_search::HopSearch;
 use crate::invalid::Invalid;
 use crate::nn::matmul::Accumulate;
 use crate::nn::{
@@ -68,6 +69,7 @@ pub struct AgentCache<T: Real> {
     y: Vec<Batch<T>>,
     layers: Vec<LayerCache<T>>,
     head: MlpCache<T>,
+    search: HopSearch,
     scratch: Scratch<T>,
 }
 
@@ -194,13 +196,19 @@ impl Agent {
         if self.config.normalise { 1.0 / self.dims.detection_range } else { 1.0 }
     }
 
-    /// Writes the observations of rows `first` and on, `stride` apart.
-    fn observe<T: Real>(&self, w: Weights<'_, T>, inputs: &Inputs<'_>, first: usize, out: &mut [T], stride: usize) {
+    /// Writes the observations of rows `first` and following, `stride` apart.
+    fn observe<T: Real>(
+        &self,
+        w: Weights<'_, T>,
+        (geometry, first): (&Geometry, usize),
+        search: &mut HopSearch,
+        (out, stride): (&mut [T], usize),
+    ) {
         match &self.sets {
-            Some(sets) => sets.forward(w, inputs.geometry, first, out, stride),
+            Some(sets) => sets.forward(w, (geometry, first), search, (out, stride)),
             None => {
                 for (r, out) in out.chunks_exact_mut(stride).enumerate() {
-                    flat_observation(&inputs.geometry.view(first + r), self.flat_scale(), &mut out[..self.observation]);
+                    flat_observation(&geometry.view(first + r, search), self.flat_scale(), &mut out[..self.observation]);
                 }
             }
         }
@@ -227,7 +235,7 @@ impl Agent {
         let uavs = inputs.geometry.uav_rows();
         let rows = inputs.geometry.rows();
         c.input.reset(self.fc.inputs, uavs);
-        self.observe(w, inputs, 0, c.input.as_mut_slice(), self.fc.inputs);
+        self.observe(w, (inputs.geometry, 0), &mut c.search, (c.input.as_mut_slice(), self.fc.inputs));
         for (r, input) in c.input.as_mut_slice().chunks_exact_mut(self.fc.inputs).enumerate() {
             write_rest(&self.config, self.dims.actions, inputs, r, &mut input[self.observation..]);
         }
@@ -242,7 +250,8 @@ impl Agent {
             Body::Graph { w1, w2, layers, head } => {
                 let graph = inputs.geometry.graph();
                 c.user_obs.reset(self.observation, rows - uavs);
-                self.observe(w, inputs, uavs, c.user_obs.as_mut_slice(), self.observation);
+                let out = (c.user_obs.as_mut_slice(), self.observation);
+                self.observe(w, (inputs.geometry, uavs), &mut c.search, out);
                 c.y.resize_with(layers.len() + 1, Batch::default);
                 c.layers.resize_with(layers.len(), LayerCache::default);
                 c.y[0].reset(HIDDEN, rows);
@@ -302,7 +311,7 @@ impl Agent {
                 if let Some(sets) = &self.sets {
                     s.observation.reset(SetEncoder::WIDTH, users.len);
                     w2.backward_input(w.flat, (0, SetEncoder::WIDTH), users, s.observation.rows_mut(), Accumulate::Zero);
-                    sets.backward(w, (inputs.geometry, uavs), s.observation.rows(), grads);
+                    sets.backward(w, (inputs.geometry, uavs), &mut c.search, s.observation.rows(), grads);
                 }
             }
         }
@@ -313,7 +322,7 @@ impl Agent {
         if let Some(sets) = &self.sets {
             s.observation.reset(SetEncoder::WIDTH, uavs);
             self.fc.backward_input(w.flat, (0, SetEncoder::WIDTH), s.dx.rows(), s.observation.rows_mut(), Accumulate::Zero);
-            sets.backward(w, (inputs.geometry, 0), s.observation.rows(), grads);
+            sets.backward(w, (inputs.geometry, 0), &mut c.search, s.observation.rows(), grads);
         }
     }
 }

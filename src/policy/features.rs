@@ -1,7 +1,8 @@
 //! What a node's network is fed (spec 2.1, 2.2, 2.4): observations, last action, identity, own position.
 
 use super::config::{AgentConfig, Identity, TOKEN};
-use super::geometry::{Geometry, View};
+use super::geometry::{Geometry, NodeView};
+use super::hop_search::HopSearch;
 use crate::nn::{Embedding, EmbeddingGrad, HIDDEN, ParameterLayout, Real, Rows, Weights, simd};
 
 /// Last action of a UAV that has not acted yet.
@@ -21,7 +22,7 @@ pub struct Inputs<'a> {
 }
 
 /// Writes the flat observation (spec 2.1) of one node, 2M + 3N wide; relative positions times `scale`.
-pub fn flat_observation<T: Real>(view: &View<'_>, scale: f64, out: &mut [T]) {
+pub fn flat_observation<T: Real>(view: &NodeView<'_>, scale: f64, out: &mut [T]) {
     out.fill(T::ZERO);
     let uavs = view.fleet.uavs;
     let scaled = |x: f32| T::from_f64(f64::from(x) * scale);
@@ -57,15 +58,15 @@ pub(super) fn write_rest<T: Real>(config: &AgentConfig, actions: usize, inputs: 
     if inputs.last[row] != NO_ACTION {
         last[inputs.last[row] as usize] = T::ONE;
     }
-    let view = inputs.geometry.view(row);
-    let identity = identity_width(config.identity, view.fleet.uavs);
+    let (fleet, uav) = inputs.geometry.node_of_row(row);
+    let identity = identity_width(config.identity, fleet.uavs);
     let (own, position) = rest.split_at_mut(identity);
     match config.identity {
         Identity::None => {}
-        Identity::Onehot => own[view.node] = T::ONE,
+        Identity::Onehot => own[uav] = T::ONE,
         Identity::Phase => {
-            let turn = std::f64::consts::TAU * view.node as f64 / view.fleet.uavs as f64;
-            own.copy_from_slice(&[T::from_f64(turn.cos()), T::from_f64(turn.sin())]);
+            let angle = std::f64::consts::TAU * uav as f64 / fleet.uavs as f64;
+            own.copy_from_slice(&[T::from_f64(angle.cos()), T::from_f64(angle.sin())]);
         }
         Identity::Token => {
             let token = &inputs.token[row * TOKEN..][..TOKEN];
@@ -113,14 +114,20 @@ impl SetEncoder {
     }
 
     /// Observations of rows `first` and on, into the first columns of rows of `stride` numbers.
-    pub(super) fn forward<T: Real>(&self, w: Weights<'_, T>, geometry: &Geometry, first: usize, out: &mut [T], stride: usize) {
+    pub(super) fn forward<T: Real>(
+        &self,
+        w: Weights<'_, T>,
+        (geometry, first): (&Geometry, usize),
+        search: &mut HopSearch,
+        (out, stride): (&mut [T], usize),
+    ) {
         let (uav, user, scale) = (self.uav.load(w), self.user.load(w), self.scale);
         simd(
             #[inline(always)]
             || {
                 for (r, out) in out.chunks_exact_mut(stride).enumerate() {
                     let [uavs, users] = out[..Self::WIDTH].as_chunks_mut::<HIDDEN>().0 else { unreachable!("two halves") };
-                    encode(&geometry.view(first + r), scale, (&uav, &user), (uavs, users));
+                    encode(&geometry.view(first + r, search), scale, (&uav, &user), (uavs, users));
                 }
             },
         );
@@ -131,6 +138,7 @@ impl SetEncoder {
         &self,
         w: Weights<'_, T>,
         (geometry, first): (&Geometry, usize),
+        search: &mut HopSearch,
         d: Rows<'_, T>,
         grads: &mut [T],
     ) {
@@ -142,7 +150,7 @@ impl SetEncoder {
                 for (r, d) in d.data.chunks(d.stride).take(d.len).enumerate() {
                     let [uavs, users] = d[..Self::WIDTH].as_chunks::<HIDDEN>().0 else { unreachable!("two halves") };
                     let sums = (&mut uav_sums, &mut user_sums);
-                    encode_back(&geometry.view(first + r), scale, (&uav, &user), (uavs, users), sums);
+                    encode_back(&geometry.view(first + r, search), scale, (&uav, &user), (uavs, users), sums);
                 }
             },
         );
@@ -153,7 +161,7 @@ impl SetEncoder {
 
 #[inline(always)]
 fn encode<T: Real>(
-    view: &View<'_>,
+    view: &NodeView<'_>,
     scale: f64,
     (uav, user): (&EmbeddingGrad<T, 2>, &EmbeddingGrad<T, 3>),
     (uav_sum, user_sum): (&mut [T; HIDDEN], &mut [T; HIDDEN]),
@@ -166,7 +174,7 @@ fn encode<T: Real>(
 
 #[inline(always)]
 fn encode_back<T: Real>(
-    view: &View<'_>,
+    view: &NodeView<'_>,
     scale: f64,
     (uav, user): (&EmbeddingGrad<T, 2>, &EmbeddingGrad<T, 3>),
     (d_uav, d_user): (&[T; HIDDEN], &[T; HIDDEN]),
@@ -177,7 +185,7 @@ fn encode_back<T: Real>(
 
 /// Every entity a node sees; a user sees itself.
 #[inline(always)]
-fn each_seen<T: Real>(view: &View<'_>, scale: f64, mut uav: impl FnMut([T; 2]), mut user: impl FnMut([T; 3])) {
+fn each_seen<T: Real>(view: &NodeView<'_>, scale: f64, mut uav: impl FnMut([T; 2]), mut user: impl FnMut([T; 3])) {
     let m = view.fleet.uavs;
     let aoi = |node: usize| T::from_f64(view.aoi[node - m].into());
     if view.node >= m {

@@ -6,18 +6,21 @@ pub mod baselines;
 mod config;
 mod features;
 mod geometry;
+mod hop_search;
 mod learned;
 pub mod mixer;
+mod neighbor_search;
 mod slot;
-mod vision;
 
 pub use actor::{Actor, StepInput};
 pub use agent::{Agent, AgentCache, Dims};
 pub use config::{AgentConfig, Aggregation, Gnn, HIDDEN, Identity, ObservationKind, TOKEN};
 pub use features::{Inputs, NO_ACTION, SetEncoder, flat_observation, flat_state};
-pub use geometry::{Fleet, Geometry, GeometryConfig, View};
+pub use geometry::{FleetSpan, Geometry, GeometryConfig, NodeView};
+pub use hop_search::HopSearch;
 pub use learned::LearnedPolicy;
-pub use slot::{Detection, Slot};
+pub use neighbor_search::Detection;
+pub use slot::Slot;
 
 use crate::invalid::Invalid;
 

@@ -1,18 +1,9 @@
-//! One slot of one fleet as its nodes see it (spec 2): who detects whom, where, and how old its data is.
+//! One slot of one fleet: what each node detects, the users' AoI, and positions where they are known (docs/model.md, "Observations").
 
-use super::vision::Vision;
+use super::neighbor_search::{Detection, NeighborSearch};
 use crate::env::Point;
 
-/// Node `target` seen at `rel` = target position - own position.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Detection {
-    /// Node index: UAVs first, then users.
-    pub target: u32,
-    /// Relative coordinates, computed in f64, rounded once.
-    pub rel: [f32; 2],
-}
-
-/// The sparse graph of one slot. Nodes are UAVs 0..M, then users M..M+N. A node is never in its own list.
+/// The graph of one slot as lists of detections. Nodes 0..M are UAVs, nodes M..M+N are users. No node is in its own list.
 #[derive(Clone, Debug, Default)]
 pub struct Slot {
     uavs: usize,
@@ -23,9 +14,9 @@ pub struct Slot {
     aoi: Vec<f32>,
     uav_positions: Option<Vec<Point>>,
     user_positions: Option<Vec<Point>>,
-    /// Scratch of `set_scene`.
+    /// Buffers of `set_scene`.
     points: Vec<Point>,
-    vision: Vision,
+    search: NeighborSearch,
 }
 
 impl PartialEq for Slot {
@@ -53,8 +44,8 @@ impl Slot {
         slot
     }
 
-    /// The slot of a detection graph. `detections[i]` are node i's, in ascending order of target; the caller has checked
-    /// that targets exist, differ from i and do not repeat. `aoi` of a user that nobody detects is irrelevant; give 0.
+    /// The slot of a detection graph. `detections[i]` is the list of node i, in ascending order of target. The caller has checked
+    /// that targets exist, differ from i and do not repeat. The AoI of a user that no node detects has no effect; set it to 0.
     ///
     /// # Panics
     /// When the lengths do not fit together.
@@ -69,17 +60,17 @@ impl Slot {
         Self::from_flat_detections(uav_positions, uavs, aoi, offsets, flat)
     }
 
-    /// The slot of a scene (see [`Slot::from_scene`]) if it has at most `most` detections. Work and memory are bounded by the
+    /// As [`Slot::from_scene`], but `None` if there are more than `most` detections. Work and memory are bounded by the number of
     /// nodes and by `most`.
     ///
     /// # Panics
     /// When `aoi` does not have one entry per user.
     pub fn from_scene_within(uavs: &[Point], users: &[Point], aoi: &[f32], range: f64, most: usize) -> Option<Self> {
         let mut slot = Self::default();
-        slot.look_at(uavs, users, aoi, range, most).then_some(slot)
+        slot.rebuild(uavs, users, aoi, range, most).then_some(slot)
     }
 
-    /// The slot of a detection graph, as [`Slot::from_detections`] has it, from all lists one after another: node i's are
+    /// As [`Slot::from_detections`], from all lists in one vector: the list of node i is
     /// `detections[offsets[i]..offsets[i + 1]]`.
     ///
     /// # Panics
@@ -93,7 +84,11 @@ impl Slot {
     ) -> Self {
         let users = aoi.len();
         assert_eq!(offsets.len(), uavs + users + 1, "one list of detections per node");
-        assert_eq!(offsets.last().map(|&end| end as usize), Some(detections.len()), "the last list ends at the end");
+        assert_eq!(
+            offsets.last().map(|&end| end as usize),
+            Some(detections.len()),
+            "the last list ends at the end of the vector"
+        );
         Self { uavs, users, offsets, detections, aoi, uav_positions, ..Self::default() }
     }
 
@@ -102,11 +97,11 @@ impl Slot {
     /// # Panics
     /// When `aoi` does not have one entry per user.
     pub fn set_scene(&mut self, uavs: &[Point], users: &[Point], aoi: &[f32], range: f64) {
-        self.look_at(uavs, users, aoi, range, usize::MAX);
+        self.rebuild(uavs, users, aoi, range, usize::MAX);
     }
 
-    /// False, and the slot incomplete, if there are more than `most` detections.
-    fn look_at(&mut self, uavs: &[Point], users: &[Point], aoi: &[f32], range: f64, most: usize) -> bool {
+    /// Returns false and leaves the slot incomplete if there are more than `most` detections.
+    fn rebuild(&mut self, uavs: &[Point], users: &[Point], aoi: &[f32], range: f64, most: usize) -> bool {
         assert_eq!(aoi.len(), users.len(), "one AoI per user");
         self.uavs = uavs.len();
         self.users = users.len();
@@ -124,7 +119,7 @@ impl Slot {
         self.points.clear();
         self.points.extend_from_slice(uavs);
         self.points.extend_from_slice(users);
-        self.vision.look(&self.points, self.points.len(), range, (&mut self.offsets, &mut self.detections), most)
+        self.search.append_detections(&self.points, self.points.len(), range, (&mut self.offsets, &mut self.detections), most)
     }
 
     /// M.
@@ -142,8 +137,8 @@ impl Slot {
         &self.detections[self.offsets[i] as usize..self.offsets[i + 1] as usize]
     }
 
-    /// How many detections all nodes have together.
-    pub fn all_detections(&self) -> usize {
+    /// Number of detections of all nodes.
+    pub fn detection_count(&self) -> usize {
         self.detections.len()
     }
 

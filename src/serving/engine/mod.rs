@@ -87,7 +87,7 @@ impl Task {
 
     /// About what it costs, in units of what a detection does.
     fn work(&self) -> usize {
-        UAV * self.slot.uavs() + self.slot.users() + self.slot.all_detections()
+        UAV * self.slot.uavs() + self.slot.users() + self.slot.detection_count()
     }
 
     /// Whether a caller may compute it.

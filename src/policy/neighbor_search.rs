@@ -1,20 +1,28 @@
-//! Finds what nodes detect: pairs with distance^2 <= range^2, in f64.
+//! Finds what nodes detect: pairs of nodes with distance^2 <= range^2, computed in f64 (docs/model.md, "Observations").
 //!
-//! Few nodes are compared pair by pair; many are sorted into square cells at least as wide as the range, so that work and
-//! memory grow with the nodes and the detections. Both give the same detections in the same (ascending) order.
+//! Up to [`ALL_PAIRS`] nodes, all pairs are compared. More nodes are sorted into square cells at least as wide as the range, so
+//! that work and memory grow with the nodes and the detections. Both ways give the same detections in the same order.
 
-use super::slot::Detection;
 use crate::env::Point;
 
-/// Up to this many nodes all pairs are compared.
-const FEW: usize = 48;
+/// Largest number of nodes for which all pairs are compared.
+const ALL_PAIRS: usize = 48;
 
-/// Scratch of the search; keeps its allocations.
+/// Node `target` detected at relative position `rel` = position of the target - position of the detecting node.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Detection {
+    /// Node index: UAVs first, then users.
+    pub target: u32,
+    /// Computed in f64, rounded once.
+    pub rel: [f32; 2],
+}
+
+/// Buffers of the search, kept from call to call.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Vision {
+pub(super) struct NeighborSearch {
     /// Cell of each node.
     cell: Vec<u32>,
-    /// Nodes of cell c are `nodes[starts[c]..starts[c + 1]]`.
+    /// The nodes of cell c are `nodes[starts[c]..starts[c + 1]]`.
     starts: Vec<u32>,
     nodes: Vec<u32>,
 }
@@ -27,25 +35,27 @@ struct Grid {
 }
 
 impl Grid {
-    fn over(points: &[Point], range: f64) -> Self {
+    fn new(points: &[Point], range: f64) -> Self {
         let fold = |axis: usize, f: fn(f64, f64) -> f64| points.iter().map(|p| p[axis]).fold(points[0][axis], f);
         let low = [fold(0, f64::min), fold(1, f64::min)];
         let extent = (fold(0, f64::max) - low[0]).max(fold(1, f64::max) - low[1]);
-        // No more cells than a few per node; a shade wider than the range, so that rounding cannot part a pair by two cells.
+        // At most a few cells per node. Cells are slightly wider than the range, so that rounding cannot put a pair within
+        // range two cells apart.
         let most = (points.len() as f64).sqrt().ceil() * 2.0;
         let size = (range * (1.0 + 1e-9)).max(extent / most).max(f64::MIN_POSITIVE);
         Self { low, size, side: (extent / size) as usize + 1 }
     }
 
-    fn place(&self, p: Point) -> [usize; 2] {
+    /// Column and row of the cell of `p`.
+    fn cell(&self, p: Point) -> [usize; 2] {
         [0, 1].map(|axis| (((p[axis] - self.low[axis]) / self.size) as usize).min(self.side - 1))
     }
 }
 
-impl Vision {
-    /// Appends what nodes 0..`observers` detect among all `points`, each in ascending order of target, without itself, and
-    /// the end of each list to `offsets`. False, and not everything appended, if `detections` grew longer than `most`.
-    pub(super) fn look(
+impl NeighborSearch {
+    /// Appends what nodes 0..`observers` detect among all `points`, each list in ascending order of target and without the node
+    /// itself, and the end of each list to `offsets`. Stops and returns false when `detections` is longer than `most`.
+    pub(super) fn append_detections(
         &mut self,
         points: &[Point],
         observers: usize,
@@ -53,18 +63,18 @@ impl Vision {
         (offsets, detections): (&mut Vec<u32>, &mut Vec<Detection>),
         most: usize,
     ) -> bool {
-        if points.len() <= FEW {
+        if points.len() <= ALL_PAIRS {
             for (i, &from) in points[..observers].iter().enumerate() {
                 detections.extend(points.iter().enumerate().filter_map(|(j, &to)| detect(i, from, j, to, range)));
                 offsets.push(detections.len() as u32);
             }
             return detections.len() <= most;
         }
-        let grid = Grid::over(points, range);
-        self.sort(points, &grid);
+        let grid = Grid::new(points, range);
+        self.sort_into_cells(points, &grid);
         for (i, &from) in points[..observers].iter().enumerate() {
             let first = detections.len();
-            let [x, y] = grid.place(from);
+            let [x, y] = grid.cell(from);
             for row in y.saturating_sub(1)..=(y + 1).min(grid.side - 1) {
                 let (left, right) = (x.saturating_sub(1), (x + 1).min(grid.side - 1));
                 let cells = self.starts[row * grid.side + left] as usize..self.starts[row * grid.side + right + 1] as usize;
@@ -80,16 +90,16 @@ impl Vision {
         true
     }
 
-    /// Sorts nodes by cell.
-    fn sort(&mut self, points: &[Point], grid: &Grid) {
+    /// Counting sort of the nodes by cell.
+    fn sort_into_cells(&mut self, points: &[Point], grid: &Grid) {
         self.cell.clear();
         self.cell.extend(points.iter().map(|&p| {
-            let [x, y] = grid.place(p);
+            let [x, y] = grid.cell(p);
             (y * grid.side + x) as u32
         }));
         self.starts.clear();
         self.starts.resize(grid.side * grid.side + 2, 0);
-        // Counted two places on, so that filling moves each start to where its cell begins.
+        // Counts are stored two places further, so that filling the cells moves each start to its final value.
         for &c in &self.cell {
             self.starts[c as usize + 2] += 1;
         }
@@ -127,19 +137,25 @@ mod tests {
     }
 
     #[test]
-    fn cells_find_what_comparing_all_pairs_finds() {
+    fn grid_finds_the_same_detections_as_comparing_all_pairs() {
         for (n, range, spread) in
             [(49, 0.28, 1.0), (300, 0.04, 1.0), (500, 0.1, 30.0), (200, 1e-6, 1.0), (100, 2.0, 1.0), (60, 0.25, 0.0)]
         {
-            let mut rng = crate::rng::stream(7, "vision", n);
-            // A lattice of quarters of the range puts many pairs exactly at the range.
+            let mut rng = crate::rng::stream(7, "neighbor search", n);
+            // A lattice with a spacing of a quarter of the range puts many pairs exactly at the range.
             let mut coordinate = |i: u64| {
                 let x = spread * (rng.random::<f64>() - 0.3);
                 if i.is_multiple_of(2) { x } else { (x / range * 4.0).round() * range / 4.0 }
             };
             let points: Vec<Point> = (0..n).map(|i| [coordinate(i), coordinate(i)]).collect();
             let (mut offsets, mut detections) = (vec![0], Vec::new());
-            assert!(Vision::default().look(&points, points.len(), range, (&mut offsets, &mut detections), usize::MAX));
+            assert!(NeighborSearch::default().append_detections(
+                &points,
+                points.len(),
+                range,
+                (&mut offsets, &mut detections),
+                usize::MAX
+            ));
             assert_eq!((offsets, detections), pairs(&points, range), "{n} nodes, range {range}");
         }
     }
