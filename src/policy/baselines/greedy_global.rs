@@ -1,8 +1,8 @@
-//! `greedy-global`: knows all positions and ages; pairs UAVs with the users that promise most AoI per slot of flight.
+//! `greedy-global`: knows all positions and AoI, and pairs UAVs with users by AoI per slot of flight.
 
 use super::geometry::{heading_toward, travel_slots};
-use super::{EnvParams, RequiredInput, Rule, own_positions};
-use crate::policy::Slot;
+use super::rule::{EnvParams, Rule, uav_positions, user_positions};
+use crate::policy::{RequiredInput, Slot};
 
 /// Has no memory.
 #[derive(Default)]
@@ -10,7 +10,7 @@ pub(super) struct GreedyGlobal;
 
 impl Rule for GreedyGlobal {
     const NAME: &'static str = "greedy-global";
-    const TEXT: &'static str = "Full information: pairs UAVs with the users that promise most AoI per slot of flight.";
+    const DESCRIPTION: &'static str = "Full information: pairs UAVs with the users that promise most AoI per slot of flight.";
     const NEEDS: RequiredInput = RequiredInput::FullScene;
 
     fn memory_len(&self, _uavs: usize, _users: usize) -> usize {
@@ -19,18 +19,17 @@ impl Rule for GreedyGlobal {
 
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}
 
-    fn fly(&self, world: &EnvParams, slot: &Slot, _step: u64, _memory: &mut [f32], headings: &mut [u8]) {
-        let uavs = own_positions(slot);
-        let users = slot.user_positions().expect("the caller gives what `needs` asks for");
+    fn decide(&self, env: &EnvParams, slot: &Slot, _step: u64, _memory: &mut [f32], headings: &mut [u8]) {
+        let (uavs, users) = (uav_positions(slot), user_positions(slot));
         let mut pairs = Vec::with_capacity(uavs.len() * users.len());
         for (i, &at) in uavs.iter().enumerate() {
             for (j, &to) in users.iter().enumerate() {
-                let slots = travel_slots(world, at, to, world.transmission_range);
+                let slots = travel_slots(env, at, to, env.transmission_range);
                 let age = f64::from(slot.aoi()[j]) + slots;
                 pairs.push((age / slots, i, j));
             }
         }
-        // The best pair first; the indices make the order, and so the answer, unique.
+        // The best pair first. The indices make the order unique, and with it the result.
         pairs.sort_by(|a, b| b.0.total_cmp(&a.0).then((a.1, a.2).cmp(&(b.1, b.2))));
         let mut target = vec![None; uavs.len()];
         let mut taken = vec![false; users.len()];
@@ -40,12 +39,12 @@ impl Rule for GreedyGlobal {
                 taken[j] = true;
             }
         }
-        // More UAVs than users: the others help where they would go themselves.
+        // With more UAVs than users, each remaining UAV flies to its own best user.
         for &(_, i, j) in &pairs {
             target[i].get_or_insert(j);
         }
         for ((heading, &at), target) in headings.iter_mut().zip(uavs).zip(target) {
-            *heading = target.map_or(0, |j| heading_toward(world, at, users[j]));
+            *heading = target.map_or(0, |j| heading_toward(env, at, users[j]));
         }
     }
 }

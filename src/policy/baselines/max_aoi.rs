@@ -1,20 +1,21 @@
-//! `max-aoi`: every UAV flies to the user it sees whose data is oldest; it searches where all it sees is fresh.
+//! `max-aoi`: every UAV flies to the detected user with the oldest data, and searches if all detected data is fresh.
 
-use super::search::{Sight, Target};
+use super::search::{DetectedUser, TargetChoice};
 
 #[derive(Default)]
 pub(super) struct MaxAoi;
 
-/// Slots after which data is stale. Lower, and a UAV stays with the first users it finds; chosen on `valid-v1`.
+/// AoI, in slots, from which data is stale. With a lower limit, a UAV stays with the first users it finds. Chosen on `valid-v1`.
 const STALE: f32 = 5.0;
 
-impl Target for MaxAoi {
+impl TargetChoice for MaxAoi {
     const NAME: &'static str = "max-aoi";
-    const TEXT: &'static str = "Every UAV flies to the user it sees whose data is oldest, else searches straight on.";
+    const DESCRIPTION: &'static str =
+        "Every UAV flies to the detected user with the oldest data, and searches if all detected data is fresh.";
 
-    fn choose(seen: impl Iterator<Item = Sight>) -> Option<Sight> {
-        // Equally old, as all are that nobody has visited: the nearer one, so that a UAV does not waver between them.
-        let older = |a: &Sight, b: &Sight| b.aoi.total_cmp(&a.aoi).then(a.distance.total_cmp(&b.distance));
-        seen.filter(|user| user.aoi >= STALE).min_by(older)
+    fn choose(detected: impl Iterator<Item = DetectedUser>) -> Option<DetectedUser> {
+        // Of equal AoI, as users have that were never visited, the nearest: otherwise a UAV could switch between targets.
+        let older = |a: &DetectedUser, b: &DetectedUser| b.aoi.total_cmp(&a.aoi).then(a.distance.total_cmp(&b.distance));
+        detected.filter(|user| user.aoi >= STALE).min_by(older)
     }
 }

@@ -1,18 +1,19 @@
-//! `nearest`: every UAV flies to the nearest user it sees whose data is stale; it searches where there is none.
+//! `nearest`: every UAV flies to the nearest detected user with stale data, and searches if there is none.
 
-use super::search::{Sight, Target};
+use super::search::{DetectedUser, TargetChoice};
 
 #[derive(Default)]
 pub(super) struct Nearest;
 
-/// Slots after which data is stale. Lower, and a UAV stays with the first users it finds; chosen on `valid-v1`.
+/// AoI, in slots, from which data is stale. With a lower limit, a UAV stays with the first users it finds. Chosen on `valid-v1`.
 const STALE: f32 = 5.0;
 
-impl Target for Nearest {
+impl TargetChoice for Nearest {
     const NAME: &'static str = "nearest";
-    const TEXT: &'static str = "Every UAV flies to the nearest user it sees whose data is stale, else searches straight on.";
+    const DESCRIPTION: &'static str =
+        "Every UAV flies to the nearest detected user with stale data, and searches if there is none.";
 
-    fn choose(seen: impl Iterator<Item = Sight>) -> Option<Sight> {
-        seen.filter(|user| user.aoi >= STALE).min_by(|a, b| a.distance.total_cmp(&b.distance))
+    fn choose(detected: impl Iterator<Item = DetectedUser>) -> Option<DetectedUser> {
+        detected.filter(|user| user.aoi >= STALE).min_by(|a, b| a.distance.total_cmp(&b.distance))
     }
 }

@@ -1,15 +1,15 @@
 //! `persistent`: every UAV keeps a random heading and draws another where the next move would leave the square.
 
-use super::search::{Sight, Target};
+use super::search::{DetectedUser, TargetChoice};
 
 #[derive(Default)]
 pub(super) struct Persistent;
 
-impl Target for Persistent {
+impl TargetChoice for Persistent {
     const NAME: &'static str = "persistent";
-    const TEXT: &'static str = "Every UAV keeps a random heading and turns at the border.";
+    const DESCRIPTION: &'static str = "Every UAV keeps a random heading and turns at the border.";
 
-    fn choose(_seen: impl Iterator<Item = Sight>) -> Option<Sight> {
+    fn choose(_detected: impl Iterator<Item = DetectedUser>) -> Option<DetectedUser> {
         None
     }
 }

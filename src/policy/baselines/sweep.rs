@@ -1,38 +1,39 @@
-//! `sweep`: no prior knowledge. UAVs fan out over the square, search what they have not seen, and serve the users they found.
+//! `sweep`: no prior knowledge. UAVs fan out over the square, search it, and serve the users they have found.
 //!
-//! Local knowledge only: a UAV knows the square, its own index among M, and what it detected itself. One rule weighs
-//! searching against serving: fly to where most AoI is removed per slot of flight, where unseen ground is taken to hold the
-//! users that the UAV does not know. Each UAV looks first in its own sector of the square.
+//! A UAV knows the square, its own index among M, and what it has detected itself. It flies to where it expects to remove most
+//! AoI per slot of flight: to a known user, or to a part of the square that it has not seen and that may hold the users it does
+//! not know. Each UAV searches its own sector of the square first.
 
 use std::f64::consts::{PI, TAU};
 
 use super::geometry::{distance, heading_toward, travel_slots};
-use super::{EnvParams, RequiredInput, Rule, own_positions};
+use super::rule::{EnvParams, Rule, uav_positions};
 use crate::env::Point;
-use crate::policy::Slot;
+use crate::policy::{RequiredInput, Slot};
 
-/// Memory of each UAV: a grid of cells, 1 where seen; then per user whether it is known, where, and the slot at which its
-/// data was last collected.
+/// Memory of each UAV: a grid of cells, 1 if the cell was seen; then for each user: 1 if it is known, its position (x, y), and
+/// the slot in which its data was last collected.
 #[derive(Default)]
 pub(super) struct Sweep;
 
 /// Cells along each side of the square.
 const GRID: usize = 10;
 const CELLS: usize = GRID * GRID;
-/// f32s per user.
+/// Numbers per user in the memory.
 const USER: usize = 4;
-/// A UAV is this unconcerned about unseen ground in the sectors of others.
-const FOREIGN: f64 = 0.02;
-/// AoI hoped for in unseen ground against AoI known: what is found can be served again and again.
-const CURIOSITY: f64 = 2.0;
-/// What another UAV that is nearer leaves of a user's attraction.
-const RIVALRY: f64 = 0.3;
-/// Power of the flight time that AoI is divided by; above 1, near users come first. Chosen on `valid-v1`, like the above.
-const HASTE: f64 = 1.25;
+// The following four weights were chosen on `valid-v1`.
+/// Weight of unseen cells in the sectors of other UAVs; in the UAV's own sector it is 1.
+const FOREIGN_SECTOR: f64 = 0.02;
+/// Weight of the AoI expected in unseen cells relative to known AoI: a user that is found can be served many times.
+const SEARCH: f64 = 2.0;
+/// Weight of a user to whom a detected UAV is nearer.
+const CONTESTED: f64 = 0.3;
+/// AoI is divided by the flight time to this power. Above 1, near users are preferred.
+const TIME_POWER: f64 = 1.25;
 
 impl Rule for Sweep {
     const NAME: &'static str = "sweep";
-    const TEXT: &'static str = "No prior knowledge: UAVs fan out, search, and serve the users that each found itself.";
+    const DESCRIPTION: &'static str = "No prior knowledge: UAVs fan out, search, and serve the users that each found itself.";
     const NEEDS: RequiredInput = RequiredInput::OwnPositions;
 
     fn memory_len(&self, uavs: usize, users: usize) -> usize {
@@ -41,29 +42,34 @@ impl Rule for Sweep {
 
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}
 
-    fn fly(&self, world: &EnvParams, slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]) {
+    fn decide(&self, env: &EnvParams, slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]) {
         let memories = memory.chunks_exact_mut(CELLS + USER * slot.users());
         for ((i, memory), heading) in memories.enumerate().zip(headings) {
             let (seen, users) = memory.split_at_mut(CELLS);
-            let uav = Uav { world, index: i, fleet: slot.uavs(), at: own_positions(slot)[i], now: step as f64 };
-            let rivals = uav.look(slot, seen, users);
-            let serving = uav.best_user(users, &rivals);
-            let searching = uav.best_ground(seen, users);
-            let best = if serving.0 >= searching.0 { serving } else { searching };
-            *heading = heading_toward(world, uav.at, best.1);
+            let uav = Uav { env, index: i, fleet: slot.uavs(), at: uav_positions(slot)[i], now: step as f64 };
+            let nearby = uav.observe(slot, seen, users);
+            let serving = uav.best_user(users, &nearby);
+            let searching = uav.best_cell(seen, users);
+            let best = if serving.score >= searching.score { serving } else { searching };
+            *heading = heading_toward(env, uav.at, best.position);
         }
     }
 }
 
-/// A promise and where it is: AoI removed per slot of flight, 0 for nothing to do.
-type Goal = (f64, Point);
+/// A place to fly to.
+#[derive(Clone, Copy)]
+struct Candidate {
+    /// AoI removed per slot of flight, as weighted above.
+    score: f64,
+    position: Point,
+}
 
-/// Where a UAV with nothing to do goes.
-const HOME: Goal = (0.0, [0.5, 0.5]);
+/// A UAV with nothing to do flies to the centre.
+const NOTHING: Candidate = Candidate { score: 0.0, position: [0.5, 0.5] };
 
 /// One UAV in one slot.
 struct Uav<'a> {
-    world: &'a EnvParams,
+    env: &'a EnvParams,
     index: usize,
     fleet: usize,
     at: Point,
@@ -71,17 +77,17 @@ struct Uav<'a> {
 }
 
 impl Uav<'_> {
-    /// Writes what is seen into the memory; the positions of other UAVs in sight.
-    fn look(&self, slot: &Slot, seen: &mut [f32], users: &mut [f32]) -> Vec<Point> {
-        let range = self.world.detection_range;
+    /// Writes what the UAV detects into its memory. Returns the positions of the other UAVs that it detects.
+    fn observe(&self, slot: &Slot, seen: &mut [f32], users: &mut [f32]) -> Vec<Point> {
+        let range = self.env.detection_range;
         for (_, seen) in seen.iter_mut().enumerate().filter(|(c, _)| distance(self.at, center(*c)) <= range) {
             *seen = 1.0;
         }
-        // A user that should be in sight and is not has walked away. Just inside the edge, rounding could hide it.
+        // A user that should be detected and is not has moved away. The margin allows for rounding.
         for user in users.chunks_exact_mut(USER).filter(|u| distance(self.at, position(u)) < 0.99 * range) {
             user[0] = 0.0;
         }
-        let mut rivals = Vec::new();
+        let mut uavs = Vec::new();
         for detection in slot.detections(self.index) {
             let [x, y] = [0, 1].map(|k| self.at[k] + f64::from(detection.rel[k]));
             match (detection.target as usize).checked_sub(slot.uavs()) {
@@ -89,57 +95,57 @@ impl Uav<'_> {
                     let collected = self.now as f32 - slot.aoi()[j];
                     users[j * USER..][..USER].copy_from_slice(&[1.0, x as f32, y as f32, collected]);
                 }
-                None => rivals.push([x, y]),
+                None => uavs.push([x, y]),
             }
         }
-        rivals
+        uavs
     }
 
-    /// The known user that promises most.
-    fn best_user(&self, users: &[f32], rivals: &[Point]) -> Goal {
-        let mut best = HOME;
+    /// The known user with the best score.
+    fn best_user(&self, users: &[f32], uavs: &[Point]) -> Candidate {
+        let mut best = NOTHING;
         for user in users.chunks_exact(USER).filter(|u| u[0] > 0.0 && f64::from(u[3]) < self.now) {
             let to = position(user);
-            let slots = travel_slots(self.world, self.at, to, self.world.transmission_range);
+            let slots = travel_slots(self.env, self.at, to, self.env.transmission_range);
             let age = self.now - f64::from(user[3]) + slots;
-            let contested = rivals.iter().any(|&r| distance(r, to) < distance(self.at, to));
-            let promise = age / slots.powf(HASTE) * if contested { RIVALRY } else { 1.0 };
-            if promise > best.0 {
-                best = (promise, to);
+            let contested = uavs.iter().any(|&r| distance(r, to) < distance(self.at, to));
+            let score = age / slots.powf(TIME_POWER) * if contested { CONTESTED } else { 1.0 };
+            if score > best.score {
+                best = Candidate { score, position: to };
             }
         }
         best
     }
 
-    /// The unseen ground that promises most.
-    fn best_ground(&self, seen: &[f32], users: &[f32]) -> Goal {
+    /// The unseen cell with the best score.
+    fn best_cell(&self, seen: &[f32], users: &[f32]) -> Candidate {
         let unknown = users.chunks_exact(USER).filter(|u| u[0] == 0.0).count();
         let unseen: Vec<(Point, f64)> =
-            (0..CELLS).filter(|&c| seen[c] == 0.0).map(|c| (center(c), self.concern(center(c)))).collect();
-        let range = self.world.detection_range;
+            (0..CELLS).filter(|&c| seen[c] == 0.0).map(|c| (center(c), self.cell_weight(center(c)))).collect();
+        let range = self.env.detection_range;
         let users_per_cell = unknown as f64 / unseen.len().max(1) as f64;
-        let mut best = HOME;
+        let mut best = NOTHING;
         for &(to, _) in &unseen {
-            let in_sight = |p: Point| (p[0] - to[0]).powi(2) + (p[1] - to[1]).powi(2) <= range * range;
-            let cells: f64 = unseen.iter().filter(|(p, _)| in_sight(*p)).map(|(_, concern)| concern).sum();
-            let slots = travel_slots(self.world, self.at, to, range);
-            let promise = CURIOSITY * cells * users_per_cell * (self.now + slots) / (slots + 1.0);
-            if promise > best.0 {
-                best = (promise, to);
+            let in_range = |p: Point| (p[0] - to[0]).powi(2) + (p[1] - to[1]).powi(2) <= range * range;
+            let cells: f64 = unseen.iter().filter(|(p, _)| in_range(*p)).map(|(_, weight)| weight).sum();
+            let slots = travel_slots(self.env, self.at, to, range);
+            let score = SEARCH * cells * users_per_cell * (self.now + slots) / (slots + 1.0);
+            if score > best.score {
+                best = Candidate { score, position: to };
             }
         }
         best
     }
 
-    /// How much unseen ground at `p` matters to this UAV: fully within its sector around the middle of the square.
-    fn concern(&self, p: Point) -> f64 {
+    /// Weight of an unseen cell at `p`: 1 in the UAV's own sector around the centre of the square.
+    fn cell_weight(&self, p: Point) -> f64 {
         let own = TAU * self.index as f64 / self.fleet as f64;
         let off = ((p[1] - 0.5).atan2(p[0] - 0.5) - own).rem_euclid(TAU);
-        if off.min(TAU - off) <= PI / self.fleet as f64 { 1.0 } else { FOREIGN }
+        if off.min(TAU - off) <= PI / self.fleet as f64 { 1.0 } else { FOREIGN_SECTOR }
     }
 }
 
-/// Middle of cell `c`.
+/// Centre of cell `c`.
 fn center(c: usize) -> Point {
     [c % GRID, c / GRID].map(|k| (k as f64 + 0.5) / GRID as f64)
 }

@@ -118,7 +118,7 @@ pub async fn load(app: &App) -> Result<(), Error> {
         // The digest says what a checkpoint's does: equal digests, equal answers.
         let digest = Sha256::digest(format!("baseline {} {world:?}", baseline.name)).into();
         let reference = PolicyRef { name: baseline.name.to_owned(), version: 1, digest };
-        app.registry.insert(LoadedPolicy::baseline(reference, baseline.text, policy, app.clock.now()));
+        app.registry.insert(LoadedPolicy::baseline(reference, baseline.description, policy, app.clock.now()));
     }
     for (name, version) in app.store.policy_versions().await? {
         match Stored::new(&app.store, &name, version).await?.load().await {

@@ -1,36 +1,36 @@
-//! `tour`: plans once, with all positions known: users are shared out among UAVs and each UAV flies round its own for ever.
-//! A reference, not a bound: the plan is found by local search and flown by a simple pilot.
+//! `tour`: knows all positions and plans once. Each UAV gets a share of the users and flies a cyclic tour through them.
+//! `tour` is a reference, not a bound: the plan is found by local search and flown by a simple pilot.
 //!
-//! The memory is the plan, so that the policy has no other state. Where users walk, the fleet plans again, from the ages and
-//! positions of that slot, when a user has left the place that the plan was made for. This file owns the memory.
+//! This file owns the fleet's memory, which holds the plan. If a user has moved too far from its position at the time of
+//! planning, the fleet plans again, from the AoI and positions of that slot.
 
-mod flight;
 mod order;
 mod partition;
+mod pilot;
 mod plan;
 
-use self::flight::{Leg, Pilot, Scene};
+use self::pilot::{Pilot, Problem, TourState};
 use super::geometry::distance;
-use super::{EnvParams, RequiredInput, Rule, own_positions};
+use super::rule::{EnvParams, Rule, uav_positions, user_positions};
 use crate::env::Point;
-use crate::policy::Slot;
+use crate::policy::{RequiredInput, Slot};
 
-/// Memory: per UAV, 1 + the position in its tour and the length of the tour; where users were at planning; then the tours,
-/// one after the other. All zeros before the first plan.
+/// Memory: for each UAV, 1 + the index in its tour, and the length of the tour; the positions of users at the time of planning;
+/// then all tours, one after another. All zeros before the first plan.
 #[derive(Default)]
 pub(super) struct Tour;
 
-/// Part of the transmission range that a user may walk before the fleet plans again.
-const STRAY: f64 = 0.5;
-/// The farthest that a plan looks ahead, in slots, however long the episode.
-const FARTHEST: usize = 200;
-/// The least, near the end of an episode or beyond it.
-const SHORTEST: usize = 20;
+/// Share of the transmission range that a user may move before the fleet plans again.
+const MAX_MOVE: f64 = 0.5;
+/// Largest number of slots that a plan looks ahead.
+const MAX_SLOTS: usize = 200;
+/// Smallest number, used near the end of an episode and after it.
+const MIN_SLOTS: usize = 20;
 
 impl Rule for Tour {
     const NAME: &'static str = "tour";
-    const TEXT: &'static str =
-        "Full information: shares users out among UAVs and flies round each UAV's own. A reference, not a bound.";
+    const DESCRIPTION: &'static str =
+        "Full information: assigns users to UAVs, and each UAV flies a tour through its users. A reference, not a bound.";
     const NEEDS: RequiredInput = RequiredInput::FullScene;
 
     fn memory_len(&self, uavs: usize, users: usize) -> usize {
@@ -39,31 +39,30 @@ impl Rule for Tour {
 
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}
 
-    fn fly(&self, world: &EnvParams, slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]) {
-        let uavs = own_positions(slot);
-        let users = slot.user_positions().expect("the caller gives what `needs` asks for");
-        let mut legs = recall(world, uavs.len(), users, memory).unwrap_or_else(|| {
-            let left = world.slots.saturating_sub(usize::try_from(step).unwrap_or(usize::MAX));
-            let slots = left.clamp(SHORTEST, FARTHEST);
-            let scene = Scene { world, uavs, users, aoi: slot.aoi(), slots };
-            let tours = plan::tours(&scene, capacity(uavs.len(), users.len()));
-            remember(&tours, users, memory);
-            tours.into_iter().map(|tour| Leg { tour, next: 0 }).collect()
+    fn decide(&self, env: &EnvParams, slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]) {
+        let (uavs, users) = (uav_positions(slot), user_positions(slot));
+        let mut states = read_plan(env, uavs.len(), users, memory).unwrap_or_else(|| {
+            let left = env.slots.saturating_sub(usize::try_from(step).unwrap_or(usize::MAX));
+            let slots = left.clamp(MIN_SLOTS, MAX_SLOTS);
+            let problem = Problem { env, uavs, users, aoi: slot.aoi(), slots };
+            let tours = plan::tours(&problem, capacity(uavs.len(), users.len()));
+            write_plan(&tours, users, memory);
+            tours.into_iter().map(|tour| TourState { tour, next: 0 }).collect()
         });
-        for (((leg, &at), heading), memory) in legs.iter_mut().zip(uavs).zip(headings).zip(memory.chunks_exact_mut(2)) {
-            *heading = Pilot::new(world).heading(leg, at, users) as u8;
-            memory[0] = (leg.next + 1) as f32;
+        for (((state, &at), heading), memory) in states.iter_mut().zip(uavs).zip(headings).zip(memory.chunks_exact_mut(2)) {
+            *heading = Pilot::new(env).heading(state, at, users) as u8;
+            memory[0] = (state.next + 1) as f32;
         }
     }
 }
 
-/// Most entries of all tours together: every user once, and two more per UAV for users that are shared.
+/// Largest number of entries of all tours: every user once, and two more per UAV for users that are shared.
 fn capacity(uavs: usize, users: usize) -> usize {
     users + 2 * uavs
 }
 
-/// Writes a plan at its beginning.
-fn remember(tours: &[Vec<u32>], users: &[Point], memory: &mut [f32]) {
+/// Writes a new plan to `memory`.
+fn write_plan(tours: &[Vec<u32>], users: &[Point], memory: &mut [f32]) {
     let (counts, rest) = memory.split_at_mut(2 * tours.len());
     let (places, entries) = rest.split_at_mut(2 * users.len());
     for (count, tour) in counts.chunks_exact_mut(2).zip(tours) {
@@ -77,16 +76,17 @@ fn remember(tours: &[Vec<u32>], users: &[Point], memory: &mut [f32]) {
     }
 }
 
-/// The plan in `memory`, where it still holds. Callers may keep the memory themselves, so nothing in it is taken on trust.
-fn recall(world: &EnvParams, uavs: usize, users: &[Point], memory: &[f32]) -> Option<Vec<Leg>> {
+/// The plan in `memory`, or `None` if it is missing, out of date or malformed: the memory may come from a client.
+fn read_plan(env: &EnvParams, uavs: usize, users: &[Point], memory: &[f32]) -> Option<Vec<TourState>> {
     let (counts, rest) = memory.split_at(2 * uavs);
     let (places, mut entries) = rest.split_at(2 * users.len());
-    let near =
-        |(place, &user): (&[f32], &Point)| distance([place[0].into(), place[1].into()], user) <= STRAY * world.transmission_range;
+    let near = |(place, &user): (&[f32], &Point)| {
+        distance([place[0].into(), place[1].into()], user) <= MAX_MOVE * env.transmission_range
+    };
     if !places.chunks_exact(2).zip(users).all(near) {
         return None;
     }
-    let mut legs = Vec::with_capacity(uavs);
+    let mut states = Vec::with_capacity(uavs);
     for count in counts.chunks_exact(2) {
         let next = (count[0] as usize).checked_sub(1)?;
         let (tour, rest) = entries.split_at_checked(count[1] as usize)?;
@@ -95,7 +95,7 @@ fn recall(world: &EnvParams, uavs: usize, users: &[Point], memory: &[f32]) -> Op
         if tour.iter().any(|&user| user as usize >= users.len()) || next > tour.len() {
             return None;
         }
-        legs.push(Leg { tour, next });
+        states.push(TourState { tour, next });
     }
-    Some(legs)
+    Some(states)
 }

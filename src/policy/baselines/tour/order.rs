@@ -1,17 +1,19 @@
-//! Short closed tours through points: nearest neighbour, then 2-opt and Or-opt. Work is bounded for any number of points.
+//! Short cyclic tours through points: nearest neighbour, then 2-opt and Or-opt. Work is bounded for any number of points.
 
 use super::super::geometry::distance;
 use crate::env::Point;
 
-/// Up to this many points the first tour is by nearest neighbour, which looks at every pair; above, row by row.
+/// Largest number of points for which the first tour is by nearest neighbour, which compares all pairs. Larger tours start row
+/// by row.
 const PAIRWISE: usize = 2048;
-/// How far apart in the tour improvements are looked for.
+/// Largest distance along the tour between two points that an improvement exchanges.
 const WINDOW: usize = 48;
-/// How often, for a tour of ordinary length; and points looked at in all rounds, where it is long.
+/// Largest number of rounds of improvements.
 const ROUNDS: usize = 12;
-const LOOKED_AT: usize = 20_000;
+/// Largest number of points times rounds.
+const WORK: usize = 20_000;
 
-/// `tour` in a short closed order.
+/// Reorders `tour` into a short cyclic tour.
 pub fn shorten(tour: &mut [u32], users: &[Point]) {
     let n = tour.len();
     if n < 4 {
@@ -22,8 +24,8 @@ pub fn shorten(tour: &mut [u32], users: &[Point]) {
     } else {
         by_neighbour(tour, users);
     }
-    for _ in 0..ROUNDS.min(LOOKED_AT / n) {
-        if !(reversed(tour, users) | shifted(tour, users)) {
+    for _ in 0..ROUNDS.min(WORK / n) {
+        if !(two_opt(tour, users) | or_opt(tour, users)) {
             break;
         }
     }
@@ -34,7 +36,7 @@ fn between(tour: &[u32], users: &[Point], i: usize, j: usize) -> f64 {
     distance(users[tour[i % n] as usize], users[tour[j % n] as usize])
 }
 
-/// Each point is followed by the nearest that is left.
+/// Each point is followed by the nearest point that remains.
 fn by_neighbour(tour: &mut [u32], users: &[Point]) {
     for i in 1..tour.len() {
         let nearest = (i..tour.len()).min_by(|&a, &b| between(tour, users, i - 1, a).total_cmp(&between(tour, users, i - 1, b)));
@@ -42,7 +44,7 @@ fn by_neighbour(tour: &mut [u32], users: &[Point]) {
     }
 }
 
-/// Rows of about as many points as there are rows, there and back.
+/// Rows of points, each traversed in the direction opposite to the row before.
 fn by_rows(tour: &mut [u32], users: &[Point]) {
     let rows = (tour.len() as f64).sqrt().ceil().max(1.0);
     let key = |&user: &u32| {
@@ -53,8 +55,8 @@ fn by_rows(tour: &mut [u32], users: &[Point]) {
     tour.sort_by(|a, b| key(a).0.total_cmp(&key(b).0).then(key(a).1.total_cmp(&key(b).1)).then(a.cmp(b)));
 }
 
-/// 2-opt: whether a stretch was turned round.
-fn reversed(tour: &mut [u32], users: &[Point]) -> bool {
+/// 2-opt: reverses parts of the tour. Returns whether the tour became shorter.
+fn two_opt(tour: &mut [u32], users: &[Point]) -> bool {
     let n = tour.len();
     let mut better = false;
     for i in 0..n - 1 {
@@ -70,8 +72,8 @@ fn reversed(tour: &mut [u32], users: &[Point]) -> bool {
     better
 }
 
-/// Or-opt: whether a point was moved to another place nearby.
-fn shifted(tour: &mut [u32], users: &[Point]) -> bool {
+/// Or-opt: moves single points along the tour. Returns whether the tour became shorter.
+fn or_opt(tour: &mut [u32], users: &[Point]) -> bool {
     let n = tour.len();
     let mut better = false;
     for i in 1..n - 1 {

@@ -1,0 +1,82 @@
+//! What all baselines share: the parameters of the environment, the trait of a rule, and seeds in a fleet's memory.
+
+use rand_chacha::ChaCha8Rng;
+
+use crate::env::{EnvConfig, Point};
+use crate::policy::{RequiredInput, Slot};
+use crate::rng;
+
+/// The parameters of the environment that a baseline flies in. Lengths are in units of the square's side.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct EnvParams {
+    /// v, distance per slot.
+    pub speed: f64,
+    /// t, range within which data is collected.
+    pub transmission_range: f64,
+    /// d, range within which nodes detect each other.
+    pub detection_range: f64,
+    /// A, the number of actions.
+    pub headings: usize,
+    /// K, slots per episode: how far baselines that plan look ahead.
+    pub slots: usize,
+}
+
+impl From<&EnvConfig> for EnvParams {
+    fn from(env: &EnvConfig) -> Self {
+        Self {
+            speed: env.speed,
+            transmission_range: env.transmission_range,
+            detection_range: env.detection_range,
+            headings: env.headings(),
+            slots: env.slots,
+        }
+    }
+}
+
+impl Default for EnvParams {
+    fn default() -> Self {
+        Self::from(&EnvConfig::default())
+    }
+}
+
+/// How one fleet acts in one slot. No rule but `random` hovers.
+pub(super) trait Rule: Default + Send + Sync {
+    const NAME: &'static str;
+    /// One sentence on what the rule does.
+    const DESCRIPTION: &'static str;
+    const NEEDS: RequiredInput;
+
+    /// Length of a fleet's memory.
+    fn memory_len(&self, uavs: usize, users: usize) -> usize;
+
+    /// Initialises the memory for slot 0. All numbers are 0 before.
+    fn start(&self, seed: u64, memory: &mut [f32]);
+
+    /// Writes one heading per UAV and advances the memory.
+    fn decide(&self, env: &EnvParams, slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]);
+}
+
+/// Length of a seed in a memory: 16 bits per f32, which f32 holds exactly.
+pub(super) const SEED_LEN: usize = 4;
+
+pub(super) fn store_seed(seed: u64, memory: &mut [f32]) {
+    for (i, m) in memory[..SEED_LEN].iter_mut().enumerate() {
+        *m = f32::from((seed >> (16 * i)) as u16);
+    }
+}
+
+/// The random stream `name` of slot `step` of the episode whose seed is in `memory`.
+pub(super) fn slot_rng(memory: &[f32], name: &str, step: u64) -> ChaCha8Rng {
+    let seed = memory[..SEED_LEN].iter().rev().fold(0, |seed, &m| seed << 16 | u64::from(m as u16));
+    rng::stream(seed, name, step)
+}
+
+/// The positions of the UAVs.
+pub(super) fn uav_positions(slot: &Slot) -> &[Point] {
+    slot.uav_positions().expect("the caller provides what `needs` requires")
+}
+
+/// The positions of the users.
+pub(super) fn user_positions(slot: &Slot) -> &[Point] {
+    slot.user_positions().expect("the caller provides what `needs` requires")
+}
