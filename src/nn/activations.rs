@@ -47,6 +47,12 @@ pub fn elu<T: Real>(x: T) -> T {
     if x > T::ZERO { x } else { below }
 }
 
+/// Derivative of the ELU, from its output.
+#[inline(always)]
+pub fn elu_slope<T: Real>(y: T) -> T {
+    if y > T::ZERO { T::ONE } else { y + T::ONE }
+}
+
 /// Index of the largest value; of equal values the first; 0 for an empty slice.
 pub fn argmax<T: PartialOrd>(x: &[T]) -> usize {
     (1..x.len()).fold(0, |best, i| if x[i] > x[best] { i } else { best })

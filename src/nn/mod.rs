@@ -27,7 +27,7 @@ mod real;
 mod rgcn;
 mod simd;
 
-pub use activations::{argmax, elu, leaky_relu, leaky_relu_back, relu, relu_back};
+pub use activations::{argmax, elu, elu_slope, leaky_relu, leaky_relu_back, relu, relu_back};
 pub use adam::{Adam, norm_squared};
 pub use batch::{Batch, Rows, RowsMut};
 pub use edge_conv::{EdgeCache, EdgeNet, EdgeScratch, Pairing};

@@ -1,4 +1,4 @@
-//! Linear, ReLU, Linear: the hypernetworks of the mixers.
+//! The hypernetworks of the mixers: Linear, ReLU, Linear.
 
 use crate::nn::{Batch, Linear, ParameterLayout, Real, Rows, Weights, matmul::Accumulate, relu, relu_back};
 
@@ -11,7 +11,7 @@ pub(super) struct HyperNet {
 #[derive(Debug, Default)]
 pub(super) struct HyperNetCache<T: Real> {
     pub(super) hidden: Batch<T>,
-    /// The output; before backward the caller puts its gradient here.
+    /// The output; before backward the caller replaces it by its gradient.
     pub(super) out: Batch<T>,
     /// After backward: the gradient at the output of the first layer.
     pub(super) d_first: Batch<T>,
@@ -36,7 +36,7 @@ impl HyperNet {
         self.finish(w, c);
     }
 
-    /// From the output of the first layer, already in `hidden`.
+    /// The rest of the forward pass, from the output of the first layer in `hidden`.
     pub(super) fn finish<T: Real>(&self, w: Weights<'_, T>, c: &mut HyperNetCache<T>) {
         relu(c.hidden.as_mut_slice());
         c.out.reset(self.last.outputs, c.hidden.len());
@@ -48,14 +48,14 @@ impl HyperNet {
         self.first.backward(flat, x, c.d_first.rows(), grads, None);
     }
 
-    /// Up to the output of the first layer.
+    /// Backward up to the output of the first layer.
     pub(super) fn backward_last<T: Real>(&self, flat: &[T], c: &mut HyperNetCache<T>, grads: &mut [T]) {
         c.d_first.reset(self.first.outputs, c.hidden.len());
         self.last.backward(flat, c.hidden.rows(), c.out.rows(), grads, Some(c.d_first.rows_mut()));
         relu_back(c.hidden.as_slice(), c.d_first.as_mut_slice());
     }
 
-    /// Adds to dx, after backward.
+    /// After backward: adds the gradient of the input to `dx`.
     pub(super) fn backward_input<T: Real>(&self, flat: &[T], c: &HyperNetCache<T>, dx: &mut Batch<T>) {
         self.first.backward_input(flat, (0, self.first.inputs), c.d_first.rows(), dx.rows_mut(), Accumulate::Add);
     }

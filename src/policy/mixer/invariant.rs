@@ -1,4 +1,4 @@
-//! The permutation-invariant mixer (spec 4.2), E = 32:
+//! The permutation-invariant mixer (docs/model.md, "Invariant"), E = 32:
 //!
 //! ```text
 //! g    = mean_i relu(Linear(2, 64)(P_i)) + mean_j relu(Linear(3, 64)(P_j, AoI_j / K))
@@ -6,11 +6,10 @@
 //! Q_tot = |Linear(64, E)(relu(Linear(64, 64)(g)))| . hid + Linear(E, 1)(relu(Linear(64, E)(g)))
 //! ```
 //!
-//! The share of g in w1's first layer is the same for all UAVs of a slot and computed once.
+//! The part of w1's first layer that depends on g is the same for all UAVs of a slot and computed once.
 
-use super::E;
 use super::hyper_net::{HyperNet, HyperNetCache};
-use super::qmix::{mix, mix_back};
+use super::mixing::{E, mix, mix_back};
 use crate::nn::matmul::Accumulate;
 use crate::nn::{Batch, Embedding, EmbeddingGrad, HIDDEN, Linear, ParameterLayout, Real, Rows, Weights, simd};
 use crate::policy::agent::Dims;
@@ -31,7 +30,7 @@ pub(super) struct InvariantCache<T: Real> {
     g: Batch<T>,
     /// P_i, one sample per slot and UAV.
     positions: Batch<T>,
-    /// g's share of w1's first layer, and later its gradient.
+    /// The part of w1's first layer that depends on g; in backward its gradient.
     share: Batch<T>,
     w1: HyperNetCache<T>,
     w2: HyperNetCache<T>,

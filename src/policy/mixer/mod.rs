@@ -1,10 +1,11 @@
-//! Mixers (spec 4): the UAVs' values become one per slot. Used in training only.
+//! Mixers compute the joint value Q_tot of a slot from the UAVs' values (docs/model.md, "Mixers"). Used in training only.
 //!
-//! The weights of a mixing network depend on the state and never on the values, and enter as absolute values, so Q_tot
-//! does not fall when any Q_i rises.
+//! The weights of a mixing network depend on the state, not on the values, and are used as absolute values. So
+//! dQ_tot/dQ_i >= 0.
 
 mod hyper_net;
 mod invariant;
+mod mixing;
 mod qmix;
 
 use serde::{Deserialize, Serialize};
@@ -14,9 +15,6 @@ use self::invariant::{Invariant, InvariantCache};
 use self::qmix::{Qmix, QmixCache};
 use super::agent::Dims;
 use crate::nn::{Batch, ParameterLayout, Real, Rows, RowsMut, Weights};
-
-/// E, the width of the mixing layer.
-const E: usize = 32;
 
 /// How the UAVs' values become joint values.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -32,7 +30,7 @@ pub enum MixerKind {
     None,
 }
 
-/// A mixing network and where its parameters lie.
+/// A mixing network and the offsets of its parameters.
 #[derive(Clone, Copy, Debug)]
 pub struct Mixer {
     uavs: usize,
@@ -47,7 +45,7 @@ enum Net {
     None,
 }
 
-/// Activations of one forward pass.
+/// Activations of a forward pass.
 #[derive(Debug, Default)]
 pub struct MixerCache<T: Real> {
     qmix: QmixCache<T>,
@@ -66,7 +64,7 @@ impl Mixer {
         Self { uavs: dims.uavs, net }
     }
 
-    /// Joint values per slot: 1, or M when nothing is mixed.
+    /// Number of joint values per slot: 1, or M with [`MixerKind::None`].
     pub fn values(&self) -> usize {
         if matches!(self.net, Net::None) { self.uavs } else { 1 }
     }
@@ -80,7 +78,7 @@ impl Mixer {
         }
     }
 
-    /// `total` from flat states (spec 2.3) and the UAVs' values, one row per slot each.
+    /// Writes the joint values `total`, from flat states (docs/model.md, "Flat state") and the UAVs' values, one row per slot each.
     pub fn forward<T: Real>(
         &self,
         w: Weights<'_, T>,
@@ -100,7 +98,7 @@ impl Mixer {
         }
     }
 
-    /// Adds the gradients of the parameters and writes those of the values. Spoils the cache.
+    /// Adds the gradients of the parameters and writes those of the values. Overwrites the cache.
     pub fn backward<T: Real>(
         &self,
         w: Weights<'_, T>,
@@ -121,22 +119,4 @@ impl Mixer {
             Net::None => dq.as_mut_slice().copy_from_slice(d_total),
         }
     }
-}
-
-/// -1, 0 or 1.
-#[inline(always)]
-fn sign<T: Real>(x: T) -> T {
-    if x > T::ZERO {
-        T::ONE
-    } else if x < T::ZERO {
-        -T::ONE
-    } else {
-        T::ZERO
-    }
-}
-
-/// Derivative of the ELU, from its output.
-#[inline(always)]
-fn elu_slope<T: Real>(y: T) -> T {
-    if y > T::ZERO { T::ONE } else { y + T::ONE }
 }

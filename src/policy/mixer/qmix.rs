@@ -1,4 +1,4 @@
-//! QMIX (spec 4.1), E = 32, s the flat state:
+//! QMIX (docs/model.md, "QMIX"), E = 32, s the flat state:
 //!
 //! ```text
 //! W1 = |Linear(64, M E)(relu(Linear(S, 64)(s)))|   b1 = Linear(S, E)(s)
@@ -7,8 +7,8 @@
 //! ```
 
 use super::hyper_net::{HyperNet, HyperNetCache};
-use super::{E, elu_slope, sign};
-use crate::nn::{Batch, HIDDEN, Linear, ParameterLayout, Real, Rows, Weights, elu, simd};
+use super::mixing::{E, mix, mix_back};
+use crate::nn::{Batch, HIDDEN, Linear, ParameterLayout, Real, Rows, Weights, simd};
 use crate::policy::agent::Dims;
 
 #[derive(Clone, Copy, Debug)]
@@ -82,59 +82,5 @@ impl Qmix {
         self.w1.backward(w.flat, states, &mut c.w1, grads);
         self.w2.backward(w.flat, states, &mut c.w2, grads);
         self.b2.backward(w.flat, states, &mut c.b2, grads);
-    }
-}
-
-#[inline(always)]
-pub(super) fn mix<T: Real>((w1, w2, b2): (&[T], &[T], &[T]), (q, uavs): (&[T], usize), mixed: &mut [T], total: &mut [T]) {
-    let (w1, w2) = (w1.as_chunks::<E>().0, w2.as_chunks::<E>().0);
-    for (g, (mixed, total)) in mixed.as_chunks_mut::<E>().0.iter_mut().zip(total).enumerate() {
-        for (w1, &q) in w1[g * uavs..][..uavs].iter().zip(&q[g * uavs..]) {
-            for e in 0..E {
-                mixed[e] = q.mul_add(w1[e].abs(), mixed[e]);
-            }
-        }
-        let mut sum = T::ZERO;
-        let mut terms = [T::ZERO; E];
-        for e in 0..E {
-            mixed[e] = elu(mixed[e]);
-            terms[e] = mixed[e] * w2[g][e].abs();
-        }
-        for x in terms {
-            sum += x;
-        }
-        *total = sum + b2[g];
-    }
-}
-
-/// w1, w2 and mixed become their gradients.
-#[inline(always)]
-pub(super) fn mix_back<T: Real>(
-    (w1, w2, mixed): (&mut [T], &mut [T], &mut [T]),
-    (q, uavs): (&[T], usize),
-    d_total: &[T],
-    dq: &mut [T],
-) {
-    let (w1, w2) = (w1.as_chunks_mut::<E>().0, w2.as_chunks_mut::<E>().0);
-    for (g, (mixed, &d)) in mixed.as_chunks_mut::<E>().0.iter_mut().zip(d_total).enumerate() {
-        let w2 = &mut w2[g];
-        for e in 0..E {
-            let y = mixed[e];
-            mixed[e] = d * w2[e].abs() * elu_slope(y);
-            w2[e] = d * y * sign(w2[e]);
-        }
-        for i in g * uavs..(g + 1) * uavs {
-            let w1 = &mut w1[i];
-            let mut terms = [T::ZERO; E];
-            for e in 0..E {
-                terms[e] = mixed[e] * w1[e].abs();
-                w1[e] = mixed[e] * q[i] * sign(w1[e]);
-            }
-            let mut sum = T::ZERO;
-            for x in terms {
-                sum += x;
-            }
-            dq[i] = sum;
-        }
     }
 }
