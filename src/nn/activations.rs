@@ -14,7 +14,7 @@ pub fn relu<T: Real>(x: &mut [T]) {
     );
 }
 
-/// dx = dy where y > 0, else 0, in place.
+/// Derivative of the ReLU from its output y: sets dy to 0 where y <= 0.
 pub fn relu_back<T: Real>(y: &[T], dy: &mut [T]) {
     simd(
         #[inline(always)]
@@ -22,7 +22,7 @@ pub fn relu_back<T: Real>(y: &[T], dy: &mut [T]) {
     );
 }
 
-/// x = x above 0, 0.01 x below.
+/// x = x if x > 0, else 0.01 x.
 pub fn leaky_relu<T: Real>(x: &mut [T]) {
     let leak = T::from_f64(LEAK);
     simd(
@@ -31,7 +31,7 @@ pub fn leaky_relu<T: Real>(x: &mut [T]) {
     );
 }
 
-/// Gradient of the leaky ReLU from its output, in place.
+/// Derivative of the leaky ReLU from its output y: multiplies dy by 0.01 where y <= 0.
 pub fn leaky_relu_back<T: Real>(y: &[T], dy: &mut [T]) {
     let leak = T::from_f64(LEAK);
     simd(
@@ -40,7 +40,7 @@ pub fn leaky_relu_back<T: Real>(y: &[T], dy: &mut [T]) {
     );
 }
 
-/// ELU: x above 0, e^x - 1 below.
+/// ELU: x if x > 0, else e^x - 1.
 #[inline(always)]
 pub fn elu<T: Real>(x: T) -> T {
     let below = x.exp() - T::ONE;

@@ -1,4 +1,4 @@
-//! Adam over a flat vector, with the gradient clipped to a global norm, as `PyTorch` does both.
+//! Adam over a flat vector, with clipping of the gradient to a global norm, both as in `PyTorch` (docs/model.md, "Optimiser").
 
 use super::real::Real;
 use super::simd::simd;
@@ -7,14 +7,14 @@ const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
 const EPS: f64 = 1e-8;
 
-/// The optimiser's state.
+/// State of the optimiser.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Adam<T> {
     /// First moments.
     pub m: Vec<T>,
     /// Second moments.
     pub v: Vec<T>,
-    /// Steps taken.
+    /// Number of steps taken.
     pub steps: u64,
 }
 
@@ -24,10 +24,10 @@ impl<T: Real> Adam<T> {
         Self { m: vec![T::ZERO; len], v: vec![T::ZERO; len], steps: 0 }
     }
 
-    /// One step of `params` against `grads`, scaled down to the norm `clip` when `norm` exceeds it.
+    /// Takes one step. `norm` is the norm of `grads`; gradients of a larger norm than `clip` are scaled down to it.
     ///
     /// # Panics
-    /// When lengths differ.
+    /// If the lengths differ.
     pub fn step(&mut self, params: &mut [T], grads: &[T], rate: f64, (norm, clip): (f64, f64)) {
         assert!(params.len() == grads.len() && grads.len() == self.m.len(), "one moment per parameter");
         self.steps += 1;

@@ -1,4 +1,5 @@
-//! Activations of many samples in nalgebra's column-major storage: one column per sample, so a sample is contiguous.
+//! Activations of many samples. The storage is nalgebra's, which is column-major: one column per sample, so that a sample is
+//! contiguous. ARCHITECTURE.md says why products are not nalgebra's.
 
 use std::ops::Range;
 
@@ -17,30 +18,30 @@ impl<T: Real> Default for Batch<T> {
     }
 }
 
-/// A view of samples: sample i is `data[i * stride ..]`, of a width that the reader knows.
+/// A view of samples: sample i starts at `data[i * stride]`. The width is known from the context.
 #[derive(Clone, Copy, Debug)]
 pub struct Rows<'a, T> {
-    /// First number of the first sample, and on.
+    /// From the first number of the first sample on.
     pub data: &'a [T],
-    /// Distance between samples.
+    /// Distance between the starts of samples.
     pub stride: usize,
-    /// Samples.
+    /// Number of samples.
     pub len: usize,
 }
 
 /// A mutable view of samples.
 #[derive(Debug)]
 pub struct RowsMut<'a, T> {
-    /// First number of the first sample, and on.
+    /// From the first number of the first sample on.
     pub data: &'a mut [T],
-    /// Distance between samples.
+    /// Distance between the starts of samples.
     pub stride: usize,
-    /// Samples.
+    /// Number of samples.
     pub len: usize,
 }
 
 impl<T> Rows<'_, T> {
-    /// The same samples from column `from` on.
+    /// The same samples without their first `from` numbers.
     #[must_use]
     pub fn from_column(self, from: usize) -> Self {
         Self { data: &self.data[from.min(self.data.len())..], ..self }
@@ -48,7 +49,7 @@ impl<T> Rows<'_, T> {
 }
 
 impl<T: Real> Batch<T> {
-    /// Takes a new shape. What it holds afterwards is unspecified.
+    /// Changes the shape. The content is unspecified afterwards.
     pub fn reset(&mut self, width: usize, len: usize) {
         if (self.0.nrows(), self.0.ncols()) != (width, len) {
             let mut data: Vec<T> = std::mem::take(self).0.data.into();
@@ -57,7 +58,7 @@ impl<T: Real> Batch<T> {
         }
     }
 
-    /// Takes a new shape, all zeros.
+    /// Changes the shape and sets all numbers to 0.
     pub fn reset_zero(&mut self, width: usize, len: usize) {
         self.reset(width, len);
         self.as_mut_slice().fill(T::ZERO);
@@ -68,12 +69,12 @@ impl<T: Real> Batch<T> {
         self.0.nrows()
     }
 
-    /// Samples.
+    /// Number of samples.
     pub fn len(&self) -> usize {
         self.0.ncols()
     }
 
-    /// Whether it holds nothing.
+    /// Whether there are no numbers.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }

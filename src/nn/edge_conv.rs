@@ -1,15 +1,15 @@
-//! A network on pairs of neighbours, f = Linear(2H, 96), LayerNorm, ReLU, Linear(96, H), aggregated over neighbours, in
-//! its factored form (spec 3), exact up to rounding:
+//! Edge networks: f = Linear(2H, 96), LayerNorm, ReLU, Linear(96, H) on each pair of neighbours, aggregated over the neighbours
+//! (docs/model.md, "EdgeConv" and "AggGNN"). Computed in factored form, exact up to rounding:
 //!
 //! ```text
 //! EdgeConv    x'_i = agg_j f(x_i || x_j - x_i)      u_i = (Wa - Wb) x_i + b
-//! messages    m_i  = agg_j f(x_i || x_j)            u_i = Wa x_i + b
+//! AggGNN      m_i  = agg_j f(x_i || x_j)            u_i = Wa x_i + b
 //! v_j = Wb x_j                                per node: f's first Linear is linear in x_i and x_j
-//! a_i = agg_j relu(LayerNorm(u_i + v_j))      per edge, never stored; backward recomputes it
+//! a_i = agg_j relu(LayerNorm(u_i + v_j))      per edge: not stored, backward recomputes it
 //! x'_i = W' a_i + b'                          per node: f's last Linear commutes with the sum
 //! ```
 //!
-//! A node without neighbours gets 0. Nodes computed are a prefix of the nodes read (see [`Graph`]).
+//! A node without neighbours gets 0. The nodes computed are a prefix of the nodes read (see [`Graph`]).
 
 use super::HIDDEN as H;
 use super::batch::{Batch, Rows, RowsMut};
@@ -24,16 +24,16 @@ use super::simd::simd;
 /// Width of f's hidden layer.
 const W: usize = 96;
 
-/// What f sees of a neighbour.
+/// Second half of f's input.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pairing {
-    /// x_j - x_i, as `EdgeConv`.
+    /// x_j - x_i.
     Difference,
     /// x_j.
     Plain,
 }
 
-/// The network and how it is aggregated.
+/// The network f, its input and its aggregation.
 #[derive(Clone, Copy, Debug)]
 pub struct EdgeNet {
     first: Linear,
@@ -43,7 +43,7 @@ pub struct EdgeNet {
     mean: bool,
 }
 
-/// What backward needs: u, v, a, and (mean, 1 / deviation) per edge.
+/// Values that backward needs: u, v, a, and (mean, rstd) per edge.
 #[derive(Debug, Default)]
 pub struct EdgeCache<T: Real> {
     u: Batch<T>,
@@ -52,7 +52,7 @@ pub struct EdgeCache<T: Real> {
     stats: Vec<[T; 2]>,
 }
 
-/// Scratch of backward, shared by all layers.
+/// Buffers of backward, shared by all layers.
 #[derive(Debug, Default)]
 pub struct EdgeScratch<T: Real> {
     da: Batch<T>,
@@ -61,7 +61,7 @@ pub struct EdgeScratch<T: Real> {
 }
 
 impl EdgeNet {
-    /// Adds `name.0`, `name.1`, `name.3`; aggregation is the mean or the sum over neighbours.
+    /// Adds the parameters `name.0`, `name.1` and `name.3`. The aggregation is the mean over neighbours or, without `mean`, the sum.
     pub fn new(layout: &mut ParameterLayout, name: &str, pairing: Pairing, mean: bool) -> Self {
         Self {
             first: Linear::new(layout, &format!("{name}.0"), 2 * H, W),
@@ -72,7 +72,7 @@ impl EdgeNet {
         }
     }
 
-    /// Writes what makes u and v of x, transposed, (H, W) each, and the last layer's transposed weight.
+    /// Writes the transposed matrices of u and v, (H, W) each, and the last layer's transposed weight.
     pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
         self.last.prepare(flat, transposed);
         let (own, neighbour) = self.first.weight_grad(transposed).split_at_mut(H * W);
@@ -84,12 +84,12 @@ impl EdgeNet {
         }
     }
 
-    /// The products of a forward pass that reads `read` nodes and computes `made`, each as (rows, k, columns).
+    /// The matrix products of a forward pass that reads `read` nodes and computes `made`, each as (rows, k, columns).
     pub fn products(&self, (read, made): (usize, usize)) -> [[usize; 3]; 3] {
         [[made, H, W], [read, H, W], self.last.product(made)]
     }
 
-    /// x' of the first `y.len` nodes from x of all of them.
+    /// Writes x' of the first `y.len` nodes, from x of all nodes.
     pub fn forward<T: Real>(
         &self,
         w: Weights<'_, T>,
@@ -120,7 +120,7 @@ impl EdgeNet {
         self.last.forward(w, a.rows(), RowsMut { data: &mut *y.data, ..y });
         let bias = self.last.bias(w);
         for i in 0..nodes {
-            // The product gave every node one bias; a sum has one per neighbour, and a node without neighbours none.
+            // The product added one bias per node. A sum has one bias per neighbour, and a node without neighbours has none.
             let degree = graph.degree(i);
             if degree == 0 {
                 y.data[i * stride..][..H].fill(T::ZERO);
@@ -131,7 +131,7 @@ impl EdgeNet {
         }
     }
 
-    /// Adds all gradients and writes dx of all nodes read. Spoils `dy`.
+    /// Adds the gradients of the parameters and writes dx of all nodes read. Overwrites `dy`.
     pub fn backward<T: Real>(
         &self,
         flat: &[T],
@@ -167,7 +167,7 @@ impl EdgeNet {
         self.first.backward_bias(du.rows(), grads);
         self.first.backward_part((0, H), x, du.rows(), grads);
         if self.pairing == Pairing::Difference {
-            // u takes Wa - Wb and v takes Wb, so Wb sees dv - du.
+            // u uses Wa - Wb and v uses Wb, so the gradient of Wb comes from dv - du.
             let (dv, du) = (dv.as_mut_slice(), du.as_slice());
             simd(
                 #[inline(always)]
@@ -181,7 +181,7 @@ impl EdgeNet {
     }
 }
 
-/// Adds the gradient of the last layer's bias; nodes without neighbours, whose output is 0, lose theirs.
+/// Adds the gradient of the last layer's bias. Sets the gradient of nodes without neighbours, whose output is constant, to 0.
 #[inline(always)]
 fn last_bias_back<T: Real>(graph: &Graph, mean: bool, dy: &mut [[T; H]], bias: &mut [T; H]) {
     for (i, dy) in dy.iter_mut().enumerate() {
@@ -267,7 +267,7 @@ fn aggregate_back<T: Real>(
     }
 }
 
-/// Weight of a neighbour in the aggregate.
+/// Weight of one neighbour in the aggregation.
 #[inline(always)]
 fn share<T: Real>(neighbours: &[u32], mean: bool) -> T {
     if mean { T::ONE / T::from_f64(neighbours.len().max(1) as f64) } else { T::ONE }

@@ -1,6 +1,6 @@
-//! ReLU(Linear(F, 64)) of single points, to be summed over what a node sees or a state holds (spec 2.2, 4.2).
+//! ReLU(Linear(F, 64)) of single points, summed over sets of points (docs/model.md, "Set observation" and "Invariant").
 //!
-//! F is 2 or 3, so a matrix product would be all overhead: F multiply-adds on rows of 64, recomputed in backward.
+//! F is 2 or 3, too small for a matrix product: F multiply-adds on rows of 64. Backward recomputes them.
 
 use super::HIDDEN as H;
 use super::linear::Linear;
@@ -11,7 +11,7 @@ use super::real::Real;
 #[derive(Clone, Copy, Debug)]
 pub struct Embedding<const F: usize>(Linear);
 
-/// Its weights as rows of 64, for the time of a loop; or the sums of their gradients.
+/// The weights of an embedding as rows of 64, or the sums of their gradients.
 #[derive(Clone, Copy, Debug)]
 pub struct EmbeddingGrad<T, const F: usize> {
     weight: [[T; H]; F],
@@ -29,13 +29,13 @@ impl<const F: usize> Embedding<F> {
         self.0.prepare(flat, transposed);
     }
 
-    /// The weights, ready for [`EmbeddingGrad::add`] and [`EmbeddingGrad::backward`].
+    /// The weights, for [`EmbeddingGrad::add`] and [`EmbeddingGrad::backward`].
     pub fn load<T: Real>(&self, w: Weights<'_, T>) -> EmbeddingGrad<T, F> {
         let rows = self.0.weight_transposed(w).as_chunks::<H>().0;
         EmbeddingGrad { weight: rows.try_into().expect("F rows"), bias: self.0.bias(w).try_into().expect("64 numbers") }
     }
 
-    /// Adds gathered gradients.
+    /// Adds the gradients in `sums` to `grads`.
     pub fn add_grads<T: Real>(&self, sums: &EmbeddingGrad<T, F>, grads: &mut [T]) {
         for (o, row) in self.0.weight_grad(grads).chunks_exact_mut(F).enumerate() {
             row.iter_mut().zip(&sums.weight).for_each(|(g, s)| *g += s[o]);
@@ -45,13 +45,14 @@ impl<const F: usize> Embedding<F> {
 }
 
 impl<T: Real, const F: usize> EmbeddingGrad<T, F> {
-    /// No gradient yet.
+    /// All zeros.
     pub fn zero() -> Self {
         Self { weight: [[T::ZERO; H]; F], bias: [T::ZERO; H] }
     }
 
+    /// The linear part.
     #[inline(always)]
-    fn before(&self, point: [T; F]) -> [T; H] {
+    fn linear(&self, point: [T; F]) -> [T; H] {
         let mut x = self.bias;
         for f in 0..F {
             for c in 0..H {
@@ -61,19 +62,19 @@ impl<T: Real, const F: usize> EmbeddingGrad<T, F> {
         x
     }
 
-    /// sum += the embedding of `point`.
+    /// Adds the embedding of `point` to `sum`.
     #[inline(always)]
     pub fn add(&self, point: [T; F], sum: &mut [T; H]) {
-        let x = self.before(point);
+        let x = self.linear(point);
         for c in 0..H {
             sum[c] += x[c].relu();
         }
     }
 
-    /// Adds the gradients of one point, whose embedding had the gradient `d`.
+    /// Adds the gradients of the weights, given the gradient `d` of the embedding of `point`.
     #[inline(always)]
     pub fn backward(&self, point: [T; F], d: &[T; H], grads: &mut Self) {
-        let x = self.before(point);
+        let x = self.linear(point);
         for c in 0..H {
             let open = if x[c] > T::ZERO { d[c] } else { T::ZERO };
             grads.bias[c] += open;

@@ -1,17 +1,17 @@
-//! A sparse batch of graphs, as graph layers see it: lists of neighbours, and how many nodes each layer needs.
+//! The input of graph layers: a batch of graphs as lists of neighbours, and the number of nodes that each layer computes.
 //!
-//! Only the first nodes (of the first kind) are outputs of the last layer. Nodes are ordered by their distance in hops to
-//! the nearest of them, so what a layer must compute is always a prefix; nodes further away than there are layers are
-//! left out.
+//! The last layer computes only the nodes of the first kind, which come first. Nodes are ordered by the number of hops to the
+//! nearest node of the first kind, so that each layer computes a prefix. Nodes more hops away than there are layers are left
+//! out.
 
-/// Neighbours of nodes 0..`reach[L - 1]`, as one list after another.
+/// Neighbours of nodes 0..`reach[L - 1]` for L layers.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Graph {
-    /// Neighbours of node i are `targets[offsets[i]..offsets[i + 1]]`.
+    /// The neighbours of node i are `targets[offsets[i]..offsets[i + 1]]`.
     pub offsets: Vec<u32>,
     /// Node indices.
     pub targets: Vec<u32>,
-    /// `reach[h]`: nodes within h hops of a node of the first kind; `reach[0]` are those themselves.
+    /// `reach[h]`: number of nodes within h hops of a node of the first kind; `reach[0]` counts the nodes of the first kind.
     pub reach: Vec<usize>,
 }
 
@@ -28,12 +28,12 @@ impl Graph {
         (self.offsets[i + 1] - self.offsets[i]) as usize
     }
 
-    /// Nodes of the first kind.
+    /// Number of nodes of the first kind.
     pub fn first_kind(&self) -> usize {
         self.reach[0]
     }
 
-    /// Nodes that layer `layer` of `layers` reads, and nodes that it computes.
+    /// Number of nodes that layer `layer` of `layers` reads, and number that it computes.
     pub fn span(&self, layer: usize, layers: usize) -> (usize, usize) {
         (self.reach[layers - layer], self.reach[layers - layer - 1])
     }

@@ -1,4 +1,4 @@
-//! The graph layers an agent can be built of (spec 3), behind one door.
+//! The graph layers of agents behind one type (docs/model.md, "EdgeConv", "AggGNN", "RGCN").
 
 use super::HIDDEN as H;
 use super::batch::{Batch, Rows, RowsMut};
@@ -16,20 +16,20 @@ const W: usize = 96;
 /// A graph layer, H wide at both ends.
 #[derive(Clone, Copy, Debug)]
 pub enum GraphLayer {
-    /// Qedgix.
+    /// The layer of Qedgix.
     EdgeConv(EdgeNet),
     /// The paper's Algorithm 3: x'_i = update(x_i || mean_j com(x_i || x_j)).
     AggGnn {
-        /// Messages.
+        /// Network of the messages.
         com: EdgeNet,
-        /// What is made of them.
+        /// Network that combines a node with its mean message.
         update: Mlp<W>,
     },
     /// The paper's Algorithm 4.
     Rgcn(Rgcn),
 }
 
-/// What backward needs; each kind of layer uses its part.
+/// Values that backward needs. Each kind of layer uses its part.
 #[derive(Debug, Default)]
 pub struct LayerCache<T: Real> {
     edge: EdgeCache<T>,
@@ -38,7 +38,7 @@ pub struct LayerCache<T: Real> {
     rgcn: RgcnCache<T>,
 }
 
-/// Scratch of backward, shared by all layers.
+/// Buffers of backward, shared by all layers.
 #[derive(Debug, Default)]
 pub struct LayerScratch<T: Real> {
     edge: EdgeScratch<T>,
@@ -46,18 +46,18 @@ pub struct LayerScratch<T: Real> {
 }
 
 impl GraphLayer {
-    /// `name.f.*`.
+    /// Adds the parameters `name.f.*`.
     pub fn edge_conv(layout: &mut ParameterLayout, name: &str, mean: bool) -> Self {
         Self::EdgeConv(EdgeNet::new(layout, &format!("{name}.f"), Pairing::Difference, mean))
     }
 
-    /// `name.com.*` and `name.update.*`.
+    /// Adds the parameters `name.com.*` and `name.update.*`.
     pub fn agg_gnn(layout: &mut ParameterLayout, name: &str) -> Self {
         let com = EdgeNet::new(layout, &format!("{name}.com"), Pairing::Plain, true);
         Self::AggGnn { com, update: Mlp::new(layout, &format!("{name}.update"), 2 * H, H) }
     }
 
-    /// `name.root.*` and `name.rel`.
+    /// Adds the parameters `name.root.*` and `name.rel`.
     pub fn rgcn(layout: &mut ParameterLayout, name: &str) -> Self {
         Self::Rgcn(Rgcn::new(layout, name))
     }
@@ -74,17 +74,17 @@ impl GraphLayer {
         }
     }
 
-    /// The products of a forward pass that reads `read` nodes and computes `made`, each as (rows, k, columns).
+    /// The matrix products of a forward pass that reads `read` nodes and computes `made`, each as (rows, k, columns).
     pub fn products(&self, (read, made): (usize, usize)) -> Vec<[usize; 3]> {
         match self {
             Self::EdgeConv(net) => net.products((read, made)).to_vec(),
             Self::AggGnn { com, update } => [&com.products((read, made))[..], &update.products(made)].concat(),
-            // Itself, and its neighbours of either kind.
+            // The node itself and the means over both kinds of neighbours.
             Self::Rgcn(_) => vec![[made, H, H]; 3],
         }
     }
 
-    /// x' of the first `y.len` nodes from x of all of them.
+    /// Writes x' of the first `y.len` nodes, from x of all nodes.
     pub fn forward<T: Real>(&self, w: Weights<'_, T>, graph: &Graph, x: Rows<'_, T>, c: &mut LayerCache<T>, y: RowsMut<'_, T>) {
         match self {
             Self::EdgeConv(net) => net.forward(w, graph, x, &mut c.edge, y),
@@ -98,7 +98,7 @@ impl GraphLayer {
         }
     }
 
-    /// Adds all gradients and writes dx of all nodes read. Spoils `dy` and the cache.
+    /// Adds the gradients of the parameters and writes dx of all nodes read. Overwrites `dy` and the cache.
     pub fn backward<T: Real>(
         &self,
         w: Weights<'_, T>,

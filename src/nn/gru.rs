@@ -1,12 +1,12 @@
-//! `PyTorch`'s `GRUCell` over time, gates in the order reset, update, new:
+//! `PyTorch`'s `GRUCell` over time, gates in the order reset, update, new (docs/model.md, "GRU"):
 //!
 //! ```text
 //! r = sigmoid(Wi_r x + bi_r + Wh_r h + bh_r)      z likewise
 //! q = Wh_n h + bh_n        n = tanh(Wi_n x + bi_n + r q)        h' = (1 - z) n + z h
 //! ```
 //!
-//! Only Wh h walks over time; Wi x is one product over all slots, and so are all gradients of weights, from the gate
-//! gradients of all slots. Samples are time-major: slot t is samples t n .. (t + 1) n.
+//! Only Wh h is computed slot by slot. Wi x and the gradients of all weights are one product over all slots. Samples are
+//! time-major: slot t has samples t n .. (t + 1) n.
 
 use super::HIDDEN as H;
 use super::batch::{Batch, Rows};
@@ -16,10 +16,10 @@ use super::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
 use super::params::{Init, ParameterLayout, Weights};
 use super::real::Real;
 
-/// Numbers kept per sample: r, z, n, q; after backward the gradients before their activations, in the same places.
+/// Numbers per sample: r, z, n, q; after backward, the gradients of their pre-activations.
 const GATES: usize = 4 * H;
 
-/// Offsets of the cell's parameters; input and state are both H wide.
+/// Offsets of the cell's parameters. Input and state have width H.
 #[derive(Clone, Copy, Debug)]
 pub struct Gru {
     weight_ih: usize,
@@ -29,7 +29,7 @@ pub struct Gru {
 }
 
 impl Gru {
-    /// Adds `name.weight_ih`, `weight_hh` (3H, H), `bias_ih`, `bias_hh` (3H), uniform in +-1/sqrt(H).
+    /// Adds the parameters `name.weight_ih`, `weight_hh` (3H, H), `bias_ih`, `bias_hh` (3H), uniform in +-1/sqrt(H).
     pub fn new(layout: &mut ParameterLayout, name: &str) -> Self {
         let init = Init::Uniform(1.0 / (H as f64).sqrt());
         let mut add = |part: &str, shape: &[usize]| layout.add(format!("{name}.{part}"), shape, init);
@@ -41,7 +41,7 @@ impl Gru {
         }
     }
 
-    /// Transposes both weights and joins the biases of r and z.
+    /// Transposes both weights and adds up the two biases of r and of z.
     pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
         for weight in [self.weight_ih, self.weight_hh] {
             transpose(&flat[weight..][..3 * H * H], H, &mut transposed[weight..][..3 * H * H]);
@@ -52,7 +52,7 @@ impl Gru {
         }
     }
 
-    /// Fills `h` from slot 0 on; `h` is (slots + 1) n samples of which the first n hold the state before slot 0.
+    /// Writes the states of all slots to `h`, which has (slots + 1) n samples. Its first n samples are the states before slot 0.
     pub fn forward<T: Real>(&self, w: Weights<'_, T>, x: Rows<'_, T>, slots: usize, gates: &mut Batch<T>, h: &mut Batch<T>) {
         let n = x.len / slots;
         assert_eq!(h.len(), x.len + n, "one block of states before the first slot");
@@ -76,8 +76,8 @@ impl Gru {
         }
     }
 
-    /// Adds the gradients of the weights. `dh` comes in as the gradient of every slot's state from outside and leaves as the
-    /// whole one; `gates` leaves as gradients, of which [`Gru::backward_input`] makes dx.
+    /// Adds the gradients of the weights. `dh` holds the gradient of each slot's state from the layers above on entry, and the
+    /// total gradient on return. `gates` holds gradients on return, from which [`Gru::backward_input`] computes dx.
     pub fn backward<T: Real>(
         &self,
         flat: &[T],
@@ -123,7 +123,7 @@ impl Gru {
         add_rows(rows(3 * H), &mut grads[self.bias_hh + 2 * H..][..H]);
     }
 
-    /// After [`Gru::backward`]: the gradient of x.
+    /// After [`Gru::backward`]: writes the gradient of x.
     pub fn backward_input<T: Real>(&self, flat: &[T], gates: &Batch<T>, dx: &mut Batch<T>) {
         dx.reset(H, gates.len());
         let weight = Rhs { data: &flat[self.weight_ih..][..3 * H * H], stride: H };
@@ -146,7 +146,7 @@ fn step<T: Real>(gates: &mut [T], before: &[T], after: &mut [T]) {
     }
 }
 
-/// Gates become their gradients; what flows to the slot before through z h is added to `carry`, where there is one.
+/// Replaces the gates by their gradients. Adds the gradient that flows through z h to the slot before to `carry`, if it exists.
 #[inline(always)]
 fn step_back<T: Real>(gates: &mut [T], before: &[T], dh: &[T], carry: &mut [T]) {
     let states = before.as_chunks::<H>().0.iter().zip(dh.as_chunks::<H>().0);

@@ -1,12 +1,12 @@
-//! LayerNorm (eps 1e-5, scale g, shift b) followed by ReLU, sample by sample, for widths that are a multiple of 16.
+//! LayerNorm (eps 1e-5, scale g, shift b) followed by ReLU, per sample, for widths that are a multiple of 16.
 //!
-//! y = relu(g n + b) with n = (x - mean) / deviation. Backward, with e = dy g where y > 0 and means over the width:
-//! dx = (e - mean(e) - n mean(e n)) / deviation.
+//! Forward: y = relu(g n + b), n = (x - mean) rstd, rstd = 1 / sqrt(variance + eps).
+//! Backward, with e = dy g if y > 0, else 0, and means over the width: dx = rstd (e - mean(e) - n mean(e n)).
 
 use super::params::{Init, ParameterLayout};
 use super::real::Real;
 
-/// Lanes of a reduction: fixed, so that sums have a fixed order that vector units like.
+/// Number of partial sums of a reduction. It is fixed, so that sums have the same order on every processor.
 const LANES: usize = 16;
 const EPS: f64 = 1e-5;
 
@@ -17,7 +17,7 @@ pub(super) struct LayerNorm<const W: usize> {
     shift: usize,
 }
 
-/// mean and 1 / deviation of a sample.
+/// Mean and reciprocal standard deviation of a sample.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Stats<T> {
     pub(super) mean: T,
@@ -43,7 +43,7 @@ impl<const W: usize> LayerNorm<W> {
         Affine { scale: at(self.scale), shift: at(self.shift) }
     }
 
-    /// Adds gradients gathered in `sums`.
+    /// Adds the gradients in `sums` to `grads`.
     pub(super) fn add_grads<T: Real>(&self, sums: &Affine<T, W>, grads: &mut [T]) {
         grads[self.scale..][..W].iter_mut().zip(&sums.scale).for_each(|(g, &s)| *g += s);
         grads[self.shift..][..W].iter_mut().zip(&sums.shift).for_each(|(g, &s)| *g += s);
@@ -56,7 +56,7 @@ impl<T: Real, const W: usize> Affine<T, W> {
     }
 }
 
-/// Sum of all lanes, in halves.
+/// Sum of all lanes, by repeated halving.
 #[inline(always)]
 fn fold<T: Real>(mut lanes: [T; LANES]) -> T {
     let mut width = LANES / 2;
@@ -99,7 +99,7 @@ pub(super) fn forward<T: Real, const W: usize>(x: &[T; W], s: Stats<T>, p: &Affi
     }
 }
 
-/// dx from x and dy; adds the gradients of scale and shift.
+/// Returns dx from x and dy, and adds the gradients of scale and shift.
 #[inline(always)]
 pub(super) fn backward<T: Real, const W: usize>(
     x: &[T; W],

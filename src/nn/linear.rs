@@ -1,4 +1,4 @@
-//! y = W x + b with W (out, in), as in `PyTorch`. Weights are also kept transposed (in, out) for the forward product.
+//! y = W x + b with W (out, in), as in `PyTorch`. The forward product uses W transposed (in, out).
 
 use super::batch::add_rows;
 use super::batch::{Rows, RowsMut};
@@ -6,7 +6,7 @@ use super::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
 use super::params::{Init, ParameterLayout, Weights};
 use super::real::Real;
 
-/// A linear layer: offsets of its weight and bias in the flat vector.
+/// A linear layer: the offsets of its weight and bias in the flat vector.
 #[derive(Clone, Copy, Debug)]
 pub struct Linear {
     weight: usize,
@@ -18,7 +18,7 @@ pub struct Linear {
 }
 
 impl Linear {
-    /// Adds `name.weight` and `name.bias`, uniform in +-1/sqrt(inputs).
+    /// Adds the parameters `name.weight` and `name.bias`, uniform in +-1/sqrt(inputs).
     pub fn new(layout: &mut ParameterLayout, name: &str, inputs: usize, outputs: usize) -> Self {
         let init = Init::Uniform(1.0 / (inputs as f64).sqrt());
         let weight = layout.add(format!("{name}.weight"), &[outputs, inputs], init);
@@ -26,13 +26,13 @@ impl Linear {
         Self { weight, bias, inputs, outputs }
     }
 
-    /// Writes the transposed weight.
+    /// Writes the transposed weight to `transposed`.
     pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
         let n = self.inputs * self.outputs;
         transpose(&flat[self.weight..][..n], self.inputs, &mut transposed[self.weight..][..n]);
     }
 
-    /// The product of a forward pass over `rows` samples, as (rows, k, columns).
+    /// The matrix product of a forward pass over `rows` samples, as (rows, k, columns).
     pub fn product(&self, rows: usize) -> [usize; 3] {
         [rows, self.inputs, self.outputs]
     }
@@ -67,7 +67,7 @@ impl Linear {
         self.forward_part(w, (0, self.inputs), x, y, Accumulate::Bias(self.bias(w)));
     }
 
-    /// y = start + W[:, from..from + width] x: the share of some inputs.
+    /// y = start + W[:, from..from + width] x, with start from `accumulate`: the contribution of some inputs.
     pub fn forward_part<T: Real>(
         &self,
         w: Weights<'_, T>,
@@ -82,7 +82,7 @@ impl Linear {
         matmul((x.len, width, self.outputs), Lhs::rows(x.data, x.stride), b, c, accumulate);
     }
 
-    /// Adds the gradients of W and b; writes dx where wanted.
+    /// Adds the gradients of W and b. Writes dx if it is given.
     pub fn backward<T: Real>(&self, flat: &[T], x: Rows<'_, T>, dy: Rows<'_, T>, grads: &mut [T], dx: Option<RowsMut<'_, T>>) {
         self.backward_bias(dy, grads);
         self.backward_part((0, self.inputs), x, dy, grads);
@@ -105,7 +105,7 @@ impl Linear {
         matmul((self.outputs, dy.len, width), Lhs::transposed(dy.data, dy.stride), b, c, Accumulate::Add);
     }
 
-    /// dx = start + dy W[:, from..from + width].
+    /// dx = start + dy W[:, from..from + width], with start from `accumulate`.
     pub fn backward_input<T: Real>(
         &self,
         flat: &[T],

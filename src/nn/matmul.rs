@@ -1,12 +1,13 @@
-//! Matrix products, the bulk of the arithmetic: C = A B, C = bias + A B, C += A B.
+//! Matrix products: C = A B, C = bias + A B, C += A B.
 //!
-//! One kernel serves all three products of a layer, because each has a right-hand side whose rows are contiguous:
-//! Y = X Wt (weights transposed once per update), dX = dY W, dW += dYt X. A tile of C stays in vector registers while k
-//! runs. Every element of C is summed over k in one order by fused multiply-adds (even and odd terms apart, which halves
-//! the rounding error's growth and hides latency), whatever the size of the batch or
-//! the place of its row in it. So an answer does not depend on what it was batched with, which serving promises and
-//! general-purpose products (with their special cases for few rows) do not keep. No allocation, no packing, no threads:
-//! callers split the work.
+//! One kernel serves all three products of a layer, because in each the rows of the right-hand side are contiguous:
+//! Y = X Wt (weights are transposed once per update), dX = dY W, dW += dYt X. A tile of C stays in vector registers while the
+//! kernel runs over k.
+//!
+//! Every element of C is summed over k in the same order, for any batch size and any row, by fused multiply-adds. Even and odd
+//! terms are summed separately, which lowers the rounding error and hides latency. So a policy's result for a fleet does not
+//! depend on the other fleets in the batch. General-purpose products have special cases for few rows and do not guarantee this.
+//! The kernel allocates nothing, packs nothing and starts no threads: callers split the work.
 
 use pulp::{Arch, Simd, WithSimd};
 
@@ -50,24 +51,24 @@ pub struct Out<'a, T> {
     pub stride: usize,
 }
 
-/// What the sum over k begins with.
+/// Initial value of the sum over k.
 #[derive(Clone, Copy, Debug)]
 pub enum Accumulate<'a, T> {
     /// 0.
     Zero,
-    /// One number per column.
+    /// A bias per column.
     Bias(&'a [T]),
-    /// What C holds.
+    /// The previous content of C.
     Add,
 }
 
-/// Terms summed before a tile is put back: a panel of B of this height stays in the first-level cache.
+/// Number of terms summed before a tile is stored: a panel of B of this height fits into the first-level cache.
 const DEPTH: usize = 144;
 
-/// C = start + A B for A (m, k), B (k, n).
+/// C = start + A B for A (m, k), B (k, n), with start from `accumulate`.
 ///
 /// # Panics
-/// When a slice is too short for its shape.
+/// If a slice is too short for its shape.
 pub fn matmul<T: Real>(
     (m, k, n): (usize, usize, usize),
     a: Lhs<'_, T>,
@@ -110,7 +111,7 @@ impl<T: Real> WithSimd for Product<'_, T> {
             while j < self.n {
                 let left = self.n - j;
                 let width = left.min(2 * lanes);
-                // Whole vectors have widths known to the compiler, so that only the last columns pay for masks.
+                // For whole vectors the width is known to the compiler, so that only the last columns use masks.
                 if left >= 2 * lanes {
                     self.columns::<S, 2>(simd, k0, depth, j, 2 * lanes);
                 } else if left == lanes {
@@ -136,7 +137,7 @@ impl<T: Real> Product<'_, T> {
     #[inline(always)]
     fn columns<S: Simd, const V: usize>(&mut self, simd: S, k0: usize, depth: usize, j: usize, width: usize) {
         let mut i = 0;
-        // Twice 6 x 2 sums fit into 32 registers, twice 2 x 2 into 16.
+        // Two sets of 6 x 2 sums fit into 32 registers, two sets of 2 x 2 into 16.
         if S::REGISTER_COUNT >= 32 {
             while i + 6 <= self.m {
                 self.tile::<S, 6, V>(simd, (i, j, k0), depth, width);
@@ -218,7 +219,7 @@ impl<T: Real> Product<'_, T> {
             }
             for (row, odd) in sums.iter_mut().zip(&odd) {
                 for (x, &y) in row.iter_mut().zip(odd) {
-                    *x = T::plus(simd, *x, y);
+                    *x = T::add_vectors(simd, *x, y);
                 }
             }
         }
@@ -258,7 +259,7 @@ mod tests {
 
     use super::*;
 
-    /// Row i, column j of start + A B, as the formula reads, in f64.
+    /// Row i, column j of start + A B by the formula, in f64.
     fn naive<T: Real>(k: usize, a: impl Fn(usize) -> T, b: impl Fn(usize) -> T, start: T) -> f64 {
         (0..k).map(|k| a(k).to_f64() * b(k).to_f64()).sum::<f64>() + start.to_f64()
     }

@@ -1,6 +1,6 @@
-//! Linear, LayerNorm, ReLU, Linear: the head of graph agents and the networks of `agggnn`.
+//! Linear, LayerNorm, ReLU, Linear: the head of graph agents, and the update network of `agggnn`.
 //!
-//! The input may come in two parts (x || x'), which are multiplied apart and never concatenated.
+//! The input has two parts (x || x'), which are multiplied separately and never concatenated.
 
 use super::batch::{Batch, Rows, RowsMut};
 use super::layer_norm::{self, Affine, LayerNorm, Stats};
@@ -10,7 +10,7 @@ use super::params::{ParameterLayout, Weights};
 use super::real::Real;
 use super::simd::simd;
 
-/// A network with a hidden layer of W.
+/// A network with a hidden layer of width W.
 #[derive(Clone, Copy, Debug)]
 pub struct Mlp<const W: usize> {
     /// First layer.
@@ -19,7 +19,7 @@ pub struct Mlp<const W: usize> {
     last: Linear,
 }
 
-/// What backward needs, and its scratch.
+/// Values that backward needs, and its buffers.
 #[derive(Debug, Default)]
 pub struct MlpCache<T: Real> {
     before: Batch<T>,
@@ -28,7 +28,7 @@ pub struct MlpCache<T: Real> {
 }
 
 impl<const W: usize> Mlp<W> {
-    /// Adds `name.0`, `name.1` and `name.3`, as `PyTorch` numbers them in a sequence.
+    /// Adds the parameters `name.0`, `name.1` and `name.3`, numbered as in `PyTorch`'s `Sequential`.
     pub fn new(layout: &mut ParameterLayout, name: &str, inputs: usize, outputs: usize) -> Self {
         Self {
             first: Linear::new(layout, &format!("{name}.0"), inputs, W),
@@ -43,7 +43,7 @@ impl<const W: usize> Mlp<W> {
         self.last.prepare(flat, transposed);
     }
 
-    /// The products of a forward pass over `rows` samples, each as (rows, k, columns).
+    /// The matrix products of a forward pass over `rows` samples, each as (rows, k, columns).
     pub fn products(&self, rows: usize) -> [[usize; 3]; 2] {
         [self.first.product(rows), self.last.product(rows)]
     }
@@ -70,7 +70,7 @@ impl<const W: usize> Mlp<W> {
         self.last.forward(w, cache.hidden.rows(), y);
     }
 
-    /// Adds all gradients; afterwards [`Mlp::d_first`] is the gradient at the output of the first layer.
+    /// Adds the gradients of the parameters. Afterwards [`Mlp::d_first`] is the gradient at the output of the first layer.
     pub fn backward<T: Real>(
         &self,
         flat: &[T],
@@ -81,7 +81,7 @@ impl<const W: usize> Mlp<W> {
     ) {
         self.last.backward_bias(dy, grads);
         self.last.backward_part((0, W), cache.hidden.rows(), dy, grads);
-        // The hidden layer has served; its gradient takes its place, then the first layer's that of `before`.
+        // The gradient of the hidden layer overwrites `hidden`, and then that of the first layer overwrites `before`.
         self.last.backward_input(flat, (0, W), dy, cache.hidden.rows_mut(), Accumulate::Zero);
         let affine = self.norm.affine(flat);
         let mut sums = Affine::zero();

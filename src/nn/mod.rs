@@ -1,13 +1,13 @@
-//! Layers with hand-derived gradients: forward beside backward. Pure arithmetic; knows nothing of UAVs.
+//! Layers with hand-derived gradients: `forward` beside `backward`. Pure arithmetic; independent of UAVs.
 //!
-//! Activations live in [`Batch`]es (nalgebra storage, one column per sample). All parameters of a network live in one flat
-//! vector described by a [`ParameterLayout`]; a layer holds offsets into it, so one network serves many threads and any scalar type.
-//! `forward` writes what `backward` needs into buffers of the caller, which are sized once and reused.
+//! Activations are in [`Batch`]es. All parameters of a network are in one flat vector described by a [`ParameterLayout`]. A layer
+//! holds offsets into that vector, so that one network serves many threads and both scalar types. `forward` writes what
+//! `backward` needs into caches of the caller, which are sized once and reused.
 
-// Kernels run inside a function compiled for the processor's vector units; what is not inlined into it loses them. Loops
-// over several fixed-width arrays at once read best with an index. Views are passed by value, as slices are.
+// Code that uses vector units must be inlined into a function that was compiled for them. Loops over several arrays of fixed
+// width use an index. Views are passed by value, as slices are.
 #![allow(clippy::inline_always, clippy::needless_range_loop, clippy::needless_pass_by_value)]
-// Sizes that do not fit together are the caller's bugs; every layer asserts them.
+// Every layer panics if sizes do not fit together: that is a bug of the caller.
 #![allow(clippy::missing_panics_doc)]
 
 mod activations;

@@ -1,4 +1,4 @@
-//! Where each parameter lies in a network's flat vector: name, shape, range, and how it is drawn at first.
+//! The parameters of a network in one flat vector: name, shape, range and initial distribution of each.
 
 use std::ops::Range;
 
@@ -6,14 +6,14 @@ use rand::{Rng, RngExt};
 
 use super::real::Real;
 
-/// How a parameter is drawn at first.
+/// Initial distribution of a parameter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Init {
     /// All equal.
     Constant(f64),
     /// Uniform in [-bound, bound].
     Uniform(f64),
-    /// Normal with mean 0 and this deviation.
+    /// Normal with mean 0 and this standard deviation.
     Normal(f64),
 }
 
@@ -24,7 +24,7 @@ pub struct Parameter {
     pub name: String,
     /// `PyTorch`'s shape; row-major.
     pub shape: Vec<usize>,
-    /// Its place in the flat vector.
+    /// Range in the flat vector.
     pub range: Range<usize>,
     init: Init,
 }
@@ -35,17 +35,17 @@ pub struct ParameterLayout {
     parameters: Vec<Parameter>,
 }
 
-/// A network's flat vector, and the forms derived from it that products need (each layer's `prepare` writes its own).
+/// A network's flat vector, and the forms derived from it that products use. Each layer's `prepare` writes its own forms.
 #[derive(Clone, Copy, Debug)]
 pub struct Weights<'a, T> {
     /// The parameters.
     pub flat: &'a [T],
-    /// As long as `flat`: weights transposed, and other derived forms, at the places of what they derive from.
+    /// Weights transposed, and other derived forms, each at the range of the parameter in `flat`.
     pub transposed: &'a [T],
 }
 
 impl ParameterLayout {
-    /// Appends a parameter and returns where it begins.
+    /// Appends a parameter and returns its offset.
     pub fn add(&mut self, name: impl Into<String>, shape: &[usize], init: Init) -> usize {
         let start = self.len();
         let range = start..start + shape.iter().product::<usize>();
@@ -77,7 +77,7 @@ impl ParameterLayout {
                     Init::Constant(x) => x,
                     Init::Uniform(bound) => bound * (2.0 * rng.random::<f64>() - 1.0),
                     Init::Normal(deviation) => {
-                        // Box and Muller; 1 - u is never 0.
+                        // Box-Muller transform; 1 - u is never 0.
                         let (u, angle) = (1.0 - rng.random::<f64>(), std::f64::consts::TAU * rng.random::<f64>());
                         deviation * (-2.0 * u.ln()).sqrt() * angle.cos()
                     }

@@ -1,8 +1,8 @@
-//! The scalars that networks compute with: f32 in the product, f64 where gradients are checked.
+//! The scalar types of networks: f32 in production, f64 in tests of gradients.
 //!
-//! Owns the elementary functions (exp, tanh, sigmoid) in a form that the compiler turns into vector code: no branches,
-//! no calls. For f32 their relative error stays below 3e-7 (tested here); f64 calls the standard library. Also owns the few
-//! vector operations that the matrix product is written in.
+//! For f32, exp, tanh and sigmoid are written without branches and calls, so that the compiler vectorises them; their relative
+//! error is below 3e-7 (tested here). For f64 they call the standard library. Also has the vector operations that the matrix
+//! product uses.
 
 use std::fmt::{Debug, Display};
 use std::ops::{Add, AddAssign, Div, Mul, MulAssign, Neg, Sub, SubAssign};
@@ -33,12 +33,12 @@ pub trait Real:
     /// 1.
     const ONE: Self;
 
-    /// A vector register of processor kind `S`.
+    /// A vector register of the instruction set `S`.
     type Vector<S: Simd>: Copy;
 
-    /// Rounds to this type.
+    /// Rounds `x` to this type.
     fn from_f64(x: f64) -> Self;
-    /// Widens to f64.
+    /// Converts to f64, exactly.
     fn to_f64(self) -> f64;
     /// self * a + b, rounded once.
     #[must_use]
@@ -74,17 +74,17 @@ pub trait Real:
         if self > Self::ZERO { self } else { Self::ZERO }
     }
 
-    /// Numbers per vector.
+    /// Number of lanes of a vector.
     fn lanes<S: Simd>() -> usize;
     /// `x` in every lane.
     fn splat<S: Simd>(simd: S, x: Self) -> Self::Vector<S>;
-    /// a * b + c in every lane, rounded once where the processor can.
+    /// a * b + c in every lane, rounded once if the instruction set has a fused multiply-add.
     fn fma<S: Simd>(simd: S, a: Self::Vector<S>, b: Self::Vector<S>, c: Self::Vector<S>) -> Self::Vector<S>;
     /// a + b in every lane.
-    fn plus<S: Simd>(simd: S, a: Self::Vector<S>, b: Self::Vector<S>) -> Self::Vector<S>;
-    /// The first lanes from `from`, which may be shorter than a vector; the rest is 0.
+    fn add_vectors<S: Simd>(simd: S, a: Self::Vector<S>, b: Self::Vector<S>) -> Self::Vector<S>;
+    /// Loads the first lanes from `from`. Missing lanes are 0.
     fn load<S: Simd>(simd: S, from: &[Self]) -> Self::Vector<S>;
-    /// Writes as many lanes as `to` is long, at most a vector.
+    /// Stores the first lanes to `to`, as many as fit.
     fn store<S: Simd>(simd: S, to: &mut [Self], x: Self::Vector<S>);
 }
 
@@ -113,10 +113,10 @@ impl Real for f32 {
         f32::sqrt(self)
     }
 
-    /// e^x = 2^n e^r with |r| <= ln 2 / 2; Cephes' polynomial for e^r, 2^n built in the exponent bits.
+    /// e^x = 2^n e^r with |r| <= ln 2 / 2: the Cephes polynomial for e^r, and 2^n by the exponent bits.
     #[inline(always)]
     fn exp(self) -> Self {
-        // Adding 1.5 * 2^23 rounds to the nearest integer and leaves it in the low bits.
+        // Adding 1.5 * 2^23 rounds to the nearest integer, which is then in the low bits.
         const ROUND: f32 = 12_582_912.0;
         const LN2_HIGH: f32 = 0.693_359_4;
         const LN2_LOW: f32 = -2.121_944_4e-4;
@@ -135,7 +135,7 @@ impl Real for f32 {
         p * f32::from_bits((shifted.to_bits() << 23).wrapping_add(0x3f80_0000))
     }
 
-    /// An odd polynomial near 0 (Cephes), 1 - 2 / (e^2|x| + 1) elsewhere.
+    /// The Cephes polynomial for |x| < 0.625, else 1 - 2 / (e^2|x| + 1) with the sign of x.
     #[inline(always)]
     fn tanh(self) -> Self {
         let a = self.abs();
@@ -166,7 +166,7 @@ impl Real for f32 {
     }
 
     #[inline(always)]
-    fn plus<S: Simd>(simd: S, a: S::f32s, b: S::f32s) -> S::f32s {
+    fn add_vectors<S: Simd>(simd: S, a: S::f32s, b: S::f32s) -> S::f32s {
         simd.add_f32s(a, b)
     }
 
@@ -238,7 +238,7 @@ impl Real for f64 {
     }
 
     #[inline(always)]
-    fn plus<S: Simd>(simd: S, a: S::f64s, b: S::f64s) -> S::f64s {
+    fn add_vectors<S: Simd>(simd: S, a: S::f64s, b: S::f64s) -> S::f64s {
         simd.add_f64s(a, b)
     }
 
@@ -273,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn elementary_functions_keep_their_error_bound() {
+    fn elementary_functions_are_within_their_error_bound() {
         let exp = worst(87.0, Real::exp, f64::exp);
         let tanh = worst(12.0, Real::tanh, f64::tanh);
         let tanh_near_zero = worst(1e-2, Real::tanh, f64::tanh);

@@ -1,7 +1,7 @@
-//! Relational graph convolution (the paper's Algorithm 4): x'_i = W_0 x_i + b + sum_r mean_{j in N_r(i)} x_j R_r.
+//! Relational graph convolution (docs/model.md, "RGCN"): x'_i = W_0 x_i + b + sum_r mean_{j in N_r(i)} x_j W_r.
 //!
-//! The relation is the kinds of both ends: first-first, mixed, second-second. So a node has two means, over its
-//! neighbours of the first kind and over those of the second, and products run once per node.
+//! The relation of an edge is given by the kinds of its two nodes: first-first, mixed, second-second. A node has two means,
+//! over its neighbours of the first kind and of the second kind, so that products run once per node.
 
 use super::HIDDEN as H;
 use super::batch::{Batch, Rows, RowsMut};
@@ -19,20 +19,20 @@ pub struct Rgcn {
     rel: usize,
 }
 
-/// Means over neighbours of the first and of the second kind; in backward their gradients.
+/// Means over the neighbours of the first and of the second kind; in backward their gradients.
 #[derive(Debug, Default)]
 pub struct RgcnCache<T: Real> {
     means: Batch<T>,
 }
 
 impl Rgcn {
-    /// Adds `name.root` and `name.rel` (3, H, H), which multiplies from the right.
+    /// Adds the parameters `name.root` and `name.rel` (3, H, H). `rel` multiplies from the right.
     pub fn new(layout: &mut ParameterLayout, name: &str) -> Self {
         let root = Linear::new(layout, &format!("{name}.root"), H, H);
         Self { root, rel: layout.add(format!("{name}.rel"), &[3, H, H], Init::Normal(1.0 / (H as f64).sqrt())) }
     }
 
-    /// Transposes, which only backward needs of the relations.
+    /// Transposes all weights. Those of the relations are needed in backward only.
     pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
         self.root.prepare(flat, transposed);
         for at in (self.rel..).step_by(H * H).take(3) {
@@ -40,13 +40,13 @@ impl Rgcn {
         }
     }
 
-    /// The two runs of nodes with the same kind, each with its relations to the first and to the second kind.
+    /// The range of nodes of each kind, with its relations to nodes of the first and of the second kind.
     fn runs(graph: &Graph, nodes: usize) -> [(std::ops::Range<usize>, [usize; 2]); 2] {
         let first = graph.first_kind().min(nodes);
         [(0..first, [0, 1]), (first..nodes, [1, 2])]
     }
 
-    /// x' of the first `y.len` nodes.
+    /// Writes x' of the first `y.len` nodes, from x of all nodes.
     pub fn forward<T: Real>(
         &self,
         w: Weights<'_, T>,
@@ -79,7 +79,7 @@ impl Rgcn {
         }
     }
 
-    /// Adds all gradients and writes dx of all nodes read. Spoils the cache.
+    /// Adds the gradients of the parameters and writes dx of all nodes read. Overwrites the cache.
     pub fn backward<T: Real>(
         &self,
         w: Weights<'_, T>,
@@ -117,7 +117,7 @@ impl Rgcn {
     }
 }
 
-/// Adds `share` times `from` to `to`, both H wide.
+/// Adds `share` times `from` to `to`, both of width H.
 #[inline(always)]
 fn add_share<T: Real>(from: &[T], share: T, to: &mut [T]) {
     for (to, &from) in to[..H].iter_mut().zip(&from[..H]) {
@@ -125,7 +125,7 @@ fn add_share<T: Real>(from: &[T], share: T, to: &mut [T]) {
     }
 }
 
-/// Neighbours of a node: kind, index, and weight in the mean over that kind.
+/// Neighbours of node `i`: kind, index, and weight in the mean over that kind.
 #[inline(always)]
 fn neighbours<T: Real>(graph: &Graph, i: usize) -> impl Iterator<Item = (usize, usize, T)> {
     let all = graph.neighbours(i);
