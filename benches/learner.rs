@@ -24,7 +24,7 @@ fn config(algorithm: Algorithm) -> TrainConfig {
 /// Networks that fly a fleet of any size.
 fn sized(uavs: usize, users: usize, range: f64) -> TrainConfig {
     let mut config = config(Algorithm::Qedgix);
-    config.training.observation = Observation::Set;
+    config.training.observation = ObservationKind::Set;
     config.training.identity = Identity::Phase;
     config.training.mixer = MixerKind::Invariant;
     config.environment.uavs = uavs;

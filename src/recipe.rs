@@ -209,7 +209,7 @@ impl TrainConfig {
                 environment.hover = true;
             }
             Preset::Practical => {
-                training.observation = Observation::Set;
+                training.observation = ObservationKind::Set;
                 training.identity = Identity::Phase;
                 training.self_position = true;
                 training.learning_rate = 1e-3;

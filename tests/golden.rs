@@ -297,7 +297,7 @@ fn check_features(config: &Config, episodes: &Episodes, tensors: &mut Tensors<'_
     if golden != visible {
         return Err(format!("out.visible differs in {} pairs", golden.iter().zip(&visible).filter(|(a, b)| a != b).count()));
     }
-    if config.agent.observation == Observation::Flat {
+    if config.agent.observation == ObservationKind::Flat {
         report.compare("out.obs", &observations, &tensors.f32("out.obs", &[b, k + 1, nodes, width])?, EXACT);
         report.compare("out.state", &state, &tensors.f32("out.state", &[b, k + 1, width])?, EXACT);
     }

@@ -178,7 +178,7 @@ fn actor_policy_and_update_see_the_same_values() {
                 assert_eq!(q, served, "slot {t}, {config:?}");
 
                 let actions = &ep.actions[(e * slots + t) * m..][..m];
-                actor.acted(actions);
+                actor.record_actions(actions);
                 // Replay what the episode did instead of the greedy heading.
                 let stride = memory.len() / m;
                 memory.chunks_exact_mut(stride).zip(actions).for_each(|(uav, &a)| uav[HIDDEN] = f32::from(a));

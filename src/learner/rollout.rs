@@ -99,7 +99,7 @@ impl Rollout {
                 *action =
                     if explorer.random::<f64>() < epsilon { explorer.random_range(0..headings as u8) } else { argmax(q) as u8 };
             }
-            self.actor.acted(&self.actions);
+            self.actor.record_actions(&self.actions);
             self.env.step(&self.actions);
             self.record_step();
             self.record_scene();

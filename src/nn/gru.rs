@@ -9,12 +9,12 @@
 //! time-major: slot t has samples t n .. (t + 1) n.
 
 use super::HIDDEN as H;
-use super::batch::{Batch, Rows};
-use super::kernels::{add_rows, simd};
+use super::batch::{Batch, Rows, add_rows};
 use super::linear::transpose;
 use super::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
 use super::params::{Init, ParameterLayout, Weights};
 use super::real::Real;
+use super::simd::simd;
 
 /// Numbers per sample: r, z, n, q; after backward, the gradients of their pre-activations.
 const GATES: usize = 4 * H;

@@ -1,4 +1,4 @@
-//! Batched rollout: B equal fleets act together, slot after slot, with no allocation per step.
+//! An agent that acts for B fleets of equal size at once, slot by slot, without allocation per step. Used by rollouts.
 
 use super::agent::{Agent, AgentCache};
 use super::config::TOKEN;
@@ -6,7 +6,7 @@ use super::features::{Inputs, NO_ACTION};
 use super::geometry::Geometry;
 use crate::nn::{HIDDEN, Weights};
 
-/// What B fleets see in one slot.
+/// The scenes of B fleets in one slot.
 #[derive(Clone, Copy, Debug)]
 pub struct StepInput<'a> {
     /// (B, M, 2) UAV positions.
@@ -17,7 +17,7 @@ pub struct StepInput<'a> {
     pub aoi: &'a [f32],
 }
 
-/// B fleets of an agent's own size: their hidden states and last actions, and all buffers.
+/// Hidden states, last actions and buffers of B fleets of the size that the agent was made for.
 #[derive(Debug)]
 pub struct Actor {
     fleets: usize,
@@ -31,7 +31,7 @@ pub struct Actor {
 }
 
 impl Actor {
-    /// Room for `fleets` fleets; call [`Actor::begin`] before the first step.
+    /// Allocates for `fleets` fleets. Call [`Actor::begin`] before the first step.
     pub fn new(agent: &Agent, fleets: usize) -> Self {
         let (len, rows) = (agent.layout().len(), fleets * agent.dims().uavs);
         Self {
@@ -46,10 +46,10 @@ impl Actor {
         }
     }
 
-    /// Begins an episode, to be flown with these parameters. `token` is (B, M, 4), used by agents with that identity.
+    /// Starts an episode with the parameters `params`. `token` is (B, M, 4) and is used only with identity `token`.
     ///
     /// # Panics
-    /// When a length does not fit.
+    /// If a length does not fit.
     pub fn begin(&mut self, agent: &Agent, params: &[f32], token: &[f32]) {
         self.flat.copy_from_slice(params);
         agent.prepare(&self.flat, &mut self.transposed);
@@ -58,10 +58,10 @@ impl Actor {
         self.last.fill(NO_ACTION);
     }
 
-    /// Q-values (B, M, A) of the next slot; advances the hidden states.
+    /// Returns the Q-values (B, M, A) of the next slot and advances the hidden states.
     ///
     /// # Panics
-    /// When a length does not fit.
+    /// If a length does not fit.
     pub fn step(&mut self, agent: &Agent, input: StepInput<'_>) -> &[f32] {
         let (m, n) = (agent.dims().uavs, agent.dims().users);
         let lengths = (input.uav_xy.len(), input.user_xy.len(), input.aoi.len());
@@ -82,11 +82,11 @@ impl Actor {
         self.cache.q.as_slice()
     }
 
-    /// Records the actions taken (B, M), the next slot's last actions.
+    /// Records the actions taken (B, M), which are inputs of the next slot.
     ///
     /// # Panics
-    /// When there is not one per UAV.
-    pub fn acted(&mut self, actions: &[u8]) {
+    /// If the number of actions is not B M.
+    pub fn record_actions(&mut self, actions: &[u8]) {
         self.last.copy_from_slice(actions);
     }
 }

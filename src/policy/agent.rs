@@ -1,12 +1,12 @@
-//! The agent (spec 3): parameters shared by all UAVs; only the GRU walks over time.
+//! The agent (docs/model.md, "Agents"). Its parameters are shared by all UAVs; only the GRU carries state from slot to slot.
 //!
 //! ```text
 //! x = relu(fc(input))        h_k = GRU(x, h_{k-1})
 //! no graph:    Q = head(h)
-//! with one:    y = leaky(w1 h) for UAVs, leaky(w2 obs) for users; graph layers with ReLU between; Q = head(h || y)
+//! with graph:  y = leaky(w1 h) for UAVs, leaky(w2 obs) for users; graph layers with ReLU between; Q = head(h || y)
 //! ```
 //!
-//! All slots of all fleets go through each layer at once. UAV rows are time-major: slot, fleet, UAV.
+//! Each layer computes all slots of all fleets at once. UAV rows are time-major: slot, fleet, UAV.
 
 use super::config::{AgentConfig, Aggregation, Gnn, Identity, ObservationKind};
 use super::features::{Inputs, SetEncoder, flat_observation, identity_width, write_rest};
@@ -19,7 +19,7 @@ use crate::nn::{
     leaky_relu, leaky_relu_back, relu, relu_back,
 };
 
-/// Sizes of the fleet and the environment that an agent is made for.
+/// Sizes of the fleet and parameters of the environment that an agent is made for.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Dims {
     /// M.
@@ -30,11 +30,11 @@ pub struct Dims {
     pub actions: usize,
     /// d.
     pub detection_range: f64,
-    /// K, what AoI is divided by.
+    /// K, by which AoI is divided.
     pub slots: usize,
 }
 
-/// An agent's architecture and where its parameters lie.
+/// An agent's architecture and the layout of its parameters.
 #[derive(Clone, Debug)]
 pub struct Agent {
     config: AgentConfig,
@@ -45,7 +45,7 @@ pub struct Agent {
     rnn: Gru,
     body: Body,
     /// Width of an observation.
-    observation: usize,
+    observation_width: usize,
 }
 
 #[derive(Clone, Debug)]
@@ -54,10 +54,10 @@ enum Body {
     Graph { w1: Linear, w2: Linear, layers: Vec<GraphLayer>, head: Mlp<HIDDEN> },
 }
 
-/// Activations of one forward pass, and scratch of its backward pass.
+/// Activations of one forward pass, and buffers of its backward pass.
 #[derive(Debug, Default)]
 pub struct AgentCache<T: Real> {
-    /// (slots + 1) blocks of hidden states: before the first slot, then after each.
+    /// (slots + 1) blocks of hidden states: before the first slot, then after each slot.
     pub h: Batch<T>,
     /// Q-values, A per UAV row.
     pub q: Batch<T>,
@@ -65,7 +65,7 @@ pub struct AgentCache<T: Real> {
     user_obs: Batch<T>,
     x: Batch<T>,
     gates: Batch<T>,
-    /// Input of each graph layer; the last is the output of the last.
+    /// Input of each graph layer, then the output of the last one.
     y: Vec<Batch<T>>,
     layers: Vec<LayerCache<T>>,
     head: MlpCache<T>,
@@ -84,7 +84,7 @@ struct Scratch<T: Real> {
 }
 
 impl<T: Real> AgentCache<T> {
-    /// Makes room for `slots` slots of `rows` UAVs, and returns the hidden state before the first, to be filled in.
+    /// Allocates for `slots` slots of `rows` UAVs, and returns the hidden states before the first slot for the caller to fill in.
     pub fn begin(&mut self, rows: usize, slots: usize) -> &mut [T] {
         self.h.reset(HIDDEN, rows * (slots + 1));
         &mut self.h.as_mut_slice()[..rows * HIDDEN]
@@ -97,12 +97,12 @@ impl<T: Real> AgentCache<T> {
 }
 
 impl Agent {
-    /// The agent's own layout: `agent.*`.
+    /// The agent with its own layout, `agent.*`.
     pub fn new(config: AgentConfig, dims: Dims) -> Self {
         let mut layout = ParameterLayout::default();
         let m = dims.uavs;
-        let sets =
-            (config.observation == Observation::Set).then(|| SetEncoder::new(&mut layout, "agent.sets", dims.detection_range));
+        let sets = (config.observation == ObservationKind::Set)
+            .then(|| SetEncoder::new(&mut layout, "agent.sets", dims.detection_range));
         let observation = if sets.is_some() { SetEncoder::WIDTH } else { 2 * m + 3 * dims.users };
         let position = if config.self_position { 2 } else { 0 };
         let input = observation + dims.actions + identity_width(config.identity, m) + position;
@@ -122,36 +122,36 @@ impl Agent {
             let layers = (0..config.layers).map(|l| layer(&mut layout, &format!("agent.layers.{l}"))).collect();
             Body::Graph { w1, w2, layers, head: Mlp::new(&mut layout, "agent.head", 2 * HIDDEN, dims.actions) }
         };
-        Self { config, dims, layout, sets, fc, rnn, body, observation }
+        Self { config, dims, layout, sets, fc, rnn, body, observation_width: observation }
     }
 
-    /// Its architecture.
+    /// The architecture.
     pub fn config(&self) -> &AgentConfig {
         &self.config
     }
 
-    /// What it was made for.
+    /// The sizes that the agent was made for.
     pub fn dims(&self) -> &Dims {
         &self.dims
     }
 
-    /// Its parameters.
+    /// The layout of the parameters.
     pub fn layout(&self) -> &ParameterLayout {
         &self.layout
     }
 
-    /// How geometries must be built for it.
+    /// Configuration of geometries for this agent.
     pub fn geometry(&self) -> GeometryConfig {
         let layers = if self.config.gnn == Gnn::None { 0 } else { self.config.layers };
         let Dims { detection_range, slots, .. } = self.dims;
         GeometryConfig { range: detection_range, slots, layers, self_loops: self.config.self_loops, hops: self.config.hops }
     }
 
-    /// Whether it fits a fleet: with flat observations only the one it was made for, with one-hot identities only its number
-    /// of UAVs, otherwise any.
+    /// Checks whether the agent fits a fleet. With flat observations, M and N must be those that the agent was made for; with one-hot
+    /// identities, M must be. Otherwise any fleet fits.
     ///
     /// # Errors
-    /// The count that does not fit, and what would.
+    /// [`Invalid`] for the count that does not fit.
     pub fn check_fleet(&self, uavs: usize, users: usize) -> Result<(), Invalid> {
         let flat = self.sets.is_none();
         let exact = |field: &str, count: usize, fits: usize| {
@@ -173,7 +173,7 @@ impl Agent {
         Ok(())
     }
 
-    /// Fills `transposed` (see [`Weights`]); both are as long as the layout, or longer.
+    /// Fills `transposed` (see [`Weights`]). Both vectors have at least the length of the layout.
     pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
         if let Some(sets) = &self.sets {
             sets.prepare(flat, transposed);
@@ -191,7 +191,7 @@ impl Agent {
         }
     }
 
-    /// What relative positions of flat observations are multiplied with.
+    /// Factor of relative positions in flat observations.
     fn flat_scale(&self) -> f64 {
         if self.config.normalise { 1.0 / self.dims.detection_range } else { 1.0 }
     }
@@ -208,13 +208,13 @@ impl Agent {
             Some(sets) => sets.forward(w, (geometry, first), search, (out, stride)),
             None => {
                 for (r, out) in out.chunks_exact_mut(stride).enumerate() {
-                    flat_observation(&geometry.view(first + r, search), self.flat_scale(), &mut out[..self.observation]);
+                    flat_observation(&geometry.view(first + r, search), self.flat_scale(), &mut out[..self.observation_width]);
                 }
             }
         }
     }
 
-    /// The matrix products of a forward pass over `slots` slots, each as (rows, k, columns): what an update cannot do without.
+    /// The matrix products of a forward pass over `slots` slots, each as (rows, k, columns). Benchmarks measure them alone.
     pub fn products(&self, geometry: &Geometry, slots: usize) -> Vec<[usize; 3]> {
         let (uavs, graph) = (geometry.uav_rows(), geometry.graph());
         let mut products = vec![self.fc.product(uavs), [uavs, HIDDEN, 3 * HIDDEN]];
@@ -230,14 +230,14 @@ impl Agent {
         products
     }
 
-    /// Q-values and hidden states of `slots` slots; [`AgentCache::begin`] has been called.
+    /// Computes Q-values and hidden states of `slots` slots. [`AgentCache::begin`] must have been called.
     pub fn forward<T: Real>(&self, w: Weights<'_, T>, inputs: &Inputs<'_>, slots: usize, c: &mut AgentCache<T>) {
         let uavs = inputs.geometry.uav_rows();
         let rows = inputs.geometry.rows();
         c.input.reset(self.fc.inputs, uavs);
         self.observe(w, (inputs.geometry, 0), &mut c.search, (c.input.as_mut_slice(), self.fc.inputs));
         for (r, input) in c.input.as_mut_slice().chunks_exact_mut(self.fc.inputs).enumerate() {
-            write_rest(&self.config, self.dims.actions, inputs, r, &mut input[self.observation..]);
+            write_rest(&self.config, self.dims.actions, inputs, r, &mut input[self.observation_width..]);
         }
         c.x.reset(HIDDEN, uavs);
         self.fc.forward(w, c.input.rows(), c.x.rows_mut());
@@ -249,8 +249,8 @@ impl Agent {
             Body::Plain { head } => head.forward(w, h, c.q.rows_mut()),
             Body::Graph { w1, w2, layers, head } => {
                 let graph = inputs.geometry.graph();
-                c.user_obs.reset(self.observation, rows - uavs);
-                let out = (c.user_obs.as_mut_slice(), self.observation);
+                c.user_obs.reset(self.observation_width, rows - uavs);
+                let out = (c.user_obs.as_mut_slice(), self.observation_width);
                 self.observe(w, (inputs.geometry, uavs), &mut c.search, out);
                 c.y.resize_with(layers.len() + 1, Batch::default);
                 c.layers.resize_with(layers.len(), LayerCache::default);
@@ -271,7 +271,7 @@ impl Agent {
         }
     }
 
-    /// Adds the gradients of all parameters, given those of the Q-values of the last forward pass. Spoils the cache.
+    /// Adds the gradients of all parameters, given those of the Q-values of the last forward pass. Overwrites the cache.
     pub fn backward<T: Real>(
         &self,
         w: Weights<'_, T>,
@@ -307,7 +307,7 @@ impl Agent {
                 w1.backward_part((0, HIDDEN), h, own, grads);
                 w1.backward_input(w.flat, (0, HIDDEN), own, s.dh.rows_mut(), Accumulate::Add);
                 w2.backward_bias(users, grads);
-                w2.backward_part((0, self.observation), c.user_obs.rows(), users, grads);
+                w2.backward_part((0, self.observation_width), c.user_obs.rows(), users, grads);
                 if let Some(sets) = &self.sets {
                     s.observation.reset(SetEncoder::WIDTH, users.len);
                     w2.backward_input(w.flat, (0, SetEncoder::WIDTH), users, s.observation.rows_mut(), Accumulate::Zero);
@@ -327,7 +327,7 @@ impl Agent {
     }
 }
 
-/// Hidden states after each slot.
+/// The hidden states after each slot.
 fn hidden<T: Real>(h: &Batch<T>, uavs: usize) -> Rows<'_, T> {
     h.range(h.len() - uavs..h.len())
 }

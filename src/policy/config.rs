@@ -1,19 +1,19 @@
-//! The agent's architecture as configuration (spec 2 and 3).
+//! Configuration of the agent's architecture (docs/model.md, "Observations" and "Agents").
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-/// The graph layer of an agent (spec 3).
+/// The graph layer of an agent (docs/model.md, "Agents").
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Gnn {
-    /// No graph: the QMIX / VDN agent.
+    /// No graph: the agent of `qmix`, `vdn` and `iql`.
     None,
     /// `EdgeConv`, the layer of Qedgix.
     EdgeConv,
-    /// Messages and an update network (the paper's Algorithm 3).
+    /// Messages and an update network, the paper's Algorithm 3.
     AggGnn,
-    /// Relational graph convolution (the paper's Algorithm 4).
+    /// Relational graph convolution, the paper's Algorithm 4.
     Rgcn,
 }
 
@@ -21,24 +21,24 @@ pub enum Gnn {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Aggregation {
-    /// Divided by the number of neighbours.
+    /// The mean over the neighbours.
     Mean,
-    /// As the paper writes it.
+    /// The sum, as in the paper.
     Sum,
 }
 
-/// What a node is told of what it sees.
+/// Form of a node's observation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 #[schema(as = Observation)]
 pub enum ObservationKind {
-    /// One fixed place per entity, width 2M + 3N (spec 2.1); ties a checkpoint to (M, N).
+    /// One fixed place per entity, width 2M + 3N (docs/model.md, "Flat observation"). Ties a checkpoint to one (M, N).
     Flat,
-    /// Sums of embeddings, width 128 (spec 2.2); any M and N.
+    /// Sums of embeddings, width 128 (docs/model.md, "Set observation"). Fits any M and N.
     Set,
 }
 
-/// What tells UAVs with equal observations apart (spec 2.4).
+/// Distinguishes UAVs with equal observations (docs/model.md, "Identity").
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Identity {
@@ -48,7 +48,7 @@ pub enum Identity {
     Phase,
     /// Four numbers drawn per UAV and episode.
     Token,
-    /// Nothing: a fleet that starts at one point never parts.
+    /// None: UAVs that start at one point always make the same moves.
     None,
 }
 
@@ -57,13 +57,13 @@ pub const TOKEN: usize = 4;
 /// H, the hidden width.
 pub const HIDDEN: usize = crate::nn::HIDDEN;
 
-/// Architecture of the agents, shared by all UAVs (spec 3).
+/// Architecture of the agents, shared by all UAVs (docs/model.md, "Agents").
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AgentConfig {
     /// Graph layer.
     pub gnn: Gnn,
-    /// Number of graph layers, at least 1 (ignored without a graph).
+    /// Number of graph layers, at least 1. Ignored without a graph.
     pub layers: usize,
     /// Aggregation of `edgeconv`.
     pub aggregation: Aggregation,
@@ -71,12 +71,12 @@ pub struct AgentConfig {
     pub observation: ObservationKind,
     /// Identity of a UAV.
     pub identity: Identity,
-    /// Whether a UAV knows its own position.
+    /// Whether a UAV's input has its own position.
     pub self_position: bool,
     /// Whether a node is its own neighbour.
     pub self_loops: bool,
-    /// Links over which a UAV observes; more than 1 only without a graph layer.
+    /// Number of links over which a UAV observes. More than 1 only without a graph layer.
     pub hops: usize,
-    /// Whether relative positions are in units of d in flat observations too, and own positions in [-1, 1].
+    /// Whether flat observations have relative positions in units of d, and own positions are scaled to [-1, 1].
     pub normalise: bool,
 }

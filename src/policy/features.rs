@@ -1,34 +1,35 @@
-//! What a node's network is fed (spec 2.1, 2.2, 2.4): observations, last action, identity, own position.
+//! The inputs of a node's network: observation, last action, identity, own position (docs/model.md, "Observations").
 
 use super::config::{AgentConfig, Identity, TOKEN};
 use super::geometry::{Geometry, NodeView};
 use super::hop_search::HopSearch;
 use crate::nn::{Embedding, EmbeddingGrad, HIDDEN, ParameterLayout, Real, Rows, Weights, simd};
 
-/// Last action of a UAV that has not acted yet.
+/// Last action of a UAV in slot 0.
 pub const NO_ACTION: u8 = u8::MAX;
 
-/// One batch of inputs: geometry, and what UAV rows know beside it.
+/// A batch of inputs: the geometry, and the other inputs of each UAV row.
 #[derive(Clone, Copy, Debug)]
 pub struct Inputs<'a> {
-    /// Who sees whom; its first rows are the UAVs.
+    /// Detections; the first rows are the UAVs.
     pub geometry: &'a Geometry,
-    /// Last action per UAV row, [`NO_ACTION`] at slot 0.
+    /// Last action per UAV row, [`NO_ACTION`] in slot 0.
     pub last: &'a [u8],
-    /// Identity token per UAV row, where the agent has one.
+    /// Identity token per UAV row; used with identity `token`.
     pub token: &'a [f32],
-    /// Own position (x, y) per UAV row, where the agent knows it.
+    /// Own position (x, y) per UAV row; used with `self_position`.
     pub position: &'a [f32],
 }
 
-/// Writes the flat observation (spec 2.1) of one node, 2M + 3N wide; relative positions times `scale`.
+/// Writes the flat observation of one node, of width 2M + 3N (docs/model.md, "Flat observation"). Relative positions are multiplied
+/// by `scale`.
 pub fn flat_observation<T: Real>(view: &NodeView<'_>, scale: f64, out: &mut [T]) {
     out.fill(T::ZERO);
     let uavs = view.fleet.uavs;
     let scaled = |x: f32| T::from_f64(f64::from(x) * scale);
-    let (seen_uavs, seen_users) = out.split_at_mut(2 * uavs);
+    let (detected_uavs, detected_users) = out.split_at_mut(2 * uavs);
     let mut user = |j: usize, rel: [f32; 2]| {
-        seen_users[3 * j..3 * j + 3].copy_from_slice(&[scaled(rel[0]), scaled(rel[1]), T::from_f64(view.aoi[j].into())]);
+        detected_users[3 * j..3 * j + 3].copy_from_slice(&[scaled(rel[0]), scaled(rel[1]), T::from_f64(view.aoi[j].into())]);
     };
     if view.node >= uavs {
         user(view.node - uavs, [0.0; 2]);
@@ -37,12 +38,12 @@ pub fn flat_observation<T: Real>(view: &NodeView<'_>, scale: f64, out: &mut [T])
         let target = d.target as usize;
         match target.checked_sub(uavs) {
             Some(j) => user(j, d.rel),
-            None => seen_uavs[2 * target..2 * target + 2].copy_from_slice(&d.rel.map(scaled)),
+            None => detected_uavs[2 * target..2 * target + 2].copy_from_slice(&d.rel.map(scaled)),
         }
     }
 }
 
-/// Writes the flat state (spec 2.3) of a fleet, 2M + 3N wide: positions as (x, y) each, AoI in slots, K slots.
+/// Writes the flat state of a fleet, of width 2M + 3N (docs/model.md, "Flat state"). `aoi` is in slots, `slots` is K.
 pub fn flat_state<T: Real>(uav_xy: &[f32], user_xy: &[f32], aoi: &[f32], slots: usize, out: &mut [T]) {
     let (uavs, users) = out.split_at_mut(uav_xy.len());
     uavs.iter_mut().zip(uav_xy).for_each(|(s, &x)| *s = T::from_f64(x.into()));
@@ -51,7 +52,7 @@ pub fn flat_state<T: Real>(uav_xy: &[f32], user_xy: &[f32], aoi: &[f32], slots: 
     }
 }
 
-/// Writes what follows the observation in a UAV's input (spec 2.4).
+/// Writes the part of a UAV's input that follows the observation (docs/model.md, "UAV input").
 pub(super) fn write_rest<T: Real>(config: &AgentConfig, actions: usize, inputs: &Inputs<'_>, row: usize, out: &mut [T]) {
     out.fill(T::ZERO);
     let (last, rest) = out.split_at_mut(actions);
@@ -80,7 +81,7 @@ pub(super) fn write_rest<T: Real>(config: &AgentConfig, actions: usize, inputs: 
     }
 }
 
-/// Width of an identity among `uavs` UAVs.
+/// Width of the identity in a fleet of `uavs` UAVs.
 pub(super) fn identity_width(identity: Identity, uavs: usize) -> usize {
     match identity {
         Identity::Onehot => uavs,
@@ -90,7 +91,7 @@ pub(super) fn identity_width(identity: Identity, uavs: usize) -> usize {
     }
 }
 
-/// The set observation (spec 2.2): sums of embeddings of visible UAVs, and of visible users.
+/// The set observation: sums of embeddings of detected UAVs and of detected users (docs/model.md, "Set observation").
 #[derive(Clone, Copy, Debug)]
 pub struct SetEncoder {
     uav: Embedding<2>,
@@ -113,7 +114,7 @@ impl SetEncoder {
         self.user.prepare(flat, transposed);
     }
 
-    /// Observations of rows `first` and on, into the first columns of rows of `stride` numbers.
+    /// Writes the observations of rows `first` and following to the first columns of `out`, whose rows are `stride` apart.
     pub(super) fn forward<T: Real>(
         &self,
         w: Weights<'_, T>,
@@ -133,7 +134,7 @@ impl SetEncoder {
         );
     }
 
-    /// Adds gradients, given those of the observations of rows `first` and on.
+    /// Adds the gradients of the parameters, given those of the observations of rows `first` and following.
     pub(super) fn backward<T: Real>(
         &self,
         w: Weights<'_, T>,
@@ -167,7 +168,7 @@ fn encode<T: Real>(
     (uav_sum, user_sum): (&mut [T; HIDDEN], &mut [T; HIDDEN]),
 ) {
     let (mut uavs, mut users) = ([T::ZERO; HIDDEN], [T::ZERO; HIDDEN]);
-    each_seen(view, scale, |point| uav.add(point, &mut uavs), |point| user.add(point, &mut users));
+    for_each_detected(view, scale, |point| uav.add(point, &mut uavs), |point| user.add(point, &mut users));
     *uav_sum = uavs;
     *user_sum = users;
 }
@@ -180,12 +181,12 @@ fn encode_back<T: Real>(
     (d_uav, d_user): (&[T; HIDDEN], &[T; HIDDEN]),
     (uav_sums, user_sums): (&mut EmbeddingGrad<T, 2>, &mut EmbeddingGrad<T, 3>),
 ) {
-    each_seen(view, scale, |point| uav.backward(point, d_uav, uav_sums), |point| user.backward(point, d_user, user_sums));
+    for_each_detected(view, scale, |point| uav.backward(point, d_uav, uav_sums), |point| user.backward(point, d_user, user_sums));
 }
 
-/// Every entity a node sees; a user sees itself.
+/// Calls `uav` or `user` for every node that the view's node detects. A user also observes itself.
 #[inline(always)]
-fn each_seen<T: Real>(view: &NodeView<'_>, scale: f64, mut uav: impl FnMut([T; 2]), mut user: impl FnMut([T; 3])) {
+fn for_each_detected<T: Real>(view: &NodeView<'_>, scale: f64, mut uav: impl FnMut([T; 2]), mut user: impl FnMut([T; 3])) {
     let m = view.fleet.uavs;
     let aoi = |node: usize| T::from_f64(view.aoi[node - m].into());
     if view.node >= m {

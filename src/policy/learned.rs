@@ -1,6 +1,6 @@
-//! A trained agent as a [`Policy`]: a ragged batch of fleets in one forward pass.
+//! A trained agent as a [`Policy`]. One forward pass computes a batch of fleets of different sizes.
 //!
-//! Memory per UAV: hidden state (64), last heading (-1 before the first), and its token where the agent has that identity.
+//! Memory per UAV: hidden state (64), last heading (-1 in slot 0), and the token with identity `token`.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -15,13 +15,13 @@ use crate::invalid::Invalid;
 use crate::nn::{HIDDEN, Weights, argmax};
 use crate::rng;
 
-/// A trained agent, its weights prepared once. Shared by threads.
+/// A trained agent with prepared weights. Shared by threads.
 #[derive(Debug)]
 pub struct LearnedPolicy {
     agent: Agent,
     flat: Vec<f32>,
     transposed: Vec<f32>,
-    /// Buffers of calls that are over; a call takes one or makes one.
+    /// Buffers of finished calls, for the next calls.
     buffers: Mutex<Vec<Buffers>>,
 }
 
@@ -35,10 +35,10 @@ struct Buffers {
 }
 
 impl LearnedPolicy {
-    /// The policy of `params`, in the order of the agent's layout.
+    /// The policy with parameters `params`, in the order of the agent's layout.
     ///
     /// # Errors
-    /// When their number is not the architecture's, or one is not finite.
+    /// [`Invalid`] if the number of parameters does not fit the architecture, or one is not finite.
     pub fn new(config: AgentConfig, dims: Dims, params: Vec<f32>) -> Result<Self, Invalid> {
         let agent = Agent::new(config, dims);
         let len = agent.layout().len();
@@ -67,7 +67,7 @@ impl LearnedPolicy {
         self.agent.config().identity == Identity::Token
     }
 
-    /// Numbers remembered per UAV.
+    /// Length of the memory of one UAV.
     fn stride(&self) -> usize {
         HIDDEN + 1 + if self.has_token() { TOKEN } else { 0 }
     }
@@ -107,38 +107,38 @@ impl Policy for LearnedPolicy {
         self.agent.config().hops <= 1
     }
 
-    fn act(&self, turns: &mut [FleetStep<'_>]) {
+    fn act(&self, fleets: &mut [FleetStep<'_>]) {
         let pool = || self.buffers.lock().unwrap_or_else(PoisonError::into_inner);
         let taken = pool().pop();
         let mut buffers = taken.unwrap_or_default();
-        self.run(turns, &mut buffers);
+        self.run(fleets, &mut buffers);
         pool().push(buffers);
     }
 }
 
 impl LearnedPolicy {
-    fn run(&self, turns: &mut [FleetStep<'_>], b: &mut Buffers) {
+    fn run(&self, fleets: &mut [FleetStep<'_>], b: &mut Buffers) {
         let stride = self.stride();
         let config = self.agent.geometry();
         b.geometry.clear();
         b.last.clear();
         b.token.clear();
         b.position.clear();
-        for turn in turns.iter() {
-            b.geometry.push_slot(&config, turn.slot);
-            for uav in turn.memory.chunks_exact(stride) {
-                // Memory may come from a caller: what is no heading counts as none.
+        for fleet in fleets.iter() {
+            b.geometry.push_slot(&config, fleet.slot);
+            for uav in fleet.memory.chunks_exact(stride) {
+                // The memory may come from a client. A number that is not a heading counts as no heading.
                 let known = (0.0..self.actions() as f32).contains(&uav[HIDDEN]);
                 b.last.push(if known { uav[HIDDEN] as u8 } else { NO_ACTION });
                 b.token.extend_from_slice(&uav[HIDDEN + 1..]);
             }
-            if let Some(own) = turn.slot.uav_positions() {
+            if let Some(own) = fleet.slot.uav_positions() {
                 b.position.extend(own.iter().flatten().map(|&x| x as f32));
             }
         }
         b.geometry.finish(&config);
         let rows = b.geometry.uav_rows();
-        let memories = turns.iter().flat_map(|turn| turn.memory.chunks_exact(stride));
+        let memories = fleets.iter().flat_map(|fleet| fleet.memory.chunks_exact(stride));
         for (h, uav) in b.cache.begin(rows, 1).chunks_exact_mut(HIDDEN).zip(memories) {
             h.copy_from_slice(&uav[..HIDDEN]);
         }
@@ -146,14 +146,14 @@ impl LearnedPolicy {
         let weights = Weights { flat: &self.flat, transposed: &self.transposed };
         self.agent.forward(weights, &inputs, 1, &mut b.cache);
         let mut after = b.cache.last_hidden(rows).chunks_exact(HIDDEN).zip(b.cache.q.as_slice().chunks_exact(self.actions()));
-        for turn in turns {
-            for (i, uav) in turn.memory.chunks_exact_mut(stride).enumerate() {
+        for fleet in fleets {
+            for (i, uav) in fleet.memory.chunks_exact_mut(stride).enumerate() {
                 let (h, q) = after.next().expect("one row per UAV");
                 let best = argmax(q);
                 uav[..HIDDEN].copy_from_slice(h);
                 uav[HIDDEN] = best as f32;
-                turn.headings[i] = best as u8;
-                if let Some(values) = &mut turn.q_values {
+                fleet.headings[i] = best as u8;
+                if let Some(values) = &mut fleet.q_values {
                     values[i * q.len()..][..q.len()].copy_from_slice(q);
                 }
             }

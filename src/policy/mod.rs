@@ -1,4 +1,4 @@
-//! What a UAV knows and decides: observations, agents, mixers, baselines, and the trait that all policies share.
+//! Policies: observations, agents, mixers, baselines, and the trait that all policies implement.
 
 mod actor;
 mod agent;
@@ -24,61 +24,61 @@ pub use slot::Slot;
 
 use crate::invalid::Invalid;
 
-/// How much of a slot a policy must be told.
+/// The input that a policy requires.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum RequiredInput {
-    /// Only what nodes detect.
+    /// The detections of all nodes.
     Detections,
-    /// Detections, and each UAV's own position.
+    /// The detections and each UAV's own position.
     OwnPositions,
     /// The positions of all UAVs and users.
     FullScene,
 }
 
-/// One fleet's turn in a batch: what it sees, its memory, and where its answer goes.
+/// One fleet in one slot, as an item of a batch: input, memory and output.
 pub struct FleetStep<'a> {
-    /// The slot as all nodes see it.
+    /// The observations of all nodes.
     pub slot: &'a Slot,
-    /// Slots since the episode began.
+    /// Index of the slot in the episode.
     pub step: u64,
-    /// The fleet's memory, `Policy::memory_len` long; advanced in place.
+    /// The fleet's memory, of length [`Policy::memory_len`]; updated in place.
     pub memory: &'a mut [f32],
-    /// Out: heading index of each UAV.
+    /// Output: heading index of each UAV.
     pub headings: &'a mut [u8],
-    /// Out, when wanted: Q-values, A per UAV, UAV by UAV. Policies without values write NaN.
+    /// Output, optional: A Q-values per UAV. Policies without Q-values write NaN.
     pub q_values: Option<&'a mut [f32]>,
 }
 
-/// A policy: learned or not, served and evaluated alike. Shared by threads behind an `Arc`.
+/// A policy, learned or by rule. Threads share it behind an `Arc`.
 pub trait Policy: Send + Sync {
     /// A, the number of actions.
     fn actions(&self) -> usize;
 
-    /// What it must be told.
+    /// The input that the policy requires.
     fn needs(&self) -> RequiredInput;
 
-    /// d, the detection range that it works with; scenes are transposed into detections with it.
+    /// d, the detection range. It decides the detections in a scene.
     fn detection_range(&self) -> f64;
 
-    /// Whether it can fly this many UAVs among this many users.
+    /// Checks whether the policy accepts this number of UAVs and of users.
     ///
     /// # Errors
-    /// The count that does not fit, and what would.
+    /// [`Invalid`] for the count that does not fit.
     fn check_fleet(&self, uavs: usize, users: usize) -> Result<(), Invalid>;
 
-    /// Length of the memory of a fleet.
+    /// Length of a fleet's memory.
     fn memory_len(&self, uavs: usize, users: usize) -> usize;
 
-    /// Writes the memory of a fleet at slot 0. `seed` fixes everything random about the episode.
+    /// Initialises a fleet's memory for slot 0. `seed` determines all random numbers of the episode.
     fn start(&self, uavs: usize, users: usize, seed: u64, memory: &mut [f32]);
 
-    /// Whether a slot costs little more than a constant per node and detection, so that a small one need not be computed away
-    /// from where it arrives.
+    /// Whether the time for a slot is about proportional to its nodes and detections. Small fleets of such policies can be computed
+    /// on the thread that received the request.
     fn is_cheap(&self) -> bool {
         false
     }
 
-    /// Advances every fleet by one slot. Fleets may differ in size. Each answer is the same as if its fleet came alone.
-    /// The caller has checked sizes with `check_fleet` and the slots with `needs`.
-    fn act(&self, turns: &mut [FleetStep<'_>]);
+    /// Advances every fleet by one slot. Fleets may differ in size. The result for a fleet does not depend on the other fleets.
+    /// The caller has checked the sizes with `check_fleet` and provides what `needs` requires.
+    fn act(&self, fleets: &mut [FleetStep<'_>]);
 }

@@ -150,7 +150,7 @@ impl Read {
     fn learned(self, reference: PolicyRef, created_at: i64) -> LoadedPolicy {
         let (config, step) = (self.checkpoint.config(), self.checkpoint.step());
         let (environment, training) = (&config.environment, &config.training);
-        let flat = training.observation == Observation::Flat;
+        let flat = training.observation == ObservationKind::Flat;
         let object = |value: serde_json::Result<Value>| value.unwrap_or_default();
         let mut metrics = json!({"step": step});
         let figures = object(serde_json::to_value(self.checkpoint.metrics()));
