@@ -1,6 +1,7 @@
-//! A server's settings, checked once.
+//! Settings of a server: defaults and validation.
 
 use std::net::SocketAddr;
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -8,72 +9,72 @@ use crate::invalid::{Invalid, in_range};
 use crate::service::keys::Rate;
 use crate::serving::EngineConfig;
 
-/// Everything that a server is told when it starts.
+/// Settings of a server. Every field has a flag of `qedgix serve`.
 #[derive(Clone, Debug)]
 pub struct Config {
-    /// Where gRPC listens; port 0 picks a free one.
+    /// Address of gRPC; port 0 selects a free port.
     pub grpc_addr: SocketAddr,
-    /// Where REST listens; port 0 picks a free one.
+    /// Address of REST; port 0 selects a free port.
     pub http_addr: SocketAddr,
-    /// Where everything durable is; created if need be.
+    /// Directory of the database; created if missing.
     pub data_dir: PathBuf,
-    /// Cores that training may use together.
+    /// CPU budget: threads that all running jobs may use together.
     pub cpu_budget: usize,
-    /// Failed attempts after which a job has failed.
+    /// Failed attempts after which a job fails.
     pub max_attempts: u32,
     /// Time between snapshots of a running job.
     pub snapshot_every: Duration,
-    /// The binary that workers run; absent: this one.
+    /// Program of workers; `None`: this program.
     pub worker: Option<PathBuf>,
-    /// A session idle for longer expires.
+    /// Idle time after which a session expires.
     pub session_ttl: Duration,
-    /// Most open sessions.
+    /// Maximum open sessions.
     pub max_sessions: usize,
-    /// A hosted environment idle for longer expires.
+    /// Idle time after which a hosted environment expires.
     pub environment_ttl: Duration,
-    /// Most hosted environments.
+    /// Maximum hosted environments.
     pub max_environments: usize,
-    /// Memory that all hosted environments may take together, in bytes.
+    /// Memory of all hosted environments together, in bytes.
     pub environment_memory: usize,
-    /// Largest gRPC message and HTTP body, in bytes.
+    /// Maximum size of a gRPC message or HTTP body, in bytes.
     pub max_message_size: usize,
-    /// Most streams of jobs' events that are open at a time.
+    /// Maximum open streams of job events.
     pub max_watchers: usize,
-    /// Silence after which a stream of events over HTTP gives a sign of life.
-    pub heartbeat: Duration,
+    /// Idle time after which an event stream over HTTP sends a comment.
+    pub event_heartbeat: Duration,
     /// The engine that computes headings.
     pub engine: EngineConfig,
-    /// Time that requests in flight are given when the server stops.
+    /// Time that requests in flight have to complete when the server stops.
     pub drain_timeout: Duration,
-    /// Whether it may listen where others can reach it, although nobody has to say who they are.
+    /// Allow non-loopback addresses although no API key exists.
     pub insecure: bool,
-    /// Both addresses speak TLS with these files; absent: plain text.
+    /// TLS certificates of both addresses; `None`: no TLS.
     pub tls: Option<TlsFiles>,
-    /// Most connections of both addresses together.
+    /// Maximum connections of both addresses together.
     pub max_connections: usize,
-    /// Most streams that an HTTP/2 connection may have open.
+    /// Maximum open streams per HTTP/2 connection.
     pub max_streams: u32,
-    /// Time that a caller may let the server wait: for a handshake, the head of an HTTP/1 request, the next part of a REST body.
+    /// Read timeout of a TLS handshake, of the head of an HTTP/1 request and of each part of a REST body.
     pub read_timeout: Duration,
-    /// Requests per second of an API key that has no rate of its own; absent: as many as it likes.
+    /// Requests per second of API keys without a rate of their own; `None`: unlimited.
     pub key_rate: Option<f64>,
-    /// How many of them at once; absent: as many as one second allows.
+    /// Requests at once of such keys; `None`: the requests of one second.
     pub key_burst: Option<f64>,
 }
 
-/// PEM files of TLS. They are read again when the server is told to.
+/// PEM files of TLS. The server reads them again on SIGHUP.
 #[derive(Clone, Debug)]
 pub struct TlsFiles {
-    /// The server's certificate, then those that lead to its authority.
+    /// Certificate of the server, followed by intermediate certificates.
     pub cert: PathBuf,
-    /// The certificate's private key.
+    /// Private key of the certificate.
     pub key: PathBuf,
-    /// Authorities of which callers must show a certificate; absent: callers need none.
+    /// Certificate authorities for client certificates; `None`: clients need no certificate.
     pub client_ca: Option<PathBuf>,
 }
 
 impl Config {
-    /// The defaults, with everything durable in `data_dir`.
+    /// Default settings for `data_dir`.
     pub fn new(data_dir: impl Into<PathBuf>) -> Self {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         Self {
@@ -91,7 +92,7 @@ impl Config {
             environment_memory: 1 << 30,
             max_message_size: 16 << 20,
             max_watchers: 256,
-            heartbeat: Duration::from_secs(15),
+            event_heartbeat: Duration::from_secs(15),
             engine: EngineConfig { threads: cores.min(4), queue: 4096, max_batch: 64, max_batch_delay: Duration::ZERO },
             drain_timeout: Duration::from_secs(20),
             insecure: false,
@@ -104,29 +105,30 @@ impl Config {
         }
     }
 
-    /// Checks every setting.
+    /// Checks that every setting is in range.
     ///
     /// # Errors
-    /// The first one that cannot be used.
+    /// [`Invalid`] for the first setting that is not.
     pub fn validate(&self) -> Result<(), Invalid> {
         in_range("--cpu-budget", self.cpu_budget, 1..=4096)?;
         in_range("--max-attempts", self.max_attempts, 1..=1000)?;
-        in_range("--snapshot-every (seconds)", self.snapshot_every.as_secs_f64(), 0.0..=1e9)?;
-        in_range("--session-ttl (seconds)", self.session_ttl.as_secs_f64(), 0.001..=1e9)?;
+        in_seconds("--snapshot-every", self.snapshot_every, 0.0..=1e9)?;
+        in_seconds("--session-ttl", self.session_ttl, 0.001..=1e9)?;
         in_range("--max-sessions", self.max_sessions, 1..=100_000_000)?;
-        in_range("--environment-ttl (seconds)", self.environment_ttl.as_secs_f64(), 0.001..=1e9)?;
+        in_seconds("--environment-ttl", self.environment_ttl, 0.001..=1e9)?;
         in_range("--max-environments", self.max_environments, 1..=100_000_000)?;
         in_range("--environment-memory", self.environment_memory, 1 << 20..=1 << 40)?;
         in_range("--max-message-size", self.max_message_size, 1024..=1 << 30)?;
         in_range("--max-watchers", self.max_watchers, 1..=100_000)?;
-        in_range("--event-heartbeat (seconds)", self.heartbeat.as_secs_f64(), 0.001..=3600.0)?;
+        in_seconds("--event-heartbeat", self.event_heartbeat, 0.001..=3600.0)?;
         in_range("--engine-threads", self.engine.threads, 1..=1024)?;
         in_range("--engine-queue", self.engine.queue, 1..=10_000_000)?;
         in_range("--max-batch", self.engine.max_batch, 1..=65_536)?;
-        in_range("--max-batch-delay (seconds)", self.engine.max_batch_delay.as_secs_f64(), 0.0..=10.0)?;
+        in_seconds("--max-batch-delay", self.engine.max_batch_delay, 0.0..=10.0)?;
+        in_seconds("--drain-timeout", self.drain_timeout, 0.0..=86_400.0)?;
         in_range("--max-connections", self.max_connections, 1..=1_000_000)?;
         in_range("--max-streams", self.max_streams, 1..=1_000_000)?;
-        in_range("--read-timeout (seconds)", self.read_timeout.as_secs_f64(), 0.001..=3600.0)?;
+        in_seconds("--read-timeout", self.read_timeout, 0.001..=3600.0)?;
         if let Some(rate) = self.key_rate {
             in_range("--key-rate", rate, Rate::PER_SECOND)?;
         }
@@ -136,18 +138,27 @@ impl Config {
         Ok(())
     }
 
-    /// Checks that nobody can reach the server who has not been let in: `keys` says whether callers need an API key.
+    /// Checks that a server without API keys listens on loopback addresses only. `has_keys`: whether an API key exists.
     ///
     /// # Errors
-    /// The first address that is open to everybody.
-    pub fn validate_reach(&self, keys: bool) -> Result<(), Invalid> {
+    /// [`Invalid`] for the first address that is not loopback, unless keys exist or `insecure` is set.
+    pub fn validate_exposure(&self, has_keys: bool) -> Result<(), Invalid> {
         for (flag, addr) in [("--grpc-addr", self.grpc_addr), ("--http-addr", self.http_addr)] {
-            if !addr.ip().is_loopback() && !keys && !self.insecure {
-                let expected = "a loopback address such as 127.0.0.1, an API key in the data directory (qedgix keys create), or \
-                                --insecure: whoever reaches this server may use it";
+            if !addr.ip().is_loopback() && !has_keys && !self.insecure {
+                let expected = "a loopback address such as 127.0.0.1. Other addresses require an API key (qedgix keys create) or \
+                                --insecure, which lets everyone use this server";
                 return Err(Invalid::new(flag, addr, expected));
             }
         }
         Ok(())
     }
+}
+
+/// Checks that `time` lies in `range`, which is in seconds. The bounds keep sums of times from overflowing.
+fn in_seconds(flag: &str, time: Duration, range: RangeInclusive<f64>) -> Result<(), Invalid> {
+    if range.contains(&time.as_secs_f64()) {
+        return Ok(());
+    }
+    let expected = format!("a time from {} to {} seconds", range.start(), range.end());
+    Err(Invalid::new(flag, format!("{} s", time.as_secs_f64()), expected))
 }

@@ -1,16 +1,16 @@
-//! Listeners, background work, shutdown: one process on one data directory.
+//! Listeners, background tasks and graceful shutdown of one server on one data directory.
 //!
-//! Shutdown in order: readiness goes off, watchers of health are told and new work is refused; training jobs are snapshotted
-//! and queued; streams end and requests in flight are answered; then the listeners are gone and the data directory is free for
-//! another server.
+//! Shutdown has four steps: the server reports not ready and refuses new work; workers snapshot their jobs, which return to the queue;
+//! streams end and requests in flight are answered; the listeners close and the data directory is unlocked.
 
 mod connections;
 mod keys;
-mod prompt;
+mod read_timeout;
 mod tls;
 
 use std::fs::{File, TryLockError};
 use std::future::Future;
+use std::io::Write;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -22,10 +22,10 @@ use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 use tower::ServiceExt;
+use tower_http::timeout::TimeoutBody;
 
 use self::connections::{Connections, Protocol};
-pub use self::connections::{KEEPALIVE, WINDOW};
-use self::prompt::PromptBody;
+pub use self::connections::{HTTP2_WINDOW, KEEPALIVE_INTERVAL};
 pub use self::tls::Tls;
 use crate::api::{grpc, rest};
 use crate::config::Config;
@@ -37,68 +37,67 @@ use crate::serving::{Clock, Engine, Environments, EnvironmentsConfig, Limits, Se
 use crate::store::{self, Store};
 use crate::telemetry;
 
-/// Name of the file in the data directory that tells where the server listens.
+/// Name of the file in the data directory that holds the addresses of the running server.
 pub const ENDPOINTS: &str = "endpoints.json";
 
-/// Why a server does not start or stopped.
+/// Why a server did not start, or failed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A setting that cannot be used.
+    /// A setting is invalid.
     #[error(transparent)]
     Config(#[from] Invalid),
-    /// A file of the data directory.
+    /// A file of the data directory cannot be read or written.
     #[error("{path}: {cause}")]
     File {
-        /// Which.
+        /// Path of the file.
         path: PathBuf,
-        /// What happened.
+        /// Error of the operating system.
         cause: std::io::Error,
     },
-    /// Another server works on the data directory.
+    /// Another server uses the data directory.
     #[error("{0} is in use by another qedgix server; stop it, or choose another --data-dir")]
     InUse(PathBuf),
-    /// The address is taken or not this machine's.
+    /// The address is in use, or does not belong to this machine.
     #[error("cannot listen on {addr}: {cause}")]
     Bind {
-        /// Where.
+        /// The address.
         addr: SocketAddr,
-        /// What happened.
+        /// Error of the operating system.
         cause: std::io::Error,
     },
-    /// The database.
+    /// The database failed.
     #[error(transparent)]
     Store(#[from] store::Error),
-    /// API keys could not be read.
-    #[error("reading API keys: {0}")]
+    /// API keys cannot be read.
+    #[error("cannot read API keys: {0}")]
     Keys(#[source] crate::service::Error),
-    /// Policies could not be loaded.
-    #[error("loading policies: {0}")]
+    /// Policies cannot be loaded.
+    #[error("cannot load policies: {0}")]
     Policies(#[source] crate::service::Error),
-    /// The system does not tell which program this is, so no worker can be started.
-    #[error("finding the program of workers: {0}")]
+    /// The path of this program is unknown, so workers cannot be started.
+    #[error("cannot find the program of workers: {0}")]
     Worker(#[source] std::io::Error),
-    /// The system refuses a thread.
-    #[error("starting the engine: {0}")]
+    /// The threads of the engine cannot be started.
+    #[error("cannot start the engine: {0}")]
     Engine(#[source] std::io::Error),
-    /// The system does not know where a listener listens.
-    #[error("listening: {0}")]
+    /// The address of a listener cannot be read.
+    #[error("cannot read the address of a listener: {0}")]
     Listener(#[source] std::io::Error),
 }
 
-/// Where a server listens.
+/// The bound listeners of a server.
 #[derive(Debug)]
 pub struct Listeners {
     /// gRPC.
     pub grpc: TcpListener,
     /// REST.
     pub http: TcpListener,
-    /// `WorkerService` alone, for the workers of this machine: neither certificates nor the number of callers come between
-    /// them and the server. On the loopback, without TLS.
+    /// Serves only `WorkerService`, to the workers of this machine: on loopback, without TLS, outside the connection limit.
     workers: TcpListener,
     tls: Option<Arc<Tls>>,
 }
 
-/// The addresses of [`Listeners`], ports chosen.
+/// Addresses of [`Listeners`], with their actual ports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 pub struct Endpoints {
     /// gRPC.
@@ -108,10 +107,10 @@ pub struct Endpoints {
 }
 
 impl Listeners {
-    /// Listens where `config` says.
+    /// Binds the addresses of `config`.
     ///
     /// # Errors
-    /// A file of TLS that cannot be used, an address that is taken or not this machine's.
+    /// [`Error::Config`] when a TLS file cannot be used, [`Error::Bind`] when an address cannot be bound.
     pub async fn bind(config: &Config) -> Result<Self, Error> {
         let bind = async |addr| TcpListener::bind(addr).await.map_err(|cause| Error::Bind { addr, cause });
         let tls = config.tls.clone().map(Tls::open).transpose()?.map(Arc::new);
@@ -119,34 +118,34 @@ impl Listeners {
         Ok(Self { grpc: bind(config.grpc_addr).await?, http: bind(config.http_addr).await?, workers, tls })
     }
 
-    /// TLS, if they speak it.
+    /// The TLS configuration, if TLS is on.
     pub fn tls(&self) -> Option<Arc<Tls>> {
         self.tls.clone()
     }
 
-    /// Where they listen.
+    /// Addresses of the listeners.
     ///
     /// # Errors
-    /// The system does not know.
+    /// The error of the operating system when it does not know an address.
     pub fn endpoints(&self) -> std::io::Result<Endpoints> {
         Ok(Endpoints { grpc: self.grpc.local_addr()?, http: self.http.local_addr()? })
     }
 }
 
-/// A data directory that this process works on until it is dropped.
+/// A data directory, locked by this process until the value is dropped.
 #[derive(Debug)]
 pub struct DataDir {
     path: PathBuf,
-    /// Held for its lock, which the system releases however the process ends.
+    /// Holds the file lock. The operating system releases it when the process ends, for whatever reason.
     _lock: File,
 }
 
 impl DataDir {
-    /// Takes the directory, which is created if need be.
+    /// Locks the directory and creates it if missing.
     ///
     /// # Errors
-    /// Another server has it, or it cannot be written.
-    pub fn take(path: &Path) -> Result<Self, Error> {
+    /// [`Error::InUse`] when another server holds the lock, [`Error::File`] when the directory cannot be written.
+    pub fn lock(path: &Path) -> Result<Self, Error> {
         let failed = |path: &Path| {
             let path = path.to_owned();
             move |cause| Error::File { path, cause }
@@ -161,28 +160,34 @@ impl DataDir {
         }
     }
 
-    /// Writes where the server listens, whole or not at all.
-    fn publish(&self, endpoints: Endpoints) -> Result<(), Error> {
+    /// Writes `endpoints.json` atomically.
+    fn write_endpoints(&self, endpoints: Endpoints) -> Result<(), Error> {
         let (path, part) = (self.path.join(ENDPOINTS), self.path.join(".endpoints.json.part"));
         let text = serde_json::to_string(&endpoints).expect("addresses are plain data") + "\n";
-        let written = std::fs::write(&part, text).and_then(|()| std::fs::rename(&part, &path));
-        written.map_err(|cause| Error::File { path, cause })
+        let write = || {
+            let mut file = File::create(&part)?;
+            file.write_all(text.as_bytes())?;
+            file.sync_all()?;
+            std::fs::rename(&part, &path)
+        };
+        write().map_err(|cause| Error::File { path, cause })
     }
 
-    fn withdraw(&self) {
-        // Whoever reads it afterwards finds nobody listening either way.
+    fn remove_endpoints(&self) {
+        // A stale file is harmless: nothing listens at its addresses.
         let _ = std::fs::remove_file(self.path.join(ENDPOINTS));
     }
 }
 
-/// Opens everything that use cases work with.
+/// Opens the database, loads policies and keys, and starts the engine.
 ///
 /// # Errors
-/// The database or a policy in it cannot be read.
+/// [`Error::Config`] when a setting is invalid, [`Error::Store`], [`Error::Keys`] or [`Error::Policies`] when the database or a policy
+/// in it cannot be read.
 pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<App>, Error> {
     config.validate()?;
-    // Before anything keeps a handle of a metric.
-    telemetry::metrics();
+    // The recorder must exist before anything creates a metric.
+    telemetry::install_metrics();
     let sessions = Limits { ttl: config.session_ttl, max: config.max_sessions };
     let limits = Limits { ttl: config.environment_ttl, max: config.max_environments };
     let environments = EnvironmentsConfig { limits, memory: config.environment_memory };
@@ -199,11 +204,9 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
     };
     let keys = Keyring::new(config.key_rate.map(|rate| Rate::new(rate, config.key_burst)));
     keys.refresh(&store).await.map_err(Error::Keys)?;
-    config.validate_reach(keys.required())?;
-    if config.tls.is_none() && config.validate_reach(false).is_err() {
-        tracing::warn!(
-            "others can reach this server, and nothing is encrypted: who listens on the way sees API keys (--tls-cert)"
-        );
+    config.validate_exposure(keys.required())?;
+    if config.tls.is_none() && config.validate_exposure(false).is_err() {
+        tracing::warn!("this server accepts remote connections without TLS: API keys travel unencrypted (see --tls-cert)");
     }
     let app = App {
         keys,
@@ -213,7 +216,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         sessions: Sessions::new(sessions, clock.clone()),
         environments: Environments::new(environments, clock.clone()),
         engine: Engine::start(config.engine).map_err(Error::Engine)?,
-        watchers: Watchers::new(config.max_watchers, config.heartbeat),
+        watchers: Watchers::new(config.max_watchers, config.event_heartbeat),
         clock,
         draining: Draining::default(),
     };
@@ -224,7 +227,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
 /// Serves until `shutdown` resolves, then drains.
 ///
 /// # Errors
-/// A listener fails.
+/// [`Error::Listener`] when the address of a listener cannot be read, [`Error::File`] when `endpoints.json` cannot be written.
 pub async fn run(
     config: &Config,
     data: &DataDir,
@@ -234,7 +237,7 @@ pub async fn run(
 ) -> Result<(), Error> {
     let endpoints = listeners.endpoints().map_err(Error::Listener)?;
     let workers = listeners.workers.local_addr().map_err(Error::Listener)?;
-    telemetry::metrics();
+    telemetry::install_metrics();
     let stop = CancellationToken::new();
     let health = grpc::Health::new(stop.clone());
     health.report(operations::vitals(&app).await);
@@ -242,20 +245,24 @@ pub async fn run(
     let connections = Connections {
         permits: Arc::new(Semaphore::new(config.max_connections)),
         tls: listeners.tls,
-        patience: config.read_timeout,
+        read_timeout: config.read_timeout,
         max_streams: config.max_streams,
         stop: stop.clone(),
     };
-    let own = Connections { permits: Arc::new(Semaphore::new(WORKERS)), tls: None, ..connections.clone() };
-    // A stream of gRPC may be silent for as long as its connection answers pings, a body of REST may not.
+    let worker_connections =
+        Connections { permits: Arc::new(Semaphore::new(MAX_WORKER_CONNECTIONS)), tls: None, ..connections.clone() };
+    // A gRPC stream may be silent as long as its connection answers pings. A REST body has a read timeout.
     let grpc = |services: grpc::Services| services.map_request(|r: Request<Incoming>| r.map(tonic::body::Body::new));
     let services = grpc::services(&app, &health, config.max_message_size, stop.clone());
-    let patience = config.read_timeout;
-    let router = rest::router(app.clone(), telemetry::render, config.max_message_size);
+    let timeout = config.read_timeout;
+    let router = rest::router(app.clone(), telemetry::render_metrics, config.max_message_size);
     let router =
-        router.map_request(move |r: Request<Incoming>| r.map(|body| axum::body::Body::new(PromptBody::new(body, patience))));
-    let serve_workers =
-        own.serve(listeners.workers, Protocol::Grpc, grpc(grpc::worker_services(&app, config.max_message_size, stop.clone())));
+        router.map_request(move |r: Request<Incoming>| r.map(|body| axum::body::Body::new(TimeoutBody::new(timeout, body))));
+    let serve_workers = worker_connections.serve(
+        listeners.workers,
+        Protocol::Grpc,
+        grpc(grpc::worker_services(&app, config.max_message_size, stop.clone())),
+    );
     let serve_grpc = connections.clone().serve(listeners.grpc, Protocol::Grpc, grpc(services));
     let serve_rest = connections.serve(listeners.http, Protocol::Http, router);
 
@@ -263,7 +270,7 @@ pub async fn run(
     let housekeeping = tokio::spawn(housekeeping(app.clone(), config.session_ttl.min(config.environment_ttl)));
     let monitoring = tokio::spawn(health.clone().follow(app.clone()));
     let following = tokio::spawn(keys::follow(app.clone()));
-    data.publish(endpoints)?;
+    data.write_endpoints(endpoints)?;
     tracing::info!(grpc = %endpoints.grpc, http = %endpoints.http, policies = app.registry.len(), "serving");
 
     let drain = async {
@@ -271,11 +278,11 @@ pub async fn run(
         tracing::info!("draining");
         app.draining.begin();
         health.drain();
-        // Workers send their snapshots, so they are waited for while everything still answers.
+        // Workers need the server to upload their snapshots, so it keeps answering until they are done.
         app.jobs.drain(config.drain_timeout + Duration::from_secs(5)).await;
         stop.cancel();
         tokio::time::sleep(config.drain_timeout).await;
-        tracing::warn!(after = ?config.drain_timeout, "gave up on requests in flight");
+        tracing::warn!(after = ?config.drain_timeout, "drain timeout: closing requests in flight");
     };
     let serve = async { tokio::join!(serve_grpc, serve_rest, serve_workers) };
     tokio::select! {
@@ -286,19 +293,19 @@ pub async fn run(
     housekeeping.abort();
     monitoring.abort();
     following.abort();
-    keys::keep_last_uses(&app).await;
-    data.withdraw();
+    keys::save_last_used(&app).await;
+    data.remove_endpoints();
     tracing::info!("stopped");
     Ok(())
 }
 
-/// Most connections of workers: far more than jobs that run at the same time.
-const WORKERS: usize = 4096;
+/// Maximum connections of workers: far more than jobs can run at once.
+const MAX_WORKER_CONNECTIONS: usize = 4096;
 
-/// What has to be done now and then, however quiet it is.
+/// Expires idle sessions and environments, and maintains metrics.
 async fn housekeeping(app: Arc<App>, ttl: Duration) {
     let mut sweep = tokio::time::interval((ttl / 4).clamp(Duration::from_secs(1), Duration::from_secs(30)));
-    // Times that were recorded wait in memory until they are put into their buckets.
+    // Recorded durations stay in memory until this moves them into their histogram buckets.
     let mut upkeep = tokio::time::interval(Duration::from_secs(5));
     loop {
         tokio::select! {
@@ -306,7 +313,7 @@ async fn housekeeping(app: Arc<App>, ttl: Duration) {
                 app.sessions.sweep();
                 app.environments.table().sweep();
             }
-            _ = upkeep.tick() => telemetry::metrics().run_upkeep(),
+            _ = upkeep.tick() => telemetry::install_metrics().run_upkeep(),
         }
     }
 }

@@ -267,9 +267,9 @@ impl Subject {
         let mut config = Config::new(dir);
         config.environment_memory = 1 << 20;
         (config.max_sessions, config.max_environments) = (64, 16);
-        let data = DataDir::take(dir).unwrap();
+        let data = DataDir::lock(dir).unwrap();
         let app = server::open(&config, &data, Clock::system()).await.unwrap();
-        telemetry::metrics();
+        telemetry::install_metrics();
         let health = grpc::Health::new(CancellationToken::new());
         let services = grpc::services(&app, &health, LARGEST, CancellationToken::new());
         let grpc = ServiceBuilder::new().map_response(|r: Response<_>| r.map(Body::new)).service(services);
@@ -278,7 +278,7 @@ impl Subject {
         let weights = (0..layout(&recipe).len()).map(|i| (i % 7) as f32 * 0.01).collect();
         let points = |n: usize| (0..n).map(|i| [0.1 * i as f64, 0.2]).collect::<Vec<_>>();
         Self {
-            rest: rest::router(app.clone(), telemetry::render, LARGEST),
+            rest: rest::router(app.clone(), telemetry::render_metrics, LARGEST),
             grpc: BoxCloneSyncService::new(grpc),
             app,
             checkpoint: Checkpoint::new(recipe, 1, None, weights).unwrap().to_bytes(),

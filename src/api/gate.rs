@@ -78,7 +78,7 @@ fn admit<B>(app: &App, request: &mut Request<B>, need: impl FnOnce(&Request<B>) 
     if let Need::Scope(scope) = need {
         caller.authorize(scope)?;
     }
-    caller.spend(now)?;
+    caller.acquire(now)?;
     tracing::Span::current().record("key", caller.id());
     request.headers_mut().remove(header::AUTHORIZATION);
     request.headers_mut().remove(API_KEY);
@@ -109,7 +109,7 @@ impl Opener {
     /// # Errors
     /// The key is over, and the stream with it.
     pub(super) fn count(&self, app: &App) -> Result<Result<(), Error>, Status> {
-        match self.0.as_ref().map_or(Ok(()), |caller| caller.again(app.clock.now())) {
+        match self.0.as_ref().map_or(Ok(()), |caller| caller.check_and_acquire(app.clock.now())) {
             Err(error) if !matches!(error, Error::Busy { .. }) => Err(error.into()),
             counted => Ok(counted),
         }

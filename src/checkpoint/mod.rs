@@ -9,7 +9,6 @@ mod error;
 mod file;
 
 use std::collections::BTreeMap;
-use std::fmt::Write;
 
 use sha2::{Digest, Sha256};
 
@@ -169,8 +168,5 @@ fn flatten(config: &TrainConfig, tensors: Vec<Tensor>) -> Result<Vec<f32>, Error
 
 /// What a file is known by: SHA-256 of its bytes, in hexadecimal.
 pub fn digest(bytes: &[u8]) -> String {
-    Sha256::digest(bytes).iter().fold(String::with_capacity(64), |mut hex, byte| {
-        write!(hex, "{byte:02x}").expect("a String takes all that is written");
-        hex
-    })
+    hex::encode(Sha256::digest(bytes))
 }

@@ -1,47 +1,50 @@
-//! A server's REST interface, as the command line uses it.
+//! A client of the REST interface for commands that use a server.
 
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use axum::body::{Body, to_bytes};
-use axum::http::{HeaderValue, Method, Request, header};
-use hyper_util::client::legacy::Client as Http;
-use hyper_util::rt::{TokioExecutor, TokioTimer};
+use axum::http::{HeaderMap, Method, header};
+use reqwest::redirect::Policy;
 use serde_json::Value;
 
-use super::connect::{ConnectArgs, Connector};
+use super::connect::ConnectArgs;
 
-/// Time that a request may take.
-const PATIENCE: Duration = Duration::from_secs(60);
-/// Time for a checkpoint to go over.
-const TRANSFER: Duration = Duration::from_secs(600);
-/// Largest answer, in bytes.
-const LARGEST: usize = 1 << 30;
+/// Timeout of a request.
+const TIMEOUT: Duration = Duration::from_secs(60);
+/// Timeout of an upload or download of a checkpoint.
+const TRANSFER_TIMEOUT: Duration = Duration::from_secs(600);
+/// Time between two queries of a job's state.
+const JOB_POLL: Duration = Duration::from_millis(250);
 
-/// A server to talk to.
+/// A client of one server.
 #[derive(Clone, Debug)]
 pub struct Client {
-    http: Http<Connector, Body>,
+    http: reqwest::Client,
     base: String,
-    authorization: Option<HeaderValue>,
 }
 
 impl Client {
-    /// For a server at `address`: `HOST:PORT`, `http://HOST:PORT` or `https://HOST:PORT`.
+    /// Creates a client of the server at `address`: `HOST:PORT`, `http://HOST:PORT` or `https://HOST:PORT`.
     ///
     /// # Errors
-    /// It is no address, or the API key or a certificate cannot be used.
-    pub fn new(address: &str, how: &ConnectArgs) -> anyhow::Result<Self> {
-        let url = how.url(address)?;
-        let http = Http::builder(TokioExecutor::new()).pool_timer(TokioTimer::new()).build(how.connector(&url, false)?);
-        let base = url.to_string().trim_end_matches('/').to_owned();
-        Ok(Self { http, base, authorization: how.authorization()? })
+    /// The address, the API key or a certificate is invalid.
+    pub fn new(address: &str, args: &ConnectArgs) -> anyhow::Result<Self> {
+        let url = args.url(address)?;
+        let headers: HeaderMap = args.authorization()?.map(|value| (header::AUTHORIZATION, value)).into_iter().collect();
+        let http = reqwest::Client::builder()
+            .tls_backend_preconfigured(args.tls(&url)?)
+            .default_headers(headers)
+            .redirect(Policy::none())
+            .no_proxy()
+            .build()
+            .context("cannot create an HTTP client")?;
+        Ok(Self { http, base: url.to_string().trim_end_matches('/').to_owned() })
     }
 
     /// `GET path`.
     ///
     /// # Errors
-    /// The server cannot be reached or answers with a problem, whose detail is told.
+    /// The server cannot be reached, or returns an error, whose detail the message contains.
     pub async fn get(&self, path: &str) -> anyhow::Result<Value> {
         self.json(Method::GET, path, None).await
     }
@@ -70,53 +73,55 @@ impl Client {
         self.json(Method::DELETE, path, None).await
     }
 
-    /// `POST path` with a body of bytes, which may take a while.
+    /// `POST path` with a binary body. The timeout is 10 minutes.
     ///
     /// # Errors
     /// As [`Client::get`].
     pub async fn upload(&self, path: &str, bytes: Vec<u8>) -> anyhow::Result<Value> {
-        let body = self.bytes(Method::POST, path, Some(("application/octet-stream", bytes)), TRANSFER).await?;
+        let body = self.send(Method::POST, path, Some(("application/octet-stream", bytes)), TRANSFER_TIMEOUT).await?;
         Ok(serde_json::from_slice(&body).unwrap_or(Value::Null))
     }
 
-    /// `GET path` of bytes, which may take a while.
+    /// `GET path`, which returns binary data. The timeout is 10 minutes.
     ///
     /// # Errors
     /// As [`Client::get`].
     pub async fn download(&self, path: &str) -> anyhow::Result<Vec<u8>> {
-        self.bytes(Method::GET, path, None, TRANSFER).await
+        self.send(Method::GET, path, None, TRANSFER_TIMEOUT).await
     }
 
     async fn json(&self, method: Method, path: &str, body: Option<&Value>) -> anyhow::Result<Value> {
         let body = body.map(|body| ("application/json", body.to_string().into_bytes()));
-        let answer = self.bytes(method, path, body, PATIENCE).await?;
-        Ok(serde_json::from_slice(&answer).unwrap_or(Value::Null))
+        let response = self.send(method, path, body, TIMEOUT).await?;
+        Ok(serde_json::from_slice(&response).unwrap_or(Value::Null))
     }
 
-    /// Sends a request, with a body and its type, and returns the body of an answer that went well.
-    async fn bytes(
+    /// Sends a request, with the media type and bytes of its body, and returns the body of a successful response.
+    async fn send(
         &self,
         method: Method,
         path: &str,
         body: Option<(&str, Vec<u8>)>,
-        patience: Duration,
+        timeout: Duration,
     ) -> anyhow::Result<Vec<u8>> {
-        let mut request = Request::builder().method(method).uri(format!("{}{path}", self.base));
-        if let Some(value) = &self.authorization {
-            request = request.header(header::AUTHORIZATION, value);
+        let url = format!("{}{path}", self.base);
+        let mut request = self.http.request(method, &url).timeout(timeout);
+        if let Some((media_type, bytes)) = body {
+            request = request.header(header::CONTENT_TYPE, media_type).body(bytes);
         }
-        if let Some((kind, _)) = &body {
-            request = request.header(header::CONTENT_TYPE, *kind);
-        }
-        let request = request.body(body.map_or_else(Body::empty, |(_, bytes)| Body::from(bytes)))?;
-        let answered = async {
-            let answer = self.http.request(request).await.with_context(|| format!("cannot reach {}{path}", self.base))?;
-            let (head, body) = answer.into_parts();
-            let body = to_bytes(Body::new(body), LARGEST).await.with_context(|| format!("{path}: the answer broke off"))?;
-            anyhow::Ok((head.status, body))
+        let failed = |error: reqwest::Error| {
+            let problem = if error.is_timeout() {
+                format!("{url}: no response within {} s", timeout.as_secs())
+            } else if error.is_body() || error.is_decode() {
+                format!("{url}: the response is incomplete")
+            } else {
+                format!("cannot reach {url}")
+            };
+            anyhow::Error::new(error.without_url()).context(problem)
         };
-        let answered = tokio::time::timeout(patience, answered).await;
-        let (status, body) = answered.with_context(|| format!("{}{path}: no answer in {patience:?}", self.base))??;
+        let response = request.send().await.map_err(failed)?;
+        let status = response.status();
+        let body = response.bytes().await.map_err(failed)?;
         if !status.is_success() {
             let problem: Value = serde_json::from_slice(&body).unwrap_or(Value::Null);
             bail!("{path}: {}", problem["detail"].as_str().unwrap_or(status.as_str()));
@@ -124,19 +129,19 @@ impl Client {
         Ok(body.into())
     }
 
-    /// Waits for a job to end; `tell` is shown the job every quarter of a second.
+    /// Waits until a job has ended, and calls `report` with the job at every poll.
     ///
     /// # Errors
-    /// The server cannot be reached any more, or the job failed or was cancelled.
-    pub async fn wait_for_job(&self, id: &str, mut tell: impl FnMut(&Value)) -> anyhow::Result<Value> {
+    /// The server cannot be reached, or the job failed or was cancelled.
+    pub async fn wait_for_job(&self, id: &str, mut report: impl FnMut(&Value)) -> anyhow::Result<Value> {
         loop {
             let job = self.get(&format!("/v1/jobs/{id}")).await?;
-            tell(&job);
+            report(&job);
             match job["state"].as_str() {
                 Some("succeeded") => return Ok(job),
                 Some("failed") => bail!("job {id} failed: {}", job["reason"].as_str().unwrap_or("no reason given")),
                 Some("cancelled") => bail!("job {id} was cancelled"),
-                _ => tokio::time::sleep(Duration::from_millis(250)).await,
+                _ => tokio::time::sleep(JOB_POLL).await,
             }
         }
     }

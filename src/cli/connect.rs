@@ -1,4 +1,4 @@
-//! How commands reach a server: addresses, certificates, the API key.
+//! Connection flags of commands that use a server: address, certificates and API key.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -14,27 +14,27 @@ use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::{ClientConfig, RootCertStore};
 
-/// Where the help lists these flags.
+/// Heading of these flags in the help.
 const CONNECTION: &str = "Connection";
 
-/// Flags of commands that talk to a server.
+/// Connection flags.
 #[derive(Args, Clone, Debug, Default)]
 pub struct ConnectArgs {
-    /// API key that the server asks for; command lines are for everybody on this machine to see, the environment is not
+    /// API key; prefer the environment variable, because every user of this machine can see command lines [default: none]
     #[arg(long, help_heading = CONNECTION, env = "QEDGIX_API_KEY", hide_env_values = true, value_name = "KEY")]
     api_key: Option<Secret>,
-    /// Authorities (PEM) that the server's certificate may come from [default: those of this machine]
+    /// Certificate authorities to trust (PEM) [default: those of this machine]
     #[arg(long, help_heading = CONNECTION, env = "QEDGIX_CA_CERT", value_name = "FILE")]
     ca_cert: Option<PathBuf>,
-    /// Certificate (PEM) that this caller shows
+    /// Client certificate (PEM) [default: none]
     #[arg(long, help_heading = CONNECTION, env = "QEDGIX_CLIENT_CERT", value_name = "FILE", requires = "client_key")]
     client_cert: Option<PathBuf>,
-    /// Private key of that certificate (PEM)
+    /// Private key of the client certificate (PEM)
     #[arg(long, help_heading = CONNECTION, env = "QEDGIX_CLIENT_KEY", value_name = "FILE", requires = "client_cert")]
     client_key: Option<PathBuf>,
 }
 
-/// Text that is not to be shown.
+/// Text that `Debug` hides.
 #[derive(Clone)]
 struct Secret(String);
 
@@ -50,14 +50,14 @@ impl fmt::Debug for Secret {
     }
 }
 
-/// Opens connections, in TLS where the address says `https`.
+/// Opens connections for gRPC, with TLS when the scheme is `https`.
 pub type Connector = HttpsConnector<HttpConnector>;
 
 impl ConnectArgs {
-    /// `HOST:PORT` or a URL as a URL. Where certificates are told of, TLS is meant.
+    /// Parses `HOST:PORT` or a URL. Without a scheme, the scheme is `https` when a certificate flag is given, and `http` otherwise.
     ///
     /// # Errors
-    /// It is neither.
+    /// `address` is neither.
     pub fn url(&self, address: &str) -> anyhow::Result<Uri> {
         let tls = self.ca_cert.is_some() || self.client_cert.is_some();
         let scheme = if tls { "https" } else { "http" };
@@ -70,34 +70,38 @@ impl ConnectArgs {
         Ok(url)
     }
 
-    /// What shows the API key, if there is one.
+    /// The value of the `authorization` header, if there is an API key.
     ///
     /// # Errors
-    /// It cannot be one.
+    /// The API key contains characters that a header cannot contain.
     pub fn authorization(&self) -> anyhow::Result<Option<HeaderValue>> {
         let Some(Secret(key)) = &self.api_key else { return Ok(None) };
-        // The cause would repeat what must not be repeated.
+        // The error of the conversion is dropped, because it could contain the key.
         let value = HeaderValue::try_from(format!("Bearer {}", key.trim()));
-        let Ok(mut value) = value else { bail!("--api-key: this is not an API key; expected what qedgix keys create printed") };
+        let Ok(mut value) = value else { bail!("--api-key: not an API key; expected a key that qedgix keys create printed") };
         value.set_sensitive(true);
         Ok(Some(value))
     }
 
-    /// Opens connections to `url`, for HTTP/2 or HTTP/1.
+    /// The connector of a gRPC channel to `url`.
     ///
     /// # Errors
-    /// A certificate or key that cannot be used.
-    pub fn connector(&self, url: &Uri, http2: bool) -> anyhow::Result<Connector> {
+    /// As [`ConnectArgs::tls`].
+    pub fn connector(&self, url: &Uri) -> anyhow::Result<Connector> {
         let mut tcp = HttpConnector::new();
         tcp.set_nodelay(true);
         tcp.enforce_http(false);
-        let https = url.scheme_str() == Some("https");
-        let builder = HttpsConnectorBuilder::new().with_tls_config(self.tls(https)?).https_or_http();
-        Ok(if http2 { builder.enable_http2().wrap_connector(tcp) } else { builder.enable_http1().wrap_connector(tcp) })
+        let builder = HttpsConnectorBuilder::new().with_tls_config(self.tls(url)?).https_or_http();
+        Ok(builder.enable_http2().wrap_connector(tcp))
     }
 
-    /// Whom to trust, and what to show. Without `needed` the system is not asked for its authorities: it may have none.
-    fn tls(&self, needed: bool) -> anyhow::Result<ClientConfig> {
+    /// The TLS configuration for `url`. The certificate authorities of this machine are loaded only for `https`, because a machine may
+    /// have none.
+    ///
+    /// # Errors
+    /// A certificate or private key cannot be read or used.
+    pub fn tls(&self, url: &Uri) -> anyhow::Result<ClientConfig> {
+        let https = url.scheme_str() == Some("https");
         let builder = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()));
         let builder = builder.with_safe_default_protocol_versions()?;
         let builder = match &self.ca_cert {
@@ -108,15 +112,17 @@ impl ConnectArgs {
                 }
                 builder.with_root_certificates(roots)
             }
-            None if needed => builder.with_native_roots().context("the authorities of this machine; or say --ca-cert")?,
+            None if https => {
+                builder.with_native_roots().context("cannot load the certificate authorities of this machine; use --ca-cert")?
+            }
             None => builder.with_root_certificates(RootCertStore::empty()),
         };
         let Some((cert, key)) = self.client_cert.as_deref().zip(self.client_key.as_deref()) else {
             return Ok(builder.with_no_client_auth());
         };
         let certs = certificates("--client-cert", cert)?;
-        let secret = PrivateKeyDer::from_pem_file(key).with_context(|| format!("--client-key {}", key.display()))?;
-        builder.with_client_auth_cert(certs, secret).with_context(|| format!("--client-key {}", key.display()))
+        let private_key = PrivateKeyDer::from_pem_file(key).with_context(|| format!("--client-key {}", key.display()))?;
+        builder.with_client_auth_cert(certs, private_key).with_context(|| format!("--client-key {}", key.display()))
     }
 }
 
@@ -125,7 +131,7 @@ fn certificates(flag: &str, path: &Path) -> anyhow::Result<Vec<CertificateDer<'s
     let read = CertificateDer::pem_file_iter(path).and_then(Iterator::collect::<Result<Vec<_>, _>>);
     let certs = read.with_context(|| format!("{flag} {}", path.display()))?;
     if certs.is_empty() {
-        bail!("{flag} {}: no certificate in PEM", path.display());
+        bail!("{flag} {}: no PEM certificate in the file", path.display());
     }
     Ok(certs)
 }
@@ -143,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn the_key_is_shown_nowhere_but_to_the_server() {
+    fn debug_output_and_errors_do_not_contain_the_key() {
         let line = Line::try_parse_from(["x", "--api-key", "qdx_id_SECRET"]).unwrap();
         assert!(!format!("{line:?}").contains("SECRET"));
         let value = line.connect.authorization().unwrap().unwrap();

@@ -8,11 +8,13 @@ use anyhow::Context;
 use clap::Args;
 use serde_json::{Value, json};
 
+use super::act_client::PolicyClient;
 use super::client::Client;
 use super::connect::ConnectArgs;
-use super::local::LocalServer;
+use super::in_process_server::InProcessServer;
+use super::output::outln;
 use super::run_args::all_cores;
-use super::{fly, progress, table, train};
+use super::{act_client, progress, table, train};
 use crate::env::EnvConfig;
 use crate::learner::{Algorithm, Summary, difference, layouts, summarize};
 use crate::policy::baselines;
@@ -56,26 +58,31 @@ pub async fn run(args: DemoArgs) -> anyhow::Result<()> {
 
 async fn story(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
     let begin = Instant::now();
-    let server = LocalServer::start(&data_dir).await?;
-    println!(
+    let server = InProcessServer::start(&data_dir).await?;
+    outln!(
         "A server on an empty data directory\n  gRPC  {}\n  REST  http://{}\n  data  {}\n",
         server.grpc,
         server.http,
         data_dir.display()
-    );
+    )?;
 
     let here = ConnectArgs::default();
     let env = EnvConfig::default();
     let seeds = layouts("eval-v1")?.seeds(args.episodes);
-    println!(
+    outln!(
         "1. {} UAVs collect the data of {} users, {} slots, {} layouts; every slot is one gRPC Act",
         env.uavs,
         env.users,
         env.slots,
         seeds.len()
-    );
-    let mut flight =
-        Flight { server: fly::connect(&server.grpc.to_string(), &here).await?, env, seeds, rows: Vec::new(), flown: Vec::new() };
+    )?;
+    let mut flight = Flight {
+        server: act_client::connect(&server.grpc.to_string(), &here).await?,
+        env,
+        seeds,
+        rows: Vec::new(),
+        flown: Vec::new(),
+    };
     for (name, _) in bundled::BUNDLED {
         flight.fly(name).await?;
     }
@@ -92,26 +99,27 @@ async fn story(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
         "training": {"steps": args.steps, "eval_every": (args.steps / 12).max(1)},
         "threads": all_cores(),
     });
-    println!("\n2. A training job over REST: POST /v1/jobs {job}");
+    outln!("\n2. A training job over REST: POST /v1/jobs {job}")?;
     let ended = train::submit(&client, &job).await?;
     let id = ended["id"].as_str().context("the job has no id")?;
     tell_curve(&client, id).await?;
     let policy = ended["policy"].as_str().context("the job published no policy")?;
 
-    println!("\n3. Its checkpoint, policy {policy}, served by the same Act");
+    outln!("\n3. Its checkpoint, policy {policy}, served by the same Act")?;
     flight.fly(policy).await?;
 
-    println!("\nMean AoI in slots; lower is fresher\n{}", table::of_policies(&flight.rows));
+    outln!("\nMean AoI in slots; lower is fresher\n{}", table::of_policies(&flight.rows))?;
     if let [(first, trained), .., (last, fresh)] = &flight.flown[..] {
         let d = difference(fresh, trained)?.mean_aoi;
-        println!("{last} minus {first} on the same layouts: {:+.2} (95 % interval {:+.2} to {:+.2})", d.mean, d.low, d.high);
+        outln!("{last} minus {first} on the same layouts: {:+.2} (95 % interval {:+.2} to {:+.2})", d.mean, d.low, d.high)?;
     }
-    println!("Done in {:.0} s.", begin.elapsed().as_secs_f64());
+    outln!("Done in {:.0} s.", begin.elapsed().as_secs_f64())?;
     if args.keep {
-        println!(
+        outln!(
             "\nThe server stays: gRPC {}, REST http://{} (try /v1/jobs, /v1/policies). ctrl-c ends it.",
-            server.grpc, server.http
-        );
+            server.grpc,
+            server.http
+        )?;
         tokio::signal::ctrl_c().await?;
     }
     server.stop().await
@@ -119,7 +127,7 @@ async fn story(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
 
 /// Policies flown so far.
 struct Flight {
-    server: fly::Server,
+    server: PolicyClient,
     env: EnvConfig,
     seeds: Vec<u64>,
     rows: Vec<(String, Summary)>,
@@ -130,12 +138,12 @@ impl Flight {
     async fn fly(&mut self, policy: &str) -> anyhow::Result<()> {
         let begin = Instant::now();
         let bar = progress::spinner(policy);
-        let episodes = fly::episodes(&mut self.server, policy, &self.env, &self.seeds).await?;
+        let episodes = act_client::run_episodes(&mut self.server, policy, &self.env, &self.seeds).await?;
         bar.finish_and_clear();
         let acts = (self.seeds.len() * self.env.slots) as f64;
         let summary = summarize(&episodes)?;
         let each = begin.elapsed().as_secs_f64() / acts * 1e3;
-        println!("   {policy:<16} mean AoI {:5.2}   {each:.2} ms per Act, round trip", summary.mean_aoi.mean);
+        outln!("   {policy:<16} mean AoI {:5.2}   {each:.2} ms per Act, round trip", summary.mean_aoi.mean)?;
         self.rows.push((policy.to_owned(), summary));
         self.flown.push((policy.to_owned(), episodes));
         Ok(())
@@ -148,6 +156,6 @@ async fn tell_curve(client: &Client, id: &str) -> anyhow::Result<()> {
     let values: Vec<f64> =
         answer["metrics"].as_array().into_iter().flatten().filter_map(|row: &Value| row["value"].as_f64()).collect();
     let (first, last) = values.first().zip(values.last()).context("the job reported no evaluation")?;
-    println!("   job {id} succeeded; validation mean AoI {first:.1} {} {last:.1}", table::sparkline(&values));
+    outln!("   job {id} succeeded; validation mean AoI {first:.1} {} {last:.1}", table::sparkline(&values))?;
     Ok(())
 }

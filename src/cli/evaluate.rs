@@ -8,7 +8,8 @@ use clap::Args;
 
 use super::comparison::{Comparison, Flown};
 use super::connect::ConnectArgs;
-use super::{fly, progress, report, run_args::all_cores, table};
+use super::output::outln;
+use super::{act_client, progress, report, run_args::all_cores, table};
 use crate::checkpoint::Checkpoint;
 use crate::env::EnvConfig;
 use crate::learner::{Disturbance, Layouts, Loss, Survey, Track, layouts, survey};
@@ -95,7 +96,7 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
         args.policy.iter().map(|name| (name.as_str(), false)).chain(references.map(|name| (name, true))).collect();
 
     let mut server = match &args.server {
-        Some(address) => Some(fly::connect(address, &args.connect).await?),
+        Some(address) => Some(act_client::connect(address, &args.connect).await?),
         None => None,
     };
     let bar = progress::bar(names.len() as u64, "policies");
@@ -104,7 +105,7 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
         bar.set_message(name.to_owned());
         let survey = match &mut server {
             Some(server) if !reference => {
-                let episodes = fly::episodes(server, name, &env, &seeds).await?;
+                let episodes = act_client::run_episodes(server, name, &env, &seeds).await?;
                 Survey { episodes, aoi: Vec::new(), track: Track::default() }
             }
             _ => {
@@ -126,14 +127,14 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
             .with_context(|| format!("writing the report to {}", directory.display()))?;
     }
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&comparison.json()?)?);
+        outln!("{}", serde_json::to_string_pretty(&comparison.json()?)?)?;
         return Ok(());
     }
-    println!("{}; AoI in slots", comparison.conditions());
+    outln!("{}; AoI in slots", comparison.conditions())?;
     let asked = comparison.flown.iter().filter(|f| !f.reference);
-    println!("{}", table::of_policies(&asked.map(|f| (f.name.clone(), f.summary)).collect::<Vec<_>>()));
+    outln!("{}", table::of_policies(&asked.map(|f| (f.name.clone(), f.summary)).collect::<Vec<_>>()))?;
     if let Some(directory) = &args.report {
-        println!("Report: {}", directory.join("index.html").display());
+        outln!("Report: {}", directory.join("index.html").display())?;
     }
     Ok(())
 }

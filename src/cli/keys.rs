@@ -1,36 +1,39 @@
-//! `qedgix keys`: API keys in a data directory, whether or not a server runs on it.
+//! `qedgix keys`: manages the API keys in a data directory. A server may run on it at the same time.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
+use anyhow::Context;
 use clap::{Args, Subcommand};
 use comfy_table::{Table, presets};
 use jiff::{Span, SpanRelativeTo, Timestamp};
 use serde_json::json;
 
-use crate::service::keys::{self, Created, KeyInfo, NewKey, Scopes};
+use super::output::{errln, outln};
+use crate::service::keys::{self, CreatedKey, KeyInfo, NewKey, Scopes};
 
 /// Flags of `keys`.
 #[derive(Args, Debug)]
 #[command(
-    after_help = "Scopes: read (lists, shows, metrics), act (acts, sessions, environments, inference), jobs (submit, cancel, pause, \
-                        resume, delete), admin (policies, and all of these).
+    after_help = "Scopes: read (lists, details, metrics), act (Act, sessions, environments, inference), jobs (submit, cancel, pause, \
+                        resume, delete), admin (policies and aliases, and everything above).
 
-From the first key on a server asks every caller for one. A running server notices changes within a second or two.
+Once a data directory has a key, its server requires a key from every caller. A running server notices changes within about a
+second.
 
 Examples:
   qedgix keys create --name fleet --scopes read,act --expires 90d
   export QEDGIX_API_KEY=$(qedgix keys create --name me --scopes admin)
   qedgix keys create --name simulator --scopes act --rate 500 --burst 2000
   qedgix keys list
-  qedgix keys rotate ID --grace 1h       # a new secret; the old one ends in an hour
+  qedgix keys rotate ID --grace 1h       # a new key; the old one expires in an hour
   qedgix keys revoke ID"
 )]
 pub struct KeysArgs {
-    /// The server's data directory
+    /// Data directory of the server
     #[arg(long, env = "QEDGIX_DATA_DIR", default_value = "./qedgix-data", value_name = "DIR", global = true)]
     data_dir: PathBuf,
-    /// Print JSON
+    /// Print JSON instead of text
     #[arg(long, env = "QEDGIX_JSON", global = true)]
     json: bool,
     #[command(subcommand)]
@@ -39,36 +42,36 @@ pub struct KeysArgs {
 
 #[derive(Debug, Subcommand)]
 enum What {
-    /// Make a key and print it: once, it is kept nowhere
+    /// Create a key and print it. It is shown only once, because the server stores only its hash
     Create {
-        /// What you call it, to know it again
+        /// Name for people, 1 to 128 bytes
         #[arg(long)]
         name: String,
-        /// What it opens, separated by commas: read, act, jobs, admin
+        /// What the key allows: one or more of read, act, jobs and admin, separated by commas
         #[arg(long)]
         scopes: Scopes,
-        /// How long it lasts: 12h, 90d, 52w [default: until it is revoked]
+        /// Time until the key expires, such as 12h, 90d or 52w [default: never]
         #[arg(long, value_parser = time, value_name = "TIME")]
         expires: Option<Duration>,
-        /// Most requests per second [default: the server's --key-rate]
+        /// Maximum requests per second [default: --key-rate of the server]
         #[arg(long, value_name = "PER_SECOND")]
         rate: Option<f64>,
-        /// Most of them at once [default: as many as one second allows]
+        /// Maximum requests at once, after a pause [default: the requests of one second]
         #[arg(long, value_name = "REQUESTS", requires = "rate")]
         burst: Option<f64>,
     },
-    /// Tell of all keys, without their secrets
+    /// List all keys, without their secrets
     List,
-    /// End a key at once
+    /// Revoke a key; it stops working within about a second
     Revoke {
-        /// Its id, or the whole key
+        /// Id of the key, or the whole key
         id: String,
     },
-    /// Make a key like another one, which ends
+    /// Replace a key: create one with the same name, scopes, rate and lifetime, and let the old one expire
     Rotate {
-        /// The old one's id, or the whole key
+        /// Id of the old key, or the whole key
         id: String,
-        /// How long the old one still lasts
+        /// Time until the old key expires, such as 30m, 1h or 7d
         #[arg(long, value_parser = time, default_value = "0s", value_name = "TIME")]
         grace: Duration,
     },
@@ -77,42 +80,40 @@ enum What {
 /// Runs the command.
 ///
 /// # Errors
-/// No data directory, values that cannot be used, an unknown key.
+/// The data directory has no database, a value is invalid, or the key is unknown.
 pub async fn run(args: KeysArgs) -> anyhow::Result<()> {
-    let store = keys::open(&args.data_dir, matches!(args.what, What::Create { .. })).await?;
+    let store = keys::open_store(&args.data_dir, matches!(args.what, What::Create { .. })).await?;
     let now = Timestamp::now();
     match args.what {
         What::Create { name, scopes, expires, rate, burst } => {
             let new = NewKey { name, scopes, lifetime: expires, rate, burst };
-            show(&keys::create(&store, new, now).await?, args.json);
+            print_created(&keys::create(&store, new, now).await?, args.json)?;
         }
-        What::Rotate { id, grace } => show(&keys::rotate(&store, &id, grace, now).await?, args.json),
+        What::Rotate { id, grace } => print_created(&keys::rotate(&store, &id, grace, now).await?, args.json)?,
         What::Revoke { id } => keys::revoke(&store, &id, now).await?,
         What::List => {
             let list = keys::list(&store, now).await?;
             if args.json {
-                println!("{}", serde_json::to_string_pretty(&json!({"keys": list}))?);
+                outln!("{}", serde_json::to_string_pretty(&json!({"keys": list}))?)?;
             } else {
-                println!("{}", table(&list));
+                outln!("{}", table(&list))?;
             }
         }
     }
     Ok(())
 }
 
-/// The key alone goes to standard output, so that a script can take it.
-fn show(created: &Created, json: bool) {
-    let Created { info, key } = created;
-    if json {
-        println!(
-            "{}",
-            json!({"key": key, "id": info.id, "name": info.name, "scopes": info.scopes, "expires_at": info.expires_at})
-        );
-        return;
-    }
-    let end = info.expires_at.map_or_else(|| "until it is revoked".to_owned(), |at| format!("until {}", minute(at)));
-    eprintln!("{} ({}) opens {} {end}; it is shown this once:", info.name, info.id, info.scopes);
-    println!("{key}");
+/// Prints the key alone to standard output, so that scripts can capture it, and everything else to standard error.
+fn print_created(created: &CreatedKey, json: bool) -> anyhow::Result<()> {
+    let CreatedKey { info, key } = created;
+    let printed = if json {
+        outln!("{}", json!({"key": key, "id": info.id, "name": info.name, "scopes": info.scopes, "expires_at": info.expires_at}))
+    } else {
+        let expiry = info.expires_at.map_or_else(|| "never expires".to_owned(), |at| format!("expires {}", minute(at)));
+        errln!("API key {} ({}), scopes {}, {expiry}. It is shown only now:", info.id, info.name, info.scopes);
+        outln!("{key}")
+    };
+    printed.with_context(|| format!("the API key {} exists and was not shown; revoke it", info.id))
 }
 
 fn table(list: &[KeyInfo]) -> Table {
@@ -133,10 +134,11 @@ fn minute(at: Timestamp) -> String {
     at.strftime("%Y-%m-%d %H:%M").to_string()
 }
 
-/// A time as people write it; a day has 24 hours.
+/// Parses a time with units; a day has 24 hours.
 fn time(text: &str) -> Result<Duration, String> {
     let span = text.parse::<Span>().ok().and_then(|span| span.to_duration(SpanRelativeTo::days_are_24_hours()).ok());
-    span.and_then(|time| Duration::try_from(time).ok()).ok_or_else(|| "expected a number with a unit: 12h, 90d, 52w".to_owned())
+    span.and_then(|time| Duration::try_from(time).ok())
+        .ok_or_else(|| "expected a number with a unit, such as 12h, 90d or 52w".to_owned())
 }
 
 #[cfg(test)]
@@ -144,7 +146,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn times_as_people_write_them() {
+    fn times_with_units_are_parsed() {
         const DAY: u64 = 24 * 3600;
         assert_eq!(time("90d"), Ok(Duration::from_secs(90 * DAY)));
         assert_eq!(time("2w"), Ok(Duration::from_secs(14 * DAY)));

@@ -1,5 +1,6 @@
-//! The command line. Each command has a file; every flag is also an environment variable `QEDGIX_*`.
+//! The command line. Each command has its own file. Every flag is also an environment variable `QEDGIX_*`.
 
+mod act_client;
 mod bench;
 mod client;
 mod comparison;
@@ -8,9 +9,9 @@ mod demo;
 mod evaluate;
 mod experiment;
 mod files;
-mod fly;
+mod in_process_server;
 mod keys;
-mod local;
+mod output;
 mod policies;
 mod progress;
 mod report;
@@ -22,9 +23,10 @@ mod worker;
 
 use std::process::ExitCode;
 
+use anyhow::Context;
 use clap::{Parser, Subcommand};
 
-/// Trains and serves policies that fly UAV fleets for fresh data (Age of Information).
+/// Trains and serves policies that steer UAV fleets to keep data fresh (Age of Information)
 #[derive(Debug, Parser)]
 #[command(name = "qedgix", version, arg_required_else_help = true)]
 struct Cli {
@@ -36,27 +38,31 @@ struct Cli {
 enum Command {
     /// Serve policies and run training jobs
     Serve(serve::ServeArgs),
-    /// The whole story on an empty machine: serve, fly, train, fly what was trained
+    /// Start a server, run policies on it, train a policy, and compare them all
     Demo(demo::DemoArgs),
-    /// Train a policy, here or as a job of a server
+    /// Train a policy in this process or as a job of a server
     Train(train::TrainArgs),
-    /// Compare policies on frozen layouts
+    /// Compare policies on fixed layouts
     Evaluate(evaluate::EvaluateArgs),
-    /// The policies of a server: list, upload, export, aliases, load and unload
+    /// List, upload, export, load and unload policies of a server, and move aliases
     Policies(policies::PoliciesArgs),
-    /// Run, resume and draw an experiment: many training runs and what they say together
+    /// Run or resume an experiment: many training runs, with tables and plots of the results
     Experiment(experiment::ExperimentArgs),
-    /// Make, list and revoke the API keys of a server
+    /// Create, list, rotate and revoke the API keys of a server
     Keys(keys::KeysArgs),
-    /// Measure how fast the parts are on this machine
+    /// Measure the speed of Act and of the learner on this machine
     Bench(bench::BenchArgs),
-    /// Run one job for a server; servers start their workers themselves
+    /// Run one job for a server (servers start their workers themselves)
     Worker(worker::WorkerArgs),
 }
 
-/// Runs the command that the process was started with.
+/// Runs the command of the command line.
 pub fn run() -> ExitCode {
-    match Cli::parse().command {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(message) => return output::print_usage(&message),
+    };
+    match cli.command {
         Command::Serve(args) => block_on(serve::run(args)),
         Command::Demo(args) => block_on(demo::run(args)),
         Command::Train(args) => block_on(train::run(args)),
@@ -65,28 +71,19 @@ pub fn run() -> ExitCode {
         Command::Experiment(args) => block_on(experiment::run(args)),
         Command::Keys(args) => block_on(keys::run(args)),
         Command::Bench(args) => block_on(bench::run(args)),
-        // It begins without threads and without a runtime.
-        Command::Worker(args) => worker::run(&args),
+        // A worker lowers its priority before it has threads, so it creates its own runtime.
+        Command::Worker(args) => output::exit_code(worker::run(&args)),
     }
 }
 
-/// Runs a command that serves or waits.
+/// Runs a command on a multi-threaded runtime.
 fn block_on(command: impl Future<Output = anyhow::Result<()>>) -> ExitCode {
     let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
         Ok(runtime) => runtime,
-        Err(e) => {
-            eprintln!("error: starting: {e}");
-            return ExitCode::FAILURE;
-        }
+        Err(error) => return output::exit_code(Err(error).context("cannot start the runtime")),
     };
-    let done = runtime.block_on(command);
-    // What is still being computed then ends with the process.
+    let result = runtime.block_on(command);
+    // Does not wait for tasks that still compute; they end with the process.
     runtime.shutdown_background();
-    match done {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(e) => {
-            eprintln!("error: {e:#}");
-            ExitCode::FAILURE
-        }
-    }
+    output::exit_code(result)
 }

@@ -1,14 +1,16 @@
-//! `qedgix policies`: the policies of a server, over REST.
+//! `qedgix policies`: manages the policies of a server over REST.
 
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use clap::{Args, Subcommand};
+use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, PercentEncode, utf8_percent_encode};
 use serde_json::{Value, json};
 
 use super::client::Client;
 use super::connect::ConnectArgs;
 use super::files::write_whole;
+use super::output::outln;
 use super::table;
 use crate::checkpoint::digest;
 
@@ -17,41 +19,44 @@ use crate::checkpoint::digest;
 #[command(after_help = "Examples:
   qedgix policies list
   qedgix policies upload my-policy policy.safetensors --alias live
-  qedgix policies alias set my-policy live 3 --expected 2      # only if live means version 2 now
+  qedgix policies alias set my-policy live 3 --expected 2      # only if live points to version 2
   qedgix policies history my-policy
-  qedgix policies unload my-policy:1                            # sessions that fly it go on
+  qedgix policies unload my-policy:1                            # open sessions continue
   qedgix policies export my-policy@live --out live.safetensors
   qedgix policies list --server 192.0.2.7:8080 --json")]
 pub struct PoliciesArgs {
     #[command(subcommand)]
     command: Command,
-    /// The server's REST address
+    /// REST address of the server
     #[arg(long, global = true, env = "QEDGIX_SERVER", default_value = "127.0.0.1:8080", value_name = "HOST:PORT")]
     server: String,
     #[command(flatten)]
     connect: ConnectArgs,
-    /// Print the server's answer as JSON
+    /// Print the response of the server as JSON
     #[arg(long, global = true)]
     json: bool,
 }
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// All policies, each in its newest version
+    /// List all policies with their newest versions
     List,
-    /// One policy: NAME, NAME@ALIAS or NAME:VERSION
-    Get { policy: String },
+    /// Show one policy
+    Get {
+        /// NAME, NAME@ALIAS or NAME:VERSION
+        policy: String,
+    },
     /// Publish a checkpoint as the next version of a policy
     Upload {
-        /// Name of the policy, new or known
+        /// Name of a new or existing policy
         name: String,
-        /// A checkpoint, as `train` writes it
+        /// Checkpoint file, as `qedgix train` writes it
         #[arg(required_unless_present = "checkpoint")]
         file: Option<PathBuf>,
-        /// A checkpoint of a training job of the server, by its id, instead of a file
+        /// Id of a checkpoint of a training job, instead of a file
         #[arg(long, value_name = "ID", conflicts_with = "file")]
         checkpoint: Option<String>,
-        /// Let this alias mean it
+        /// Also point this alias to the new version [default: no alias]
         #[arg(long)]
         alias: Option<String>,
     },
@@ -59,48 +64,62 @@ enum Command {
     Export {
         /// NAME, NAME@ALIAS or NAME:VERSION
         policy: String,
-        /// Where to [default: NAME-VERSION.safetensors]
+        /// Output file [default: NAME-VERSION.safetensors]
         #[arg(long)]
         out: Option<PathBuf>,
     },
-    /// Names for versions that move
+    /// List, set and delete aliases
     #[command(subcommand)]
     Alias(Alias),
-    /// Where the aliases of a policy have been, newest first
+    /// Show the changes of the aliases of a policy, newest first
     History {
         /// Name of the policy
         name: String,
-        /// Only this alias
+        /// Show only this alias [default: all aliases]
         #[arg(long)]
         alias: Option<String>,
-        /// At most this many moves
+        /// Maximum number of changes
         #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=1000))]
         limit: u32,
     },
-    /// Load all versions of a policy (NAME) or one (NAME:VERSION)
-    Load { policy: String },
-    /// Unload all versions of a policy (NAME) or one (NAME:VERSION); sessions that fly them go on
-    Unload { policy: String },
+    /// Load all versions of a policy, or one
+    Load {
+        /// NAME or NAME:VERSION
+        policy: String,
+    },
+    /// Unload all versions of a policy, or one; open sessions continue
+    Unload {
+        /// NAME or NAME:VERSION
+        policy: String,
+    },
 }
 
 #[derive(Debug, Subcommand)]
 enum Alias {
-    /// Aliases of a policy
-    List { name: String },
-    /// Let NAME@ALIAS mean a version, for all requests at once
-    Set {
+    /// List the aliases of a policy
+    List {
+        /// Name of the policy
         name: String,
+    },
+    /// Point an alias to a version, for all requests at once
+    Set {
+        /// Name of the policy
+        name: String,
+        /// Name of the alias
         alias: String,
+        /// Version that the alias points to
         version: u64,
-        /// Only if it means this version now; 0: nothing
+        /// Fail unless the alias points to this version; 0: unless the alias is new [default: no check]
         #[arg(long, value_name = "VERSION")]
         expected: Option<u64>,
     },
     /// Delete an alias
     Delete {
+        /// Name of the policy
         name: String,
+        /// Name of the alias
         alias: String,
-        /// Only if it means this version now
+        /// Fail unless the alias points to this version [default: no check]
         #[arg(long, value_name = "VERSION")]
         expected: Option<u64>,
     },
@@ -109,55 +128,55 @@ enum Alias {
 /// Runs the command.
 ///
 /// # Errors
-/// The server cannot be reached or refuses, or a file cannot be read or written.
+/// The server cannot be reached or refuses the request, or a file cannot be read or written.
 pub async fn run(args: PoliciesArgs) -> anyhow::Result<()> {
     let client = Client::new(&args.server, &args.connect)?;
-    let (answer, text) = match args.command {
+    let (response, text) = match args.command {
         Command::List => list(&client).await?,
-        Command::Get { policy } => described(client.get(&at(&[&policy])).await?),
+        Command::Get { policy } => details(client.get(&path(&[&policy])).await?),
         Command::Upload { name, file, checkpoint, alias } => {
-            let path = at(&[&name, "versions"]) + &query(&[("alias", alias)]);
-            described(match file {
-                Some(file) => client.upload(&path, read(&file)?).await?,
-                None => client.post(&path, &json!({"checkpoint_id": checkpoint})).await?,
+            let url = path(&[&name, "versions"]) + &query(&[("alias", alias)]);
+            details(match file {
+                Some(file) => client.upload(&url, read(&file)?).await?,
+                None => client.post(&url, &json!({"checkpoint_id": checkpoint})).await?,
             })
         }
         Command::Export { policy, out } => export(&client, &policy, out).await?,
         Command::Alias(Alias::List { name }) => {
-            let answer = client.get(&at(&[&name, "aliases"])).await?;
-            let rows = items(&answer, "aliases").map(|a| [text(&a["alias"]), text(&a["version"])]);
+            let response = client.get(&path(&[&name, "aliases"])).await?;
+            let rows = items(&response, "aliases").map(|a| [text(&a["alias"]), text(&a["version"])]);
             let table = table::of_rows(["alias", "version"], rows);
-            (answer, table)
+            (response, table)
         }
         Command::Alias(Alias::Set { name, alias, version, expected }) => {
             let body = json!({"version": version, "expected": expected});
-            let answer = client.put(&at(&[&name, "aliases", &alias]), &body).await?;
-            let before = match answer["previous"].as_u64() {
-                None => "new".to_owned(),
-                Some(previous) if previous == version => "as before".to_owned(),
-                Some(previous) => format!("before: {name}:{previous}"),
+            let response = client.put(&path(&[&name, "aliases", &alias]), &body).await?;
+            let before = match response["previous"].as_u64() {
+                None => "new alias".to_owned(),
+                Some(previous) if previous == version => "unchanged".to_owned(),
+                Some(previous) => format!("previously {name}:{previous}"),
             };
-            (answer, format!("{name}@{alias} is {name}:{version} ({before})"))
+            (response, format!("{name}@{alias} points to {name}:{version} ({before})"))
         }
         Command::Alias(Alias::Delete { name, alias, expected }) => {
-            let path = at(&[&name, "aliases", &alias]) + &query(&[("expected", expected.map(|v| v.to_string()))]);
-            (client.delete(&path).await?, format!("{name}@{alias} is deleted"))
+            let url = path(&[&name, "aliases", &alias]) + &query(&[("expected", expected.map(|v| v.to_string()))]);
+            (client.delete(&url).await?, format!("deleted {name}@{alias}"))
         }
         Command::History { name, alias, limit } => {
             let filter = query(&[("alias", alias), ("page_size", Some(limit.to_string()))]);
-            let answer = client.get(&(at(&[&name, "history"]) + &filter)).await?;
-            let moves = items(&answer, "history");
+            let response = client.get(&(path(&[&name, "history"]) + &filter)).await?;
+            let moves = items(&response, "history");
             let rows = moves.map(|m| ["at", "alias", "previous", "version", "by"].map(|field| text(&m[field])));
             let table = table::of_rows(["at", "alias", "from", "to", "by"], rows);
-            (answer, table)
+            (response, table)
         }
-        Command::Load { policy } => described(client.post(&at(&[&policy, "load"]), &Value::Null).await?),
-        Command::Unload { policy } => described(client.post(&at(&[&policy, "unload"]), &Value::Null).await?),
+        Command::Load { policy } => details(client.post(&path(&[&policy, "load"]), &Value::Null).await?),
+        Command::Unload { policy } => details(client.post(&path(&[&policy, "unload"]), &Value::Null).await?),
     };
     if args.json {
-        println!("{answer:#}");
+        outln!("{response:#}")?;
     } else {
-        println!("{text}");
+        outln!("{text}")?;
     }
     Ok(())
 }
@@ -188,8 +207,8 @@ async fn list(client: &Client) -> anyhow::Result<(Value, String)> {
     Ok((json!({"policies": all}), table))
 }
 
-/// A policy, and a line per field that says something.
-fn described(policy: Value) -> (Value, String) {
+/// A policy and a table of its fields.
+fn details(policy: Value) -> (Value, String) {
     let reference = format!("{}:{}", text(&policy["ref"]["name"]), text(&policy["ref"]["version"]));
     let mut rows = vec![
         ["policy".to_owned(), reference],
@@ -199,62 +218,60 @@ fn described(policy: Value) -> (Value, String) {
     for field in ["loaded", "aliases", "versions", "loaded_versions", "headings", "detection_range", "created_at"] {
         rows.push([field.to_owned(), text(&policy[field])]);
     }
-    for (figure, value) in policy["metrics"].as_object().into_iter().flatten() {
-        rows.push([figure.clone(), text(value)]);
+    for (metric, value) in policy["metrics"].as_object().into_iter().flatten() {
+        rows.push([metric.clone(), text(value)]);
     }
     let table = table::of_rows(["", ""], rows);
     (policy, table)
 }
 
 async fn export(client: &Client, policy: &str, out: Option<PathBuf>) -> anyhow::Result<(Value, String)> {
-    // Which version it is now, so that the file has its name whatever moves meanwhile.
-    let now = client.get(&at(&[policy])).await?;
-    let (name, version) = (text(&now["ref"]["name"]), text(&now["ref"]["version"]));
-    let bytes = client.download(&at(&[&format!("{name}:{version}"), "export"])).await?;
+    // Resolves the version first, so that an alias that moves meanwhile does not change what is downloaded.
+    let details = client.get(&path(&[policy])).await?;
+    let (name, version) = (text(&details["ref"]["name"]), text(&details["ref"]["version"]));
+    let bytes = client.download(&path(&[&format!("{name}:{version}"), "export"])).await?;
     let sha256 = digest(&bytes);
-    ensure!(now["ref"]["digest"] == sha256.as_str(), "{policy}: what came has another digest than {name}:{version}");
+    ensure!(
+        details["ref"]["digest"] == sha256.as_str(),
+        "{policy}: the downloaded bytes do not have the digest of {name}:{version}"
+    );
     let out = out.unwrap_or_else(|| format!("{name}-{version}.safetensors").into());
     write_whole(&out, &bytes)?;
-    let told = format!("{name}:{version}, {} bytes, is in {}", bytes.len(), out.display());
-    Ok((json!({"policy": format!("{name}:{version}"), "digest": sha256, "file": out, "size": bytes.len()}), told))
+    let text = format!("wrote {name}:{version} ({} bytes) to {}", bytes.len(), out.display());
+    Ok((json!({"policy": format!("{name}:{version}"), "digest": sha256, "file": out, "size": bytes.len()}), text))
 }
 
 fn read(file: &Path) -> anyhow::Result<Vec<u8>> {
     std::fs::read(file).with_context(|| format!("cannot read {}", file.display()))
 }
 
-/// The path of a policy and what is below it; whatever a person types stays one segment.
-fn at(segments: &[&str]) -> String {
-    segments.iter().fold("/v1/policies".to_owned(), |path, segment| path + "/" + &escaped(segment))
+/// The path of a policy and resources below it. Each segment is percent-encoded.
+fn path(segments: &[&str]) -> String {
+    segments.iter().fold("/v1/policies".to_owned(), |path, segment| format!("{path}/{}", encode(segment)))
 }
 
 fn query(parameters: &[(&str, Option<String>)]) -> String {
-    let given = parameters.iter().filter_map(|(name, value)| Some(format!("{name}={}", escaped(value.as_deref()?))));
+    let given = parameters.iter().filter_map(|(name, value)| Some(format!("{name}={}", encode(value.as_deref()?))));
     let given: Vec<String> = given.collect();
     if given.is_empty() { String::new() } else { format!("?{}", given.join("&")) }
 }
 
-fn escaped(text: &str) -> String {
-    use std::fmt::Write;
-    text.bytes().fold(String::new(), |mut escaped, byte| {
-        if byte.is_ascii_alphanumeric() || b"-_.:@".contains(&byte) {
-            escaped.push(char::from(byte));
-        } else {
-            write!(escaped, "%{byte:02X}").expect("a String takes all that is written");
-        }
-        escaped
-    })
+/// Characters that are percent-encoded in segments and query values.
+const ENCODED: &AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'_').remove(b'.').remove(b':').remove(b'@');
+
+fn encode(text: &str) -> PercentEncode<'_> {
+    utf8_percent_encode(text, ENCODED)
 }
 
-fn items<'a>(answer: &'a Value, name: &str) -> impl Iterator<Item = &'a Value> {
-    answer[name].as_array().into_iter().flatten()
+fn items<'a>(response: &'a Value, name: &str) -> impl Iterator<Item = &'a Value> {
+    response[name].as_array().into_iter().flatten()
 }
 
 fn kind(policy: &Value) -> &'static str {
     if policy["kind"] == "POLICY_KIND_BASELINE" { "baseline" } else { "checkpoint" }
 }
 
-/// A value as a person reads it.
+/// A JSON value as text.
 fn text(value: &Value) -> String {
     match value {
         Value::Null => "-".to_owned(),
@@ -270,9 +287,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_typed_stays_one_segment() {
-        assert_eq!(at(&["my policy/..?x", "aliases", "live"]), "/v1/policies/my%20policy%2F..%3Fx/aliases/live");
-        assert_eq!(at(&["mine:3"]), "/v1/policies/mine:3");
+    fn segments_and_query_values_are_percent_encoded() {
+        assert_eq!(path(&["my policy/..?x", "aliases", "live"]), "/v1/policies/my%20policy%2F..%3Fx/aliases/live");
+        assert_eq!(path(&["mine:3"]), "/v1/policies/mine:3");
         assert_eq!(query(&[("alias", Some("a&b".into())), ("page_size", None)]), "?alias=a%26b");
         assert_eq!(query(&[("alias", None)]), "");
     }

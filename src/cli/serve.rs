@@ -1,4 +1,4 @@
-//! `qedgix serve`.
+//! `qedgix serve`: flags, signals, and the run of one server.
 
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::path::PathBuf;
@@ -8,122 +8,127 @@ use std::time::Duration;
 use clap::{Args, ValueEnum};
 use tokio::signal::unix::{SignalKind, signal};
 
+use super::output::outln;
 use crate::config::{Config, TlsFiles};
 use crate::server::{self, DataDir, Listeners, Tls};
 use crate::serving::{Clock, EngineConfig};
-use crate::telemetry::{self, Logs, Traces};
+use crate::telemetry::{self, LogConfig, TraceExporter};
 
 /// Flags of `serve`.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   qedgix serve
-  qedgix serve --grpc-addr 127.0.0.1:0 --http-addr 127.0.0.1:0 --data-dir /var/lib/qedgix   # free ports, see endpoints.json
+  qedgix serve --grpc-addr 127.0.0.1:0 --http-addr 127.0.0.1:0 --data-dir /var/lib/qedgix   # free ports, written to endpoints.json
   QEDGIX_CPU_BUDGET=2 QEDGIX_LOG=debug qedgix serve --log-format json
-  qedgix keys create --name fleet --scopes read,act   # from now on callers must show a key ...
-  qedgix serve --grpc-addr 0.0.0.0:50051 --http-addr 0.0.0.0:8080 --tls-cert cert.pem --tls-key key.pem   # ... so others may come
-  qedgix serve --tls-cert cert.pem --tls-key key.pem --tls-client-ca clients.pem --key-rate 500 --max-connections 2000")]
+
+Remote access with API keys and TLS:
+  qedgix keys create --name fleet --scopes read,act
+  qedgix serve --grpc-addr 0.0.0.0:50051 --http-addr 0.0.0.0:8080 --tls-cert cert.pem --tls-key key.pem
+  qedgix serve --tls-cert cert.pem --tls-key key.pem --tls-client-ca clients.pem --key-rate 500 --max-connections 2000
+
+A TIME is a number of seconds or a number with a unit: 500us, 2ms, 90s, 10m, 2h.")]
 pub struct ServeArgs {
-    /// Where gRPC listens; port 0 picks a free one
+    /// Address of gRPC; port 0 selects a free port
     #[arg(long, env = "QEDGIX_GRPC_ADDR", default_value = "127.0.0.1:50051", value_parser = address, value_name = "HOST:PORT")]
     grpc_addr: SocketAddr,
-    /// Where REST listens; port 0 picks a free one
+    /// Address of REST; port 0 selects a free port
     #[arg(long, env = "QEDGIX_HTTP_ADDR", default_value = "127.0.0.1:8080", value_parser = address, value_name = "HOST:PORT")]
     http_addr: SocketAddr,
-    /// Where everything durable is; created if need be
+    /// Directory of the database; created if missing
     #[arg(long, env = "QEDGIX_DATA_DIR", default_value = "./qedgix-data", value_name = "DIR")]
     data_dir: PathBuf,
-    /// Cores that training jobs may use together [default: all]
-    #[arg(long, env = "QEDGIX_CPU_BUDGET", value_name = "CORES")]
+    /// CPU budget: threads that all running training jobs may use together [default: all cores]
+    #[arg(long, env = "QEDGIX_CPU_BUDGET", value_name = "THREADS")]
     cpu_budget: Option<usize>,
-    /// Failed attempts after which a job has failed
-    #[arg(long, env = "QEDGIX_MAX_ATTEMPTS", default_value_t = 3)]
+    /// Failed attempts after which a job fails
+    #[arg(long, env = "QEDGIX_MAX_ATTEMPTS", default_value_t = 3, value_name = "ATTEMPTS")]
     max_attempts: u32,
-    /// Time between snapshots of a running job; after a crash it goes on from the last one
-    #[arg(long, env = "QEDGIX_SNAPSHOT_EVERY", default_value = "10s", value_parser = duration)]
+    /// Time between two snapshots of a running job; after a crash the job continues from its last snapshot
+    #[arg(long, env = "QEDGIX_SNAPSHOT_EVERY", default_value = "10s", value_parser = duration, value_name = "TIME")]
     snapshot_every: Duration,
-    /// A session idle for longer expires: seconds, or 90s, 10m, 2h
-    #[arg(long, env = "QEDGIX_SESSION_TTL", default_value = "10m", value_parser = duration)]
+    /// Idle time after which a session expires
+    #[arg(long, env = "QEDGIX_SESSION_TTL", default_value = "10m", value_parser = duration, value_name = "TIME")]
     session_ttl: Duration,
-    /// Most open sessions
-    #[arg(long, env = "QEDGIX_MAX_SESSIONS", default_value_t = 100_000)]
+    /// Maximum open sessions
+    #[arg(long, env = "QEDGIX_MAX_SESSIONS", default_value_t = 100_000, value_name = "SESSIONS")]
     max_sessions: usize,
-    /// A hosted environment idle for longer expires: seconds, or 90s, 10m, 2h
-    #[arg(long, env = "QEDGIX_ENVIRONMENT_TTL", default_value = "10m", value_parser = duration)]
+    /// Idle time after which a hosted environment expires
+    #[arg(long, env = "QEDGIX_ENVIRONMENT_TTL", default_value = "10m", value_parser = duration, value_name = "TIME")]
     environment_ttl: Duration,
-    /// Most hosted environments
-    #[arg(long, env = "QEDGIX_MAX_ENVIRONMENTS", default_value_t = 1024)]
+    /// Maximum hosted environments
+    #[arg(long, env = "QEDGIX_MAX_ENVIRONMENTS", default_value_t = 1024, value_name = "ENVIRONMENTS")]
     max_environments: usize,
-    /// Memory that all hosted environments may take together, in bytes
+    /// Maximum memory of all hosted environments together, in bytes
     #[arg(long, env = "QEDGIX_ENVIRONMENT_MEMORY", default_value_t = 1 << 30, value_name = "BYTES")]
     environment_memory: usize,
-    /// Largest gRPC message and HTTP body, in bytes
+    /// Maximum size of a gRPC message or HTTP body, in bytes
     #[arg(long, env = "QEDGIX_MAX_MESSAGE_SIZE", default_value_t = 16 << 20, value_name = "BYTES")]
     max_message_size: usize,
     /// Threads that compute headings [default: all cores, at most 4]
     #[arg(long, env = "QEDGIX_ENGINE_THREADS", value_name = "THREADS")]
     engine_threads: Option<usize>,
-    /// Streams of jobs' events that may be open at a time; more are refused
+    /// Maximum open streams of job events; further streams are refused
     #[arg(long, env = "QEDGIX_MAX_WATCHERS", default_value_t = 256, value_name = "STREAMS")]
     max_watchers: usize,
-    /// Silence after which a stream of events over HTTP gives a sign of life
-    #[arg(long, env = "QEDGIX_EVENT_HEARTBEAT", default_value = "15s", value_parser = duration)]
+    /// Idle time after which an event stream over HTTP sends a comment, so that proxies keep it open
+    #[arg(long, env = "QEDGIX_EVENT_HEARTBEAT", default_value = "15s", value_parser = duration, value_name = "TIME")]
     event_heartbeat: Duration,
-    /// Fleets that may wait to be computed; more are refused
+    /// Maximum fleets in the queue of the engine; further requests are refused
     #[arg(long, env = "QEDGIX_ENGINE_QUEUE", default_value_t = 4096, value_name = "FLEETS")]
     engine_queue: usize,
-    /// Most fleets computed together; they gather while the engine is busy
+    /// Maximum fleets computed in one forward pass
     #[arg(long, env = "QEDGIX_MAX_BATCH", default_value_t = 64, value_name = "FLEETS")]
     max_batch: usize,
-    /// How long a fleet may wait for company, counted from the oldest of a batch: seconds, or 500us, 2ms
-    #[arg(long, env = "QEDGIX_MAX_BATCH_DELAY", default_value = "0s", value_parser = duration)]
+    /// Maximum time that the oldest fleet of a batch waits for further fleets, at most 10 s
+    #[arg(long, env = "QEDGIX_MAX_BATCH_DELAY", default_value = "0s", value_parser = duration, value_name = "TIME")]
     max_batch_delay: Duration,
-    /// Time that requests in flight are given when the server stops
-    #[arg(long, env = "QEDGIX_DRAIN_TIMEOUT", default_value = "20s", value_parser = duration)]
+    /// Time that requests in flight have to complete when the server stops, at most 24 h
+    #[arg(long, env = "QEDGIX_DRAIN_TIMEOUT", default_value = "20s", value_parser = duration, value_name = "TIME")]
     drain_timeout: Duration,
-    /// Listen on addresses that others can reach, although nobody has to say who they are
+    /// Allow addresses other than loopback although no API key exists. Existing keys stay mandatory
     #[arg(long, help_heading = SECURITY, env = "QEDGIX_INSECURE")]
     insecure: bool,
     #[command(flatten)]
     security: SecurityArgs,
-    /// How logs are written to standard error
-    #[arg(long, env = "QEDGIX_LOG_FORMAT", default_value = "text", value_enum)]
+    /// Format of the logs on standard error
+    #[arg(long, env = "QEDGIX_LOG_FORMAT", default_value = "text", value_enum, value_name = "FORMAT")]
     log_format: LogFormat,
-    /// Log every request, however it went, under the target qedgix::access
+    /// Log every request, with the target qedgix::access
     #[arg(long, env = "QEDGIX_ACCESS_LOG")]
     access_log: bool,
-    /// Export traces by OTLP over gRPC to this collector, as http://127.0.0.1:4317 [default: no traces]
+    /// Export traces by OTLP over gRPC to this collector, such as http://127.0.0.1:4317 [default: no export]
     #[arg(long, env = "QEDGIX_OTLP_ENDPOINT", value_name = "URL")]
     otlp_endpoint: Option<String>,
 }
 
-/// Where the help lists them.
+/// Heading of the security flags in the help.
 const SECURITY: &str = "Security";
 
-/// Flags of `serve` that say who gets in, and how far.
+/// Flags of `serve` for TLS and limits per caller.
 #[derive(Args, Debug)]
 struct SecurityArgs {
-    /// Speak TLS with this certificate (PEM, with those that lead to its authority); read again on SIGHUP
+    /// Certificate of the server (PEM, followed by intermediate certificates); turns TLS on; SIGHUP reloads it [default: no TLS]
     #[arg(long, help_heading = SECURITY, env = "QEDGIX_TLS_CERT", value_name = "FILE", requires = "tls_key")]
     tls_cert: Option<PathBuf>,
     /// Private key of the certificate (PEM)
     #[arg(long, help_heading = SECURITY, env = "QEDGIX_TLS_KEY", value_name = "FILE", requires = "tls_cert")]
     tls_key: Option<PathBuf>,
-    /// Callers must show a certificate of one of these authorities (PEM)
+    /// Require client certificates that these authorities issued (PEM) [default: no client certificates]
     #[arg(long, help_heading = SECURITY, env = "QEDGIX_TLS_CLIENT_CA", value_name = "FILE", requires = "tls_cert")]
     tls_client_ca: Option<PathBuf>,
-    /// Most connections of both addresses together; further ones are closed at once
-    #[arg(long, help_heading = SECURITY, env = "QEDGIX_MAX_CONNECTIONS", default_value_t = 10_000)]
+    /// Maximum connections of both addresses together; further connections are closed at once
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_MAX_CONNECTIONS", default_value_t = 10_000, value_name = "CONNECTIONS")]
     max_connections: usize,
-    /// Most streams (calls in flight) of an HTTP/2 connection
-    #[arg(long, help_heading = SECURITY, env = "QEDGIX_MAX_STREAMS", default_value_t = 1024)]
+    /// Maximum streams (calls in flight) per HTTP/2 connection
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_MAX_STREAMS", default_value_t = 1024, value_name = "STREAMS")]
     max_streams: u32,
-    /// Time that a caller may let the server wait: for a handshake, the head of an HTTP/1 request, the next part of a REST body
-    #[arg(long, help_heading = SECURITY, env = "QEDGIX_READ_TIMEOUT", default_value = "30s", value_parser = duration)]
+    /// Read timeout of a TLS handshake, of the head of an HTTP/1 request and of each part of a REST body, at most 1 h
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_READ_TIMEOUT", default_value = "30s", value_parser = duration, value_name = "TIME")]
     read_timeout: Duration,
-    /// Requests per second of an API key that has no --rate of its own [default: as many as it likes]
+    /// Maximum requests per second of an API key without a rate of its own [default: unlimited]
     #[arg(long, help_heading = SECURITY, env = "QEDGIX_KEY_RATE", value_name = "PER_SECOND")]
     key_rate: Option<f64>,
-    /// How many of them at once [default: as many as one second allows]
+    /// Maximum requests at once of such a key, after a pause [default: the requests of one second]
     #[arg(long, help_heading = SECURITY, env = "QEDGIX_KEY_BURST", value_name = "REQUESTS", requires = "key_rate")]
     key_burst: Option<f64>,
 }
@@ -134,38 +139,38 @@ enum LogFormat {
     Json,
 }
 
-/// Serves until ctrl-c or SIGTERM, then drains; a second one ends the process at once.
+/// Serves until ctrl-c or SIGTERM, then drains. A second signal ends the process at once.
 ///
 /// # Errors
-/// A setting that cannot be used, an address or data directory that is taken, a database that cannot be read.
+/// A setting is invalid, an address or the data directory is in use, or the database cannot be read.
 pub async fn run(args: ServeArgs) -> anyhow::Result<()> {
-    let traces = args.otlp_endpoint.as_deref().map(Traces::start).transpose()?;
-    let logs = Logs { json: matches!(args.log_format, LogFormat::Json), access: args.access_log };
-    telemetry::logs(logs, traces.as_ref());
+    let traces = args.otlp_endpoint.as_deref().map(TraceExporter::start).transpose()?;
+    let logs = LogConfig { json: matches!(args.log_format, LogFormat::Json), access: args.access_log };
+    telemetry::init_logs(logs, traces.as_ref());
     let config = args.config();
     config.validate()?;
-    let data = DataDir::take(&config.data_dir)?;
+    let data = DataDir::lock(&config.data_dir)?;
     let listeners = Listeners::bind(&config).await?;
-    // Signals are caught before anybody is told that the server is there.
-    let shutdown = told_to_stop()?;
+    // Signal handlers exist before the server announces its addresses.
+    let shutdown = stop_signal()?;
     reload_on_hangup(listeners.tls())?;
     let app = server::open(&config, &data, Clock::system()).await?;
     let endpoints = listeners.endpoints()?;
-    println!("qedgix {}", env!("CARGO_PKG_VERSION"));
-    println!("gRPC  {}", endpoints.grpc);
-    println!("REST  {}://{}", if config.tls.is_some() { "https" } else { "http" }, endpoints.http);
-    println!("data  {}", config.data_dir.display());
+    outln!("qedgix {}", env!("CARGO_PKG_VERSION"))?;
+    outln!("gRPC  {}", endpoints.grpc)?;
+    outln!("REST  {}://{}", if config.tls.is_some() { "https" } else { "http" }, endpoints.http)?;
+    outln!("data  {}", config.data_dir.display())?;
     let served = server::run(&config, &data, app, listeners, shutdown).await;
     if let Some(traces) = traces {
-        traces.end(config.drain_timeout.min(LAST_SPANS)).await;
+        traces.shutdown(config.drain_timeout.min(SPAN_FLUSH_TIMEOUT)).await;
     }
     Ok(served?)
 }
 
-/// Time that the last spans are given to reach their collector.
-const LAST_SPANS: Duration = Duration::from_secs(5);
+/// Maximum time to send the last spans to the collector.
+const SPAN_FLUSH_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Reads certificates again on SIGHUP. Without TLS there is nothing to read, and a terminal that closes ends the server as ever.
+/// Reloads certificates on SIGHUP. Without TLS, SIGHUP keeps its default action and ends the process.
 fn reload_on_hangup(tls: Option<Arc<Tls>>) -> std::io::Result<()> {
     let Some(tls) = tls else { return Ok(()) };
     let mut hangup = signal(SignalKind::hangup())?;
@@ -177,9 +182,9 @@ fn reload_on_hangup(tls: Option<Arc<Tls>>) -> std::io::Result<()> {
     Ok(())
 }
 
-/// Resolves on the first ctrl-c or SIGTERM. The second one ends the process, whatever is still being done: what was
-/// acknowledged is on the disk, and workers end with the server.
-fn told_to_stop() -> std::io::Result<impl Future<Output = ()>> {
+/// Resolves on the first ctrl-c or SIGTERM. The second signal ends the process at once. No acknowledged change is lost, because it
+/// is committed to the database; workers end with the server.
+fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
     let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
     let mut next = async move || {
         tokio::select! {
@@ -191,7 +196,7 @@ fn told_to_stop() -> std::io::Result<impl Future<Output = ()>> {
         next().await;
         tokio::spawn(async move {
             let code = next().await;
-            tracing::warn!("told to stop again; ending at once");
+            tracing::warn!("second stop signal: ending at once");
             std::process::exit(code);
         });
     })
@@ -213,7 +218,7 @@ impl ServeArgs {
             environment_memory: self.environment_memory,
             max_message_size: self.max_message_size,
             max_watchers: self.max_watchers,
-            heartbeat: self.event_heartbeat,
+            event_heartbeat: self.event_heartbeat,
             engine: EngineConfig {
                 threads: self.engine_threads.unwrap_or(default.engine.threads),
                 queue: self.engine_queue,
@@ -245,22 +250,53 @@ fn address(text: &str) -> Result<SocketAddr, String> {
     found.next().ok_or_else(|| "the host has no address".to_owned())
 }
 
-/// A time as people write it: seconds, or a number with a unit.
+/// Parses a time: a number of seconds, or a number with a unit.
 ///
 /// # Errors
-/// What would be one.
+/// A description of the expected format.
 pub(super) fn duration(text: &str) -> Result<Duration, String> {
     let seconds = text.parse::<f64>().ok().and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
-    let friendly = || text.parse::<jiff::SignedDuration>().ok().and_then(|duration| Duration::try_from(duration).ok());
-    seconds.or_else(friendly).ok_or_else(|| "expected seconds, or a number with a unit: 500ms, 90s, 10m, 2h".to_owned())
+    let with_unit = || text.parse::<jiff::SignedDuration>().ok().and_then(|duration| Duration::try_from(duration).ok());
+    seconds
+        .or_else(with_unit)
+        .ok_or_else(|| "expected a number of seconds, or a number with a unit such as 500ms, 90s, 10m or 2h".to_owned())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    #[derive(clap::Parser)]
+    struct Line {
+        #[command(flatten)]
+        serve: ServeArgs,
+    }
+
+    fn config(words: &[&str]) -> Result<Config, String> {
+        use clap::Parser;
+        let line = Line::try_parse_from([&["x"], words].concat()).map_err(|error| error.to_string())?;
+        let config = line.serve.config();
+        config.validate().map_err(|error| error.to_string()).map(|()| config)
+    }
+
     #[test]
-    fn durations_and_addresses_as_people_write_them() {
+    fn every_duration_flag_refuses_a_time_that_is_too_long() {
+        use clap::CommandFactory;
+        let has_time = |arg: &&clap::Arg| arg.get_value_names().is_some_and(|names| names == ["TIME"]);
+        let flags: Vec<String> =
+            Line::command().get_arguments().filter(has_time).map(|arg| format!("--{}", arg.get_long().unwrap())).collect();
+        assert!(flags.len() >= 7, "{flags:?}");
+        assert!(config(&[]).is_ok());
+        for flag in &flags {
+            for time in ["1e19", "1e300", "-1s", "9e9"] {
+                let error = config(&[&format!("{flag}={time}")]).unwrap_err();
+                assert!(error.contains(flag.as_str()), "{flag}={time}: {error}");
+            }
+        }
+    }
+
+    #[test]
+    fn durations_and_addresses_are_parsed() {
         assert_eq!(duration("90"), Ok(Duration::from_secs(90)));
         assert_eq!(duration("0.5"), Ok(Duration::from_millis(500)));
         assert_eq!(duration("10m"), Ok(Duration::from_secs(600)));

@@ -12,6 +12,7 @@ use serde_json::Value;
 use super::client::Client;
 use super::connect::ConnectArgs;
 use super::files::write_whole;
+use super::output::{errln, outln};
 use super::run_args::{RunArgs, all_cores};
 use super::{progress, table};
 use crate::checkpoint::Checkpoint;
@@ -63,7 +64,7 @@ pub async fn run(args: TrainArgs) -> anyhow::Result<()> {
     if let Some(address) = &args.server {
         let client = Client::new(address, &args.connect)?;
         let job = submit(&client, &args.run.job(threads, args.name.as_deref())?).await?;
-        println!("policy {}", job["policy"].as_str().unwrap_or("none"));
+        outln!("policy {}", job["policy"].as_str().unwrap_or("none"))?;
         return Ok(());
     }
     let trainer = start(&args, threads)?;
@@ -103,7 +104,7 @@ fn start(args: &TrainArgs, threads: usize) -> anyhow::Result<Trainer> {
 
 fn train(args: &TrainArgs, mut trainer: Trainer, threads: usize) -> anyhow::Result<()> {
     let config = trainer.config().clone();
-    eprintln!("{}", serde_json::to_string(&config)?);
+    errln!("{}", serde_json::to_string(&config)?);
     let mut curve = args.metrics.as_deref().map(|path| Curve::open(path, args.resume.is_some())).transpose()?;
     let bar = progress::bar(config.training.steps, "steps");
     let mut evaluations = Vec::new();
@@ -122,7 +123,7 @@ fn train(args: &TrainArgs, mut trainer: Trainer, threads: usize) -> anyhow::Resu
                 let line = format!("step {step:>8}  mean AoI {:6.2}  {}", metrics.mean_aoi, table::sparkline(&evaluations));
                 // Where nobody sees the bar, the line is the progress.
                 if bar.is_hidden() {
-                    eprintln!("{line}");
+                    errln!("{line}");
                 } else {
                     bar.println(line);
                 }
@@ -140,7 +141,7 @@ fn train(args: &TrainArgs, mut trainer: Trainer, threads: usize) -> anyhow::Resu
     if !finished {
         let Some(path) = &args.snapshot else { bail!("stopped; without --snapshot nothing is kept") };
         write_whole(path, &trainer.snapshot())?;
-        println!("stopped; go on with --resume {}", path.display());
+        outln!("stopped; go on with --resume {}", path.display())?;
         return Ok(());
     }
     let best = trainer.best()?.context("a finished run has been evaluated")?;
@@ -153,8 +154,8 @@ fn report(config: &TrainConfig, checkpoint: &Checkpoint, out: &Path, threads: us
     let list = layouts("eval-v1")?;
     let episodes = evaluate(&checkpoint.policy(), &config.environment, &list.seeds(256), threads)?;
     let rows: Vec<(String, Summary)> = vec![(out.display().to_string(), summarize(&episodes)?)];
-    println!("best weights by validation, from step {}; on {}:", checkpoint.step(), list.name);
-    println!("{}", table::of_policies(&rows));
+    outln!("best weights by validation, from step {}; on {}:", checkpoint.step(), list.name)?;
+    outln!("{}", table::of_policies(&rows))?;
     Ok(())
 }
 

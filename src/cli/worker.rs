@@ -1,43 +1,32 @@
-//! `qedgix worker`: started by a server's executor, not by people.
-
-use std::process::ExitCode;
+//! `qedgix worker`: runs one attempt of one job. Servers start it; people do not.
 
 use clap::Args;
 
 use crate::jobs::worker::{self, Assignment, ENV_ATTEMPT, ENV_JOB, ENV_SERVER, ENV_TOKEN};
 use crate::telemetry;
 
-/// Flags of `worker`. What it works at comes through the environment, because it holds a secret.
+/// Flags of `worker`. The job and its token come from the environment, because command lines are visible to all users.
 #[derive(Args, Debug)]
-#[command(
-    after_help = "A server starts its workers itself, with QEDGIX_SERVER, QEDGIX_JOB, QEDGIX_ATTEMPT and QEDGIX_TOKEN set."
-)]
+#[command(after_help = "A server starts its workers itself and sets QEDGIX_SERVER, QEDGIX_JOB, QEDGIX_ATTEMPT and QEDGIX_TOKEN.")]
 pub struct WorkerArgs {
-    /// End when standard input does: whoever started this process is gone
+    /// Exit when standard input closes, which means that the server has ended
     #[arg(long)]
     tethered: bool,
 }
 
-/// Runs one attempt at one job.
-pub fn run(args: &WorkerArgs) -> ExitCode {
-    match try_run(args) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(e) => {
-            eprintln!("error: {e:#}");
-            ExitCode::FAILURE
-        }
-    }
-}
-
-fn try_run(args: &WorkerArgs) -> anyhow::Result<()> {
-    // Before there are threads: they inherit it.
+/// Runs the attempt that the environment names.
+///
+/// # Errors
+/// A variable is missing, or the server refuses the attempt.
+pub fn run(args: &WorkerArgs) -> anyhow::Result<()> {
+    // Before the process has threads, because threads inherit the priority.
     worker::step_back();
     if args.tethered {
         worker::tether()?;
     }
-    telemetry::logs(telemetry::Logs::default(), None);
+    telemetry::init_logs(telemetry::LogConfig::default(), None);
     let variable =
-        |name: &str| std::env::var(name).map_err(|e| anyhow::anyhow!("{name}: {e}; a server starts its workers itself"));
+        |name: &str| std::env::var(name).map_err(|e| anyhow::anyhow!("{name}: {e}; servers start their workers themselves"));
     let assignment = Assignment {
         server: variable(ENV_SERVER)?,
         job: variable(ENV_JOB)?,
@@ -45,8 +34,8 @@ fn try_run(args: &WorkerArgs) -> anyhow::Result<()> {
         token: variable(ENV_TOKEN)?,
     };
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    let done = runtime.block_on(worker::run(assignment));
-    // Training may be in the middle of something; it ends with the process.
+    let result = runtime.block_on(worker::run(assignment));
+    // Does not wait for training threads; they end with the process.
     runtime.shutdown_background();
-    Ok(done?)
+    Ok(result?)
 }

@@ -201,12 +201,3 @@ pub fn token_digest(token: &str) -> [u8; 32] {
 pub fn equal_secrets(a: &[u8], b: &[u8]) -> bool {
     a.ct_eq(b).into()
 }
-
-/// Lower-case hexadecimal.
-pub fn hex(bytes: &[u8]) -> String {
-    use std::fmt::Write;
-    bytes.iter().fold(String::with_capacity(2 * bytes.len()), |mut text, byte| {
-        write!(text, "{byte:02x}").expect("a string takes everything");
-        text
-    })
-}

@@ -106,7 +106,7 @@ impl Jobs {
     async fn begin(&self, job: &Job) -> Result<Option<(Lease, String)>, Fault> {
         let mut secret = [0; 32];
         getrandom::fill(&mut secret)?;
-        let token = super::hex(&secret);
+        let token = hex::encode(secret);
         let lease = self.0.store.begin_attempt(job.id, token_digest(&token), Timestamp::now()).await?;
         Ok(lease.map(|lease| (lease, token)))
     }

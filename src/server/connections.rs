@@ -1,7 +1,7 @@
-//! Connections of a listener: accepted, bounded in number, put through TLS, spoken HTTP on, and let go when the server stops.
+//! Connections of a listener: accepting, the limit on their number, TLS handshakes, HTTP, graceful shutdown.
 //!
-//! Nothing that a caller does or leaves undone holds up others: handshakes are made in the connection's own task, and every
-//! stage before a request has its time.
+//! A slow caller never delays another one: each connection has its own task, which includes the TLS handshake, and each stage
+//! before a request has a timeout.
 
 use std::convert::Infallible;
 use std::error::Error;
@@ -24,42 +24,44 @@ use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
 use tower::Service;
 
-use super::prompt::Prompt;
+use super::read_timeout::FirstBytesTimeout;
 use super::tls::{H2, Tls};
 
-/// What a connection may send before the server has read it, in bytes: a large fleet's observation.
-pub const WINDOW: u32 = 4 << 20;
-/// Pause between two questions whether a silent HTTP/2 caller is still there.
-pub const KEEPALIVE: Duration = Duration::from_secs(30);
-/// Time that it has to answer.
-const KEEPALIVE_ANSWER: Duration = Duration::from_secs(20);
-/// Pause after the system had no connection to give, although there was one: too many files are open.
-const EXHAUSTED: Duration = Duration::from_millis(500);
+/// HTTP/2 flow-control window in bytes: holds the observation of a large fleet.
+pub const HTTP2_WINDOW: u32 = 4 << 20;
+/// Time between two pings of a silent HTTP/2 connection.
+pub const KEEPALIVE_INTERVAL: Duration = Duration::from_secs(30);
+/// Time in which a ping must be answered.
+const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(20);
+/// Pause after `accept` failed for lack of resources, such as too many open files.
+const ACCEPT_RETRY: Duration = Duration::from_millis(500);
 
-/// What is spoken on a listener.
+/// The protocol of a listener.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Protocol {
     /// HTTP/2.
     Grpc,
-    /// HTTP/1.1; within TLS also HTTP/2, if the caller prefers it.
+    /// HTTP/1.1; with TLS also HTTP/2 when the caller negotiates it (ALPN).
     Http,
 }
 
-/// What the connections of listeners share; cheap to clone.
+/// Settings and limits that connections share; cheap to clone.
 #[derive(Clone)]
 pub(super) struct Connections {
-    /// One for each connection that there may be.
+    /// One permit per allowed connection.
     pub(super) permits: Arc<Semaphore>,
     pub(super) tls: Option<Arc<Tls>>,
-    /// Time for a handshake, for the head of an HTTP/1 request, for the next part of a REST body.
-    pub(super) patience: Duration,
-    /// HTTP/2 streams per connection.
+    /// Timeout of a TLS handshake, of the HTTP/2 preface and of the head of an HTTP/1 request.
+    pub(super) read_timeout: Duration,
+    /// Maximum HTTP/2 streams per connection.
     pub(super) max_streams: u32,
+    /// Cancelled when the server stops accepting.
     pub(super) stop: CancellationToken,
 }
 
 impl Connections {
-    /// Serves until `stop`; returns when requests in flight are answered. Dropped, it ends all connections at once.
+    /// Serves until `stop` is cancelled and returns when all requests in flight are answered. Dropping the future closes all
+    /// connections at once.
     pub(super) async fn serve<S, B>(self, listener: TcpListener, protocol: Protocol, service: S)
     where
         S: Service<Request<Incoming>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
@@ -69,7 +71,7 @@ impl Connections {
     {
         let (graceful, mut tasks) = (GracefulShutdown::new(), JoinSet::new());
         let open = metrics::gauge!("qedgix_connections");
-        let turned_away = metrics::counter!("qedgix_connections_refused_total");
+        let refused = metrics::counter!("qedgix_connections_refused_total");
         loop {
             let accepted = tokio::select! {
                 biased;
@@ -80,55 +82,55 @@ impl Connections {
             match accepted {
                 Ok((stream, _)) => match Arc::clone(&self.permits).try_acquire_owned() {
                     Ok(permit) => {
-                        let one = Open { _permit: permit, gauge: open.clone() };
-                        one.gauge.increment(1.0);
-                        tasks.spawn(self.clone().connection(stream, protocol, service.clone(), graceful.watcher(), one));
+                        let connection = OpenConnection { _permit: permit, gauge: open.clone() };
+                        connection.gauge.increment(1.0);
+                        tasks.spawn(self.clone().connection(stream, protocol, service.clone(), graceful.watcher(), connection));
                     }
-                    // Closed at once: a caller that is told goes elsewhere or comes again; one that waits thinks the server hangs.
-                    Err(_) => turned_away.increment(1),
+                    // Closing at once lets the caller retry or use another server; waiting would look like a hang.
+                    Err(_) => refused.increment(1),
                 },
-                Err(e) if of_the_caller(&e) => {}
+                Err(e) if is_caller_error(&e) => {}
                 Err(error) => {
-                    tracing::error!(%error, "accepting a connection");
-                    tokio::time::sleep(EXHAUSTED).await;
+                    tracing::error!(%error, "cannot accept a connection");
+                    tokio::time::sleep(ACCEPT_RETRY).await;
                 }
             }
         }
-        // The port is free while the last answers are given.
+        // Frees the port while the last requests are answered.
         drop(listener);
         graceful.shutdown().await;
     }
 
-    async fn connection<S, B>(self, stream: TcpStream, protocol: Protocol, service: S, watcher: Watcher, _open: Open)
+    async fn connection<S, B>(self, stream: TcpStream, protocol: Protocol, service: S, watcher: Watcher, _open: OpenConnection)
     where
         S: Service<Request<Incoming>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
         S::Future: Send,
         B: Body<Data = Bytes> + Send + 'static,
         B::Error: Into<Box<dyn Error + Send + Sync>>,
     {
-        // Only latency is lost where it cannot be set.
+        // Failure costs latency only.
         let _ = stream.set_nodelay(true);
-        let Some(tls) = &self.tls else { return self.speak(stream, protocol == Protocol::Grpc, service, watcher).await };
-        let configs = tls.now();
+        let Some(tls) = &self.tls else { return self.serve_http(stream, protocol == Protocol::Grpc, service, watcher).await };
+        let configs = tls.current();
         let config = if protocol == Protocol::Grpc { configs.grpc } else { configs.http };
-        let handshake = tokio::time::timeout(self.patience, TlsAcceptor::from(config).accept(stream));
-        let shaken = tokio::select! {
-            shaken = handshake => shaken,
+        let handshake = tokio::time::timeout(self.read_timeout, TlsAcceptor::from(config).accept(stream));
+        let handshake = tokio::select! {
+            done = handshake => done,
             () = self.stop.cancelled() => return,
         };
-        match shaken {
+        match handshake {
             Ok(Ok(stream)) => {
                 let agreed = stream.get_ref().1.alpn_protocol();
-                // Who speaks of no protocol means the one of the port.
+                // Without ALPN, the connection uses the default protocol of the port.
                 let http2 = agreed.map_or(protocol == Protocol::Grpc, |agreed| agreed == H2);
-                self.speak(stream, http2, service, watcher).await;
+                self.serve_http(stream, http2, service, watcher).await;
             }
-            Ok(Err(error)) => tracing::debug!(%error, "no TLS handshake"),
-            Err(_) => tracing::debug!(after = ?self.patience, "no TLS handshake in time"),
+            Ok(Err(error)) => tracing::debug!(%error, "TLS handshake failed"),
+            Err(_) => tracing::debug!(timeout = ?self.read_timeout, "TLS handshake timed out"),
         }
     }
 
-    async fn speak<IO, S, B>(&self, io: IO, http2: bool, service: S, watcher: Watcher)
+    async fn serve_http<IO, S, B>(&self, io: IO, http2: bool, service: S, watcher: Watcher)
     where
         IO: AsyncRead + AsyncWrite + Send + Unpin + 'static,
         S: Service<Request<Incoming>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
@@ -141,42 +143,42 @@ impl Connections {
             let mut builder = http2::Builder::new(TokioExecutor::new());
             builder
                 .timer(TokioTimer::new())
-                .initial_stream_window_size(WINDOW)
-                .initial_connection_window_size(WINDOW)
+                .initial_stream_window_size(HTTP2_WINDOW)
+                .initial_connection_window_size(HTTP2_WINDOW)
                 .max_concurrent_streams(self.max_streams)
-                .keep_alive_interval(KEEPALIVE)
-                .keep_alive_timeout(KEEPALIVE_ANSWER);
-            // From its first frame on a caller has to answer pings; this is for what comes before.
-            let io = TokioIo::new(Prompt::new(io, PREFACE, self.patience));
+                .keep_alive_interval(KEEPALIVE_INTERVAL)
+                .keep_alive_timeout(KEEPALIVE_TIMEOUT);
+            // Pings detect silent callers once HTTP/2 has begun; the preface needs a timeout of its own.
+            let io = TokioIo::new(FirstBytesTimeout::new(io, PREFACE_LEN, self.read_timeout));
             watcher.watch(builder.serve_connection(io, service)).await
         } else {
             let mut builder = http1::Builder::new();
-            builder.timer(TokioTimer::new()).header_read_timeout(self.patience);
+            builder.timer(TokioTimer::new()).header_read_timeout(self.read_timeout);
             watcher.watch(builder.serve_connection(TokioIo::new(io), service)).await
         };
         if let Err(error) = served {
-            tracing::debug!(%error, "a connection broke");
+            tracing::debug!(%error, "connection failed");
         }
     }
 }
 
-/// Bytes with which an HTTP/2 caller introduces itself.
-const PREFACE: usize = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".len();
+/// Length of the HTTP/2 connection preface in bytes.
+const PREFACE_LEN: usize = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".len();
 
-/// One of the connections that there may be.
-struct Open {
+/// An open connection: holds its permit and counts it in the gauge.
+struct OpenConnection {
     _permit: OwnedSemaphorePermit,
     gauge: metrics::Gauge,
 }
 
-impl Drop for Open {
+impl Drop for OpenConnection {
     fn drop(&mut self) {
         self.gauge.decrement(1.0);
     }
 }
 
-/// Whether a caller went away before it was let in: nothing is wrong here.
-fn of_the_caller(error: &io::Error) -> bool {
+/// Whether `accept` failed because the caller closed the connection early, which is no fault of the server.
+fn is_caller_error(error: &io::Error) -> bool {
     use io::ErrorKind as E;
     matches!(error.kind(), E::ConnectionRefused | E::ConnectionAborted | E::ConnectionReset)
 }

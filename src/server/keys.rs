@@ -1,4 +1,4 @@
-//! Keeps the keys of a running server in step with the database.
+//! Background task that keeps the API keys of a running server in step with the database.
 
 use std::error::Error;
 use std::sync::Arc;
@@ -6,28 +6,28 @@ use std::time::Duration;
 
 use crate::service::App;
 
-/// Pause between two looks whether keys have changed.
-const PAUSE: Duration = Duration::from_secs(1);
+/// Time between two checks for changed keys.
+const REFRESH_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Pauses between two times that the last uses are written down.
-const USES: u64 = 30;
+/// The times of last use are saved at every so many refreshes.
+const REFRESHES_PER_SAVE: u64 = 30;
 
-/// Notices keys that were made, revoked or given an end elsewhere, and now and then writes down when keys were used.
+/// Loads keys that another process created, revoked or rotated, and regularly saves when keys were last used.
 pub(super) async fn follow(app: Arc<App>) {
-    for pause in 1_u64.. {
-        tokio::time::sleep(PAUSE).await;
+    for refresh in 1_u64.. {
+        tokio::time::sleep(REFRESH_INTERVAL).await;
         if let Err(error) = app.keys.refresh(&app.store).await {
-            tracing::warn!(error = &error as &dyn Error, "API keys could not be read again");
+            tracing::warn!(error = &error as &dyn Error, "cannot refresh API keys");
         }
-        if pause % USES == 0 {
-            keep_last_uses(&app).await;
+        if refresh % REFRESHES_PER_SAVE == 0 {
+            save_last_used(&app).await;
         }
     }
 }
 
-/// Writes down when keys were used.
-pub(super) async fn keep_last_uses(app: &App) {
-    if let Err(error) = app.keys.keep_last_uses(&app.store).await {
-        tracing::warn!(error = &error as &dyn Error, "the last uses of API keys could not be written down");
+/// Saves when keys were last used.
+pub(super) async fn save_last_used(app: &App) {
+    if let Err(error) = app.keys.save_last_used(&app.store).await {
+        tracing::warn!(error = &error as &dyn Error, "cannot save when API keys were last used");
     }
 }

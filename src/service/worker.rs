@@ -5,7 +5,7 @@ use uuid::Uuid;
 
 use super::{App, Error, policies};
 use crate::invalid::{Invalid, in_range};
-use crate::jobs::{Directive, equal_secrets, hex, token_digest};
+use crate::jobs::{Directive, equal_secrets, token_digest};
 use crate::recipe::TrainConfig;
 use crate::store::{Ending, JobId, Lease, Metric, NewCheckpoint, OpenSnapshot, Snapshot, Wanted};
 
@@ -231,7 +231,7 @@ impl Incoming {
         if self.received != self.announced.size {
             return Err(Invalid::new("data", self.received, format!("the {} bytes announced", self.announced.size)).into());
         }
-        let sha256 = hex(&self.hash.finalize());
+        let sha256 = hex::encode(self.hash.finalize());
         if sha256 != self.announced.sha256 {
             return Err(Invalid::new("sha256", &self.announced.sha256, format!("{sha256}, that of the data received")).into());
         }

@@ -89,8 +89,7 @@ pub struct PolicyRef {
 impl PolicyRef {
     /// The digest in hexadecimal.
     pub fn digest_hex(&self) -> String {
-        let digit = |value: u8| char::from(b"0123456789abcdef"[usize::from(value)]);
-        self.digest.iter().flat_map(|byte| [digit(byte >> 4), digit(byte & 15)]).collect()
+        hex::encode(self.digest)
     }
 }
 

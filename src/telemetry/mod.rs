@@ -1,7 +1,7 @@
-//! Logs, traces and metrics of the process. All are set up once, however many servers it holds.
+//! Logs, traces and metrics of the process. Each is set up once per process, even with several servers in it.
 
-mod lines;
 mod metrics;
+mod text_format;
 mod traces;
 
 use std::io::IsTerminal;
@@ -12,44 +12,45 @@ use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer, Registry, fmt};
 
-pub use self::metrics::{metrics, render};
-pub use self::traces::{BadEndpoint, Traces};
+pub use self::metrics::{install_metrics, render_metrics};
+pub use self::traces::{InvalidEndpoint, TraceExporter};
 
-/// Target of the spans of requests and of what went wrong with them.
+/// Target of request spans and of log lines about failed requests.
 const REQUESTS: &str = "qedgix::request";
 
-/// What is written about requests, and how.
+/// Format and content of logs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Logs {
+pub struct LogConfig {
     /// One JSON object per line instead of text.
     pub json: bool,
-    /// A line for every request, however it went.
+    /// Log every request, not only failed ones.
     pub access: bool,
 }
 
-/// Sends logs to standard error, filtered by `QEDGIX_LOG` (`info` when absent), and the spans of requests to `traces`.
-/// Called twice, the first call counts.
-pub fn logs(logs: Logs, traces: Option<&Traces>) {
+/// Writes logs to standard error, filtered by `QEDGIX_LOG` (default: `info`), and request spans to `traces`.
+/// Further calls have no effect.
+pub fn init_logs(config: LogConfig, traces: Option<&TraceExporter>) {
     let filter = EnvFilter::try_from_env("QEDGIX_LOG").unwrap_or_else(|_| EnvFilter::new("info"));
-    // The target of the line that is written about every request.
-    let access = if logs.access { "qedgix::access=info" } else { "qedgix::access=off" };
-    let filter = filter.add_directive(access.parse().expect("a directive"));
-    let lines = fmt::layer().with_writer(std::io::stderr);
-    let lines: Box<dyn Layer<Registry> + Send + Sync> = if logs.json {
+    // Target of the access log.
+    let access = if config.access { "qedgix::access=info" } else { "qedgix::access=off" };
+    let filter = filter.add_directive(access.parse().expect("the directive is valid"));
+    // Log lines that cannot be written are lost; the default reports them with `eprintln!`, which would panic.
+    let lines = fmt::layer().with_writer(std::io::stderr).log_internal_errors(false);
+    let lines: Box<dyn Layer<Registry> + Send + Sync> = if config.json {
         lines.json().with_span_list(false).boxed()
     } else {
-        lines.with_ansi(std::io::stderr().is_terminal()).fmt_fields(lines::Fields).boxed()
+        lines.with_ansi(std::io::stderr().is_terminal()).fmt_fields(text_format::TextFields).boxed()
     };
-    let set = match traces {
-        // One filter for all: what is off is found out without asking any layer.
+    let installed = match traces {
+        // One filter for the whole subscriber makes disabled log statements cheapest.
         None => tracing_subscriber::registry().with(lines).with(filter).try_init(),
         Some(traces) => {
-            // The spans of requests, and what went wrong in them.
-            let wanted = |m: &Metadata<'_>| m.target() == REQUESTS && (m.is_span() || *m.level() <= Level::WARN);
-            let spans = traces.layer().with_filter(filter_fn(wanted).with_max_level_hint(LevelFilter::DEBUG));
+            // Traces contain request spans and their warnings and errors.
+            let traced = |m: &Metadata<'_>| m.target() == REQUESTS && (m.is_span() || *m.level() <= Level::WARN);
+            let spans = traces.layer().with_filter(filter_fn(traced).with_max_level_hint(LevelFilter::DEBUG));
             tracing_subscriber::registry().with(lines.with_filter(filter)).with(spans).try_init()
         }
     };
-    // A program that embeds this library may have set up its own.
-    let _ = set;
+    // Fails when a program that embeds this library has its own subscriber, which then stays.
+    let _ = installed;
 }

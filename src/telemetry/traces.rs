@@ -1,8 +1,8 @@
-//! Traces, exported by OTLP over gRPC.
+//! Trace export by OTLP over gRPC.
 //!
-//! A thread of the SDK sends finished spans in batches from a bounded queue. A collector that is away costs spans, never
-//! time: what does not fit into the queue is dropped. Sampling, batch sizes and the service's name follow the environment
-//! variables that OpenTelemetry defines (`OTEL_TRACES_SAMPLER`, `OTEL_BSP_*`, `OTEL_SERVICE_NAME`).
+//! A thread of the OpenTelemetry SDK sends finished spans in batches from a bounded queue. When the collector is unreachable and the
+//! queue is full, spans are dropped; requests never wait. The standard environment variables apply (`OTEL_TRACES_SAMPLER`, `OTEL_BSP_*`,
+//! `OTEL_SERVICE_NAME`).
 
 use std::time::Duration;
 
@@ -15,34 +15,34 @@ use tracing::Subscriber;
 use tracing_subscriber::Layer;
 use tracing_subscriber::registry::LookupSpan;
 
-/// An address that no collector can have.
+/// The address of the collector is invalid.
 #[derive(Debug, thiserror::Error)]
 #[error(
-    "--otlp-endpoint: {endpoint:?} cannot be used{reason}; expected the address of an OTLP collector's gRPC, as http://127.0.0.1:4317"
+    "--otlp-endpoint: {endpoint:?} is not valid{reason}; expected the gRPC address of an OTLP collector, such as http://127.0.0.1:4317"
 )]
-pub struct BadEndpoint {
+pub struct InvalidEndpoint {
     endpoint: String,
     reason: String,
 }
 
-/// The exporter of traces.
+/// A running trace exporter.
 #[derive(Clone, Debug)]
-pub struct Traces(SdkTracerProvider);
+pub struct TraceExporter(SdkTracerProvider);
 
-impl Traces {
-    /// Exports to the collector at `endpoint`, `http://HOST:PORT`, whenever it can be reached. Trace ids of callers
-    /// (W3C `traceparent`) are followed from now on. To be called inside a runtime, which is to last.
+impl TraceExporter {
+    /// Starts the export to the collector at `endpoint` (`http://HOST:PORT`) and makes request spans children of the caller's W3C
+    /// `traceparent`. Must be called inside the tokio runtime that runs the server.
     ///
     /// # Errors
-    /// An address that is none.
-    pub fn start(endpoint: &str) -> Result<Self, BadEndpoint> {
-        let bad = |reason: String| BadEndpoint { endpoint: endpoint.to_owned(), reason };
-        let uri: axum::http::Uri = endpoint.parse().map_err(|e| bad(format!(" ({e})")))?;
+    /// [`InvalidEndpoint`] when `endpoint` is not such an address.
+    pub fn start(endpoint: &str) -> Result<Self, InvalidEndpoint> {
+        let invalid = |reason: String| InvalidEndpoint { endpoint: endpoint.to_owned(), reason };
+        let uri: axum::http::Uri = endpoint.parse().map_err(|e| invalid(format!(" ({e})")))?;
         if uri.scheme_str() != Some("http") || uri.host().is_none_or(str::is_empty) {
-            return Err(bad(String::new()));
+            return Err(invalid(String::new()));
         }
         let exporter = SpanExporter::builder().with_tonic().with_endpoint(endpoint).with_timeout(Duration::from_secs(5));
-        let exporter = exporter.build().map_err(|e| bad(format!(" ({e})")))?;
+        let exporter = exporter.build().map_err(|e| invalid(format!(" ({e})")))?;
         let mut resource = Resource::builder();
         if std::env::var_os("OTEL_SERVICE_NAME").is_none() {
             resource = resource.with_service_name("qedgix");
@@ -53,7 +53,7 @@ impl Traces {
         Ok(Self(SdkTracerProvider::builder().with_batch_exporter(exporter).with_resource(resource).build()))
     }
 
-    /// What turns spans of this program into spans of a trace.
+    /// The layer that sends spans to the exporter.
     pub(super) fn layer<S: Subscriber + for<'a> LookupSpan<'a>>(&self) -> impl Layer<S> + use<S> {
         tracing_opentelemetry::layer()
             .with_tracer(self.0.tracer("qedgix"))
@@ -62,10 +62,10 @@ impl Traces {
             .with_tracked_inactivity(false)
     }
 
-    /// Sends what is left, for at most `patience`, and ends the export.
-    pub async fn end(self, patience: Duration) {
-        // It blocks. What could not be sent until then is lost, and that is said by the SDK.
-        let ended = tokio::task::spawn_blocking(move || self.0.shutdown_with_timeout(patience));
-        let _ = tokio::time::timeout(patience, ended).await;
+    /// Sends the remaining spans for at most `timeout` and ends the export.
+    pub async fn shutdown(self, timeout: Duration) {
+        // The SDK blocks, and logs when spans are lost.
+        let ended = tokio::task::spawn_blocking(move || self.0.shutdown_with_timeout(timeout));
+        let _ = tokio::time::timeout(timeout, ended).await;
     }
 }

@@ -146,9 +146,9 @@ impl Server {
         executor: Option<Arc<dyn Executor>>,
     ) -> Self {
         let free = SocketAddr::from(([127, 0, 0, 1], 0));
-        let (max_watchers, heartbeat) = (WATCHERS, Duration::from_millis(20));
-        let config = Config { grpc_addr: free, http_addr: free, max_watchers, heartbeat, ..Config::new(data_dir) };
-        let data = DataDir::take(data_dir).unwrap();
+        let (max_watchers, event_heartbeat) = (WATCHERS, Duration::from_millis(20));
+        let config = Config { grpc_addr: free, http_addr: free, max_watchers, event_heartbeat, ..Config::new(data_dir) };
+        let data = DataDir::lock(data_dir).unwrap();
         let listeners = Listeners::bind(&config).await.unwrap();
         let endpoints = listeners.endpoints().unwrap();
         let (sender, workers) = mpsc::unbounded_channel();
@@ -166,7 +166,7 @@ impl Server {
             environments: Environments::new(EnvironmentsConfig { limits, memory: 1 << 20 }, clock.clone()),
             engine: Engine::start(EngineConfig { threads: 1, queue: 1, max_batch: 1, max_batch_delay: Duration::ZERO }).unwrap(),
             keys: Keyring::new(None),
-            watchers: Watchers::new(config.max_watchers, config.heartbeat),
+            watchers: Watchers::new(config.max_watchers, config.event_heartbeat),
             clock,
             draining: Draining::default(),
         });

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use qedgix::checkpoint::Checkpoint;
 use qedgix::env::EpisodeMetrics;
-use qedgix::jobs::{LocalProcess, hex};
+use qedgix::jobs::LocalProcess;
 use qedgix::learner::{Event, Preset, TrainConfig, Trainer, evaluate, layouts};
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
@@ -207,7 +207,7 @@ async fn a_job_runs_to_its_end_in_a_worker() {
     let found = list.iter().find(|c| c["kind"] == "best").unwrap();
     let path = format!("/v1/checkpoints/{}", found["id"].as_str().unwrap());
     let bytes = rest.request(Method::GET, &path).send().await.unwrap().bytes().await.unwrap();
-    assert_eq!(found["sha256"], hex(&Sha256::digest(&bytes)));
+    assert_eq!(found["sha256"], hex::encode(Sha256::digest(&bytes)));
     assert_eq!(Checkpoint::from_bytes(&bytes).unwrap(), best);
     assert_eq!(found["metrics"]["eval/mean_aoi"], json!(best.metrics().unwrap().mean_aoi));
     assert!(list.iter().any(|c| c["kind"] == "last" && c["step"] == 24_000));

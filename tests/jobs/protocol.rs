@@ -2,7 +2,6 @@
 
 use std::collections::HashMap;
 
-use qedgix::jobs::hex;
 use qedgix::wire::v1;
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
@@ -113,7 +112,7 @@ async fn a_snapshot_comes_back_as_it_went_and_a_broken_one_changes_nothing() {
     assert_eq!(absent.code(), Code::NotFound);
 
     let bytes: Vec<u8> = (0..3_500_000_u32).map(|i| (i.wrapping_mul(i) >> 7) as u8).collect();
-    let sha256 = hex(&Sha256::digest(&bytes));
+    let sha256 = hex::encode(Sha256::digest(&bytes));
     client.upload_snapshot(sign(&worker, snapshot(100, &bytes, sha256.clone()))).await.unwrap();
     client.upload_snapshot(sign(&worker, snapshot(200, &bytes, sha256))).await.unwrap();
     let broken = client.upload_snapshot(sign(&worker, snapshot(300, &bytes, "0".repeat(64)))).await.unwrap_err();
@@ -138,7 +137,7 @@ async fn upload(server: &Server, worker: &Worker, kind: v1::CheckpointKind, step
         kind: kind.into(),
         step,
         size: bytes.len() as u64,
-        sha256: hex(&Sha256::digest(bytes)),
+        sha256: hex::encode(Sha256::digest(bytes)),
         metrics: HashMap::from([("eval/mean_aoi".to_owned(), 12.5)]),
     };
     let parts = [Part::Header(header), Part::Data(bytes.to_vec().into())];
@@ -163,7 +162,7 @@ async fn the_best_and_the_last_checkpoint_are_kept() {
     assert_eq!(list["checkpoints"][0]["config"]["training"]["steps"], 400);
 
     let response = server.request(Method::GET, &format!("/v1/checkpoints/{better}")).send().await.unwrap();
-    assert_eq!(response.headers()["etag"], format!("\"{}\"", hex(&Sha256::digest(b"better"))));
+    assert_eq!(response.headers()["etag"], format!("\"{}\"", hex::encode(Sha256::digest(b"better"))));
     assert_eq!(response.bytes().await.unwrap().as_ref(), b"better");
     expect(server.request(Method::GET, &format!("/v1/checkpoints/{first}")), StatusCode::NOT_FOUND).await;
 }

@@ -55,7 +55,7 @@ impl Server {
         let time = Arc::new(Mutex::new(Timestamp::UNIX_EPOCH));
         let told = time.clone();
         let clock = Clock::new(move || *told.lock().unwrap());
-        let data = DataDir::take(dir.path()).unwrap();
+        let data = DataDir::lock(dir.path()).unwrap();
         let listeners = Listeners::bind(&config).await.unwrap();
         let endpoints = listeners.endpoints().unwrap();
         let app = server::open(&config, &data, clock).await.unwrap();

@@ -90,11 +90,11 @@ async fn reflection_in_both_versions() {
 #[tokio::test]
 async fn a_data_directory_belongs_to_one_server() {
     let server = Server::start().await;
-    let second = DataDir::take(server.dir.path()).unwrap_err();
+    let second = DataDir::lock(server.dir.path()).unwrap_err();
     assert!(matches!(&second, server::Error::InUse(path) if path == server.dir.path()), "{second}");
     assert!(second.to_string().contains("--data-dir"), "{second}");
     let file = server.dir.path().join("lock");
-    assert!(matches!(DataDir::take(&file), Err(server::Error::File { .. })), "a file is no directory");
+    assert!(matches!(DataDir::lock(&file), Err(server::Error::File { .. })), "a file is no directory");
 }
 
 #[test]
@@ -109,22 +109,22 @@ fn settings_are_checked() {
     assert_eq!(refused(|c| c.max_sessions = 0), "--max-sessions");
     assert_eq!(refused(|c| c.max_environments = 0), "--max-environments");
     assert_eq!(refused(|c| c.environment_memory = 1), "--environment-memory");
-    assert_eq!(refused(|c| c.environment_ttl = std::time::Duration::ZERO), "--environment-ttl (seconds)");
+    assert_eq!(refused(|c| c.environment_ttl = std::time::Duration::ZERO), "--environment-ttl");
     assert_eq!(refused(|c| c.max_connections = 0), "--max-connections");
     assert_eq!(refused(|c| c.max_streams = 0), "--max-streams");
-    assert_eq!(refused(|c| c.read_timeout = std::time::Duration::ZERO), "--read-timeout (seconds)");
+    assert_eq!(refused(|c| c.read_timeout = std::time::Duration::ZERO), "--read-timeout");
     assert_eq!(refused(|c| c.key_rate = Some(0.0)), "--key-rate");
     assert_eq!(refused(|c| c.key_burst = Some(f64::NAN)), "--key-burst");
 
     let mut far = Config::new("unused");
-    assert!(far.validate_reach(false).is_ok());
+    assert!(far.validate_exposure(false).is_ok());
     far.grpc_addr = "0.0.0.0:50051".parse().unwrap();
-    assert_eq!(far.validate_reach(false).unwrap_err().field, "--grpc-addr");
+    assert_eq!(far.validate_exposure(false).unwrap_err().field, "--grpc-addr");
     (far.grpc_addr, far.http_addr) = ("[::1]:50051".parse().unwrap(), "192.0.2.1:80".parse().unwrap());
-    assert_eq!(far.validate_reach(false).unwrap_err().field, "--http-addr");
-    assert!(far.validate_reach(true).is_ok(), "callers need keys");
+    assert_eq!(far.validate_exposure(false).unwrap_err().field, "--http-addr");
+    assert!(far.validate_exposure(true).is_ok(), "callers need keys");
     far.insecure = true;
-    assert!(far.validate_reach(false).is_ok());
+    assert!(far.validate_exposure(false).is_ok());
 }
 
 /// Starts the binary; it is killed when dropped.

@@ -1,6 +1,6 @@
 //! Bodies, paths and queries, with the errors of the one table.
 
-use axum::body::{Body, BodyDataStream, HttpBody};
+use axum::body::BodyDataStream;
 use axum::extract::{FromRequest, FromRequestParts, Request};
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, header};
@@ -74,13 +74,12 @@ pub fn unsupported(kind: Option<String>, expected: &str) -> Error {
 /// It is larger, or breaks off.
 pub async fn read(request: Request, limit: usize) -> Result<Bytes, Error> {
     let too_large = || Error::TooLarge(format!("the body is larger than the limit of {limit} bytes"));
-    let body = request.into_body();
-    let announced = announced_size(&body);
+    let announced = announced_size(request.headers());
+    let mut body = request.into_body().into_data_stream();
     if announced > limit as u64 {
-        discard(body.into_data_stream()).await;
+        discard(body).await;
         return Err(too_large());
     }
-    let mut body = body.into_data_stream();
     let mut received = bytes::BytesMut::with_capacity(announced as usize);
     while let Some(part) = body.next().await {
         let part = part.map_err(|e| Invalid::new("body", e, "a complete body"))?;
@@ -93,9 +92,9 @@ pub async fn read(request: Request, limit: usize) -> Result<Bytes, Error> {
     Ok(received.freeze())
 }
 
-/// Bytes that the body is known to have at least.
-fn announced_size(body: &Body) -> u64 {
-    body.size_hint().lower()
+/// Size of the body by its header, 0 when the header is missing. A body that differs is rejected by HTTP, or by the limit.
+fn announced_size(headers: &HeaderMap) -> u64 {
+    headers.get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok()).unwrap_or(0)
 }
 
 async fn discard(mut parts: BodyDataStream) {

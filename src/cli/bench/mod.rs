@@ -1,18 +1,19 @@
-//! `qedgix bench`: how fast the parts are on this machine.
+//! `qedgix bench`: measures the speed of `Act` and of the learner on this machine.
 
 mod act;
-mod floor;
+mod roofline;
 
 use std::time::Instant;
 
 use clap::{Args, Subcommand};
 use serde_json::json;
 
+use super::output::outln;
 use super::run_args::{RunArgs, all_cores};
 use crate::learner::{Episodes, Learner, Rollout, TrainConfig};
 use crate::policy::mixer::MixerKind;
 
-/// What to measure.
+/// Flags of `bench`.
 #[derive(Args, Debug)]
 pub struct BenchArgs {
     #[command(subcommand)]
@@ -21,18 +22,18 @@ pub struct BenchArgs {
 
 #[derive(Subcommand, Debug)]
 enum What {
-    /// Seconds per learner update and per rollout, environment steps per second, and the floor of an update: its matrix
-    /// products alone, at the same shapes on the same threads
+    /// Measure the learner: time per update and per rollout, environment steps per second, and the roofline of an update
     ///
-    /// What --set leaves open is as in the specification's figures: flat observation without own position, one-hot identity,
-    /// mean aggregation, qmix mixer, a batch of 128 episodes, one update per rollout of 8.
+    /// The roofline is the time of the matrix products of an update alone, with the same shapes and threads. Fields that --set does
+    /// not change differ from the preset as follows: flat observation without own position, one-hot identity, mean aggregation,
+    /// qmix mixer, a batch of 128 episodes, one update per rollout of 8.
     Learner(LearnerArgs),
-    /// Load for gRPC Act: throughput and latencies, beside those of a bare gRPC echo in the same run
+    /// Measure gRPC Act: throughput and latencies, next to those of a plain gRPC echo service
     ///
-    /// Sessions fly real episodes. Rounds of Act and of an echo that answers messages of the same size alternate, so that what
-    /// else the machine does slows both alike; read the ratios first.
+    /// Each session runs real episodes. Rounds of Act alternate with rounds of an echo service that returns messages of the same size,
+    /// so other load on the machine slows both. Read the ratios first.
     Act(act::ActArgs),
-    /// The echo beside a server in another process; `bench act --server` starts it itself
+    /// The echo service in a process of its own; `bench act --server` starts it
     #[command(hide = true)]
     Echo,
 }
@@ -48,16 +49,16 @@ pub struct LearnerArgs {
     /// Threads of the update [default: all cores]
     #[arg(long, env = "QEDGIX_THREADS")]
     threads: Option<usize>,
-    /// Times each part is run; the median is told
-    #[arg(long, default_value_t = 7, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    /// Repetitions of each measurement; the median is printed
+    #[arg(long, default_value_t = 7, value_name = "TIMES", value_parser = clap::value_parser!(u32).range(1..=10_000))]
     repeat: u32,
-    /// Print JSON
+    /// Print JSON instead of text
     #[arg(long)]
     json: bool,
 }
 
-/// The configuration of the specification's figures, where it differs from the preset `practical`.
-const FIGURES: [&str; 6] = [
+/// The measured configuration, where it differs from the preset `practical`.
+const CONFIGURATION: [&str; 6] = [
     "training.observation=flat",
     "training.identity=onehot",
     "training.self_position=false",
@@ -69,7 +70,7 @@ const FIGURES: [&str; 6] = [
 /// Runs the command.
 ///
 /// # Errors
-/// A configuration that is wrong, a server that cannot be reached, an Act that was refused.
+/// The configuration is invalid, the server cannot be reached, or an Act is refused.
 pub async fn run(args: BenchArgs) -> anyhow::Result<()> {
     match args.what {
         What::Learner(args) => learner(args),
@@ -80,7 +81,7 @@ pub async fn run(args: BenchArgs) -> anyhow::Result<()> {
 
 fn learner(mut args: LearnerArgs) -> anyhow::Result<()> {
     let threads = args.threads.unwrap_or_else(all_cores);
-    let mut set: Vec<String> = FIGURES.map(str::to_owned).to_vec();
+    let mut set: Vec<String> = CONFIGURATION.map(str::to_owned).to_vec();
     if !matches!(TrainConfig::preset(args.run.algorithm, args.run.preset).training.mixer, MixerKind::Vdn | MixerKind::None) {
         set.push("training.mixer=qmix".to_owned());
     }
@@ -98,41 +99,41 @@ fn learner(mut args: LearnerArgs) -> anyhow::Result<()> {
     let rollout_s = median_seconds(repeat, || {
         rollout.collect(learner.agent(), learner.agent_parameters(), 0.1, 0);
     });
-    let floor = floor::of(learner.agent(), &batch, threads, repeat);
+    let roofline = roofline::measure(learner.agent(), &batch, threads, repeat);
     let steps = (t.envs * config.environment.slots) as f64;
     let env_steps_per_s = steps / (rollout_s + update_s * t.updates_per_iteration as f64);
     if args.json {
-        let figures = json!({
+        let metrics = json!({
             "algorithm": config.algorithm,
             "threads": threads,
             "update_s": update_s,
             "rollout_s": rollout_s,
             "env_steps_per_s": env_steps_per_s,
-            "update_gflop": floor.gflop,
-            "matmul_gflop_per_s": floor.gflop / floor.seconds,
-            "floor_s": floor.seconds,
+            "update_gflop": roofline.gflop,
+            "matmul_gflop_per_s": roofline.gflop / roofline.seconds,
+            "floor_s": roofline.seconds,
             "config": config,
         });
-        println!("{figures}");
+        outln!("{metrics}")?;
     } else {
-        println!("update of {} episodes   {:.2} ms", t.batch, update_s * 1e3);
-        println!(
-            "  its products alone     {:.2} ms   ({:.1} GFLOP at {:.0} GFLOP/s; the update takes {:.2} times as long)",
-            floor.seconds * 1e3,
-            floor.gflop,
-            floor.gflop / floor.seconds,
-            update_s / floor.seconds
-        );
-        println!("rollout of {} episodes    {:.2} ms", t.envs, rollout_s * 1e3);
-        println!(
+        outln!("update of {} episodes   {:.2} ms", t.batch, update_s * 1e3)?;
+        outln!(
+            "  matrix products alone  {:.2} ms   ({:.1} GFLOP at {:.0} GFLOP/s; the update takes {:.2} times as long)",
+            roofline.seconds * 1e3,
+            roofline.gflop,
+            roofline.gflop / roofline.seconds,
+            update_s / roofline.seconds
+        )?;
+        outln!("rollout of {} episodes    {:.2} ms", t.envs, rollout_s * 1e3)?;
+        outln!(
             "environment steps per s  {env_steps_per_s:.0}   ({} updates per rollout, {threads} threads)",
             t.updates_per_iteration
-        );
+        )?;
     }
     Ok(())
 }
 
-/// A batch of random flight.
+/// A batch of episodes with random headings.
 fn random_episodes(config: &TrainConfig, learner: &Learner) -> anyhow::Result<Episodes> {
     let mut config = config.clone();
     config.training.envs = config.training.batch;
@@ -140,7 +141,7 @@ fn random_episodes(config: &TrainConfig, learner: &Learner) -> anyhow::Result<Ep
     Ok(rollout.collect(learner.agent(), learner.agent_parameters(), 1.0, 0).clone())
 }
 
-/// Median seconds of `repeat` calls after one to warm up.
+/// Median time of `repeat` calls in seconds, after one call to warm up.
 fn median_seconds(repeat: usize, mut call: impl FnMut()) -> f64 {
     call();
     let mut seconds: Vec<f64> = (0..repeat)

@@ -18,6 +18,7 @@ use self::folder::Folder;
 use self::runner::Runner;
 use super::files::write_whole;
 use super::run_args::{self, all_cores};
+use crate::cli::output::outln;
 use crate::env::EpisodeMetrics;
 use crate::experiment::{Curve, Experiment, Figure, Outcome, Overrides, figures, readme, report};
 use crate::figure::Flight;
@@ -128,7 +129,7 @@ fn command(args: &ExperimentArgs) -> String {
 
 /// Prints the runs.
 fn list(experiment: &Experiment, out: &Path) -> anyhow::Result<()> {
-    println!("{}: {} runs below {}", experiment.title, experiment.runs.len(), out.display());
+    outln!("{}: {} runs below {}", experiment.title, experiment.runs.len(), out.display())?;
     for run in &experiment.runs {
         let folder = Folder::new(out, run);
         let (steps, progress) = (run.config.training.steps, folder.progress()?);
@@ -138,7 +139,7 @@ fn list(experiment: &Experiment, out: &Path) -> anyhow::Result<()> {
             0 => "to do".to_owned(),
             step => format!("at step {step}"),
         };
-        println!("  {:<32} {steps:>9} steps  {state:<16} {}", experiment.label(run), run.folder);
+        outln!("  {:<32} {steps:>9} steps  {state:<16} {}", experiment.label(run), run.folder)?;
     }
     Ok(())
 }
@@ -168,9 +169,9 @@ fn conclude(experiment: &Experiment, out: &Path, threads: usize, command: &str) 
     for row in &report.rows {
         let Interval { mean, low, high } = row.mean_aoi;
         let name = [row.point.as_str(), row.series.as_str()].join(" ");
-        println!("{:<32} mean AoI {mean:6.2}  ({low:.2} to {high:.2})", name.trim_start());
+        outln!("{:<32} mean AoI {mean:6.2}  ({low:.2} to {high:.2})", name.trim_start())?;
     }
-    println!("{}", out.join("README.md").display());
+    outln!("{}", out.join("README.md").display())?;
     Ok(())
 }
 

@@ -10,6 +10,7 @@ use anyhow::Context;
 use indicatif::{MultiProgress, ProgressBar};
 
 use super::folder::{Folder, Progress};
+use crate::cli::output::errln;
 use crate::cli::progress;
 use crate::experiment::{Experiment, Flown, Outcome, Run};
 use crate::learner::{Event, Trainer, evaluate};
@@ -109,7 +110,7 @@ impl<'a> Runner<'a> {
     /// A line above the bars, or on standard error where nobody sees bars.
     fn say(&self, line: &str) {
         if self.overall.is_hidden() {
-            eprintln!("{line}");
+            errln!("{line}");
         } else {
             self.overall.println(line);
         }
@@ -172,7 +173,7 @@ impl<'a> Runner<'a> {
             if let Some((step, aoi)) = evaluated {
                 bar.set_message(format!("{label}: mean AoI {aoi:.2}"));
                 if bar.is_hidden() {
-                    eprintln!("{label}: step {step}, mean AoI {aoi:.2}");
+                    errln!("{label}: step {step}, mean AoI {aoi:.2}");
                 }
             }
             if self.stopped() {

@@ -9,7 +9,6 @@ use tokio::sync::mpsc::UnboundedReceiver;
 
 use super::client::{Client, Lost};
 use super::training::Item;
-use crate::jobs::hex;
 use crate::wire::v1;
 
 /// Pause in which rows gather into a batch.
@@ -76,6 +75,6 @@ async fn flush(client: &Client, report: &mut v1::ReportRequest) -> Result<(), Lo
 
 /// The SHA-256 of what is sent, computed aside: heartbeats go on meanwhile.
 async fn digest(bytes: Vec<u8>) -> (String, Bytes) {
-    let hash = move || (hex(&Sha256::digest(&bytes)), Bytes::from(bytes));
+    let hash = move || (hex::encode(Sha256::digest(&bytes)), Bytes::from(bytes));
     tokio::task::spawn_blocking(hash).await.expect("hashing does not panic")
 }

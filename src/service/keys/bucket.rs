@@ -1,60 +1,65 @@
-//! A token bucket without locks: how many requests per second, and how many at once.
+//! Rate limits: a lock-free token bucket (GCRA) on nanosecond time stamps that the caller passes in.
+//!
+//! The crate `governor` implements the same algorithm and cannot replace it here. A batch is answered first and charged
+//! afterwards, possibly with more requests than the burst, and the following requests wait for it; governor's `check_n` refuses a
+//! charge that exceeds the burst and takes nothing when too few tokens are left. governor also counts whole requests, and
+//! rates of API keys may be fractional.
 
 use std::ops::RangeInclusive;
 use std::sync::atomic::{AtomicI64, Ordering};
 use std::time::Duration;
 
-/// How often something may be asked for.
+/// A request rate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rate {
-    /// Per second, in the long run.
+    /// Sustained requests per second.
     pub per_second: f64,
-    /// At once, after a pause.
+    /// Requests at once, after a pause.
     pub burst: f64,
 }
 
 impl Rate {
-    /// What may be asked for per second.
+    /// Valid values of [`Rate::per_second`].
     pub const PER_SECOND: RangeInclusive<f64> = 0.001..=1e6;
-    /// What may be asked for at once.
+    /// Valid values of [`Rate::burst`].
     pub const BURST: RangeInclusive<f64> = 1.0..=1e6;
 
-    /// Without `burst`, as many at once as one second allows.
+    /// `burst` defaults to the requests of one second, at least 1.
     pub fn new(per_second: f64, burst: Option<f64>) -> Self {
         Self { per_second, burst: burst.unwrap_or(per_second.max(1.0)) }
     }
 }
 
-/// A bucket, full at first. It keeps the moment at which it would be full again; all times are nanoseconds.
+/// A token bucket, full at first. Its state is the time at which it is full again. All times are nanoseconds.
 #[derive(Debug)]
-pub struct Bucket {
-    /// Between two tokens.
+pub struct TokenBucket {
+    /// Time between two tokens.
     interval: i64,
-    /// How far ahead that moment may be while there still is a token.
+    /// How far `full_at` may lie ahead of now while a token is left.
     slack: i64,
     full_at: AtomicI64,
 }
 
-impl Bucket {
+impl TokenBucket {
     pub fn new(rate: Rate) -> Self {
         let interval = 1e9 / rate.per_second;
         Self { interval: interval as i64, slack: (interval * (rate.burst - 1.0)) as i64, full_at: AtomicI64::new(i64::MIN) }
     }
 
-    /// Takes a token at `now`.
+    /// Takes one token at `now`.
     ///
     /// # Errors
-    /// There is none; when there will be one.
+    /// The time until the next token when none is left.
     pub fn take(&self, now: i64) -> Result<(), Duration> {
         let take = |full_at: i64| (self.wait(full_at, now) <= 0).then(|| self.later(full_at, 1, now));
         let taken = self.full_at.fetch_update(Ordering::Relaxed, Ordering::Relaxed, take);
         taken.map(drop).map_err(|full_at| Duration::from_nanos(self.wait(full_at, now).unsigned_abs()))
     }
 
-    /// Takes `tokens` at `now`, whether or not there are so many: those who come next wait for them.
+    /// Takes `tokens` at `now` even if fewer are left. The following calls of [`TokenBucket::take`] wait for the difference.
     pub fn charge(&self, tokens: u32, now: i64) {
         let charge = |full_at: i64| Some(self.later(full_at, tokens, now));
-        // It never refuses.
+        // The update always succeeds, because `charge` always returns a value.
         let _ = self.full_at.fetch_update(Ordering::Relaxed, Ordering::Relaxed, charge);
     }
 
@@ -74,8 +79,8 @@ mod tests {
     const MS: i64 = 1_000_000;
 
     #[test]
-    fn bursts_then_the_rate() {
-        let bucket = Bucket::new(Rate { per_second: 10.0, burst: 3.0 });
+    fn a_burst_is_allowed_then_the_rate() {
+        let bucket = TokenBucket::new(Rate { per_second: 10.0, burst: 3.0 });
         for _ in 0..3 {
             assert_eq!(bucket.take(0), Ok(()));
         }
@@ -83,14 +88,14 @@ mod tests {
         assert_eq!(bucket.take(60 * MS), Err(Duration::from_millis(40)));
         assert_eq!(bucket.take(100 * MS), Ok(()));
         assert!(bucket.take(199 * MS).is_err());
-        // After a long pause it is full, and not more than full.
+        // After a long pause the bucket holds the burst, and not more.
         let later = 3600 * 1000 * MS;
         assert_eq!((0..9).filter(|_| bucket.take(later).is_ok()).count(), 3);
     }
 
     #[test]
-    fn what_is_too_large_is_waited_for_afterwards() {
-        let bucket = Bucket::new(Rate { per_second: 10.0, burst: 1.0 });
+    fn a_charge_beyond_the_burst_delays_later_requests() {
+        let bucket = TokenBucket::new(Rate { per_second: 10.0, burst: 1.0 });
         assert_eq!(bucket.take(0), Ok(()));
         bucket.charge(19, 0);
         assert_eq!(bucket.take(0), Err(Duration::from_secs(2)));
@@ -98,10 +103,10 @@ mod tests {
     }
 
     #[test]
-    fn extremes_do_not_overflow() {
+    fn extreme_values_do_not_overflow() {
         assert_eq!(Rate::new(0.5, None).burst, 1.0);
         assert_eq!(Rate::new(50.0, None).burst, 50.0);
-        let slow = Bucket::new(Rate::new(*Rate::PER_SECOND.start(), Some(*Rate::BURST.end())));
+        let slow = TokenBucket::new(Rate::new(*Rate::PER_SECOND.start(), Some(*Rate::BURST.end())));
         for _ in 0..10 {
             slow.charge(u32::MAX, i64::MAX - 1);
         }

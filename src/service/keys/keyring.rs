@@ -1,6 +1,7 @@
-//! The keys of a running server, in memory: a request costs a look into a map and one SHA-256, never a query.
+//! The API keys of a running server, in memory. Authenticating a request costs one map lookup and one SHA-256, no query.
 //!
-//! Keys never leave it. Once there is one, every request needs one for as long as the server runs, whatever becomes of the key.
+//! Keys are never removed from memory. From the first key on every request needs a key until the server stops, even when all keys
+//! are revoked or expired.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
@@ -8,19 +9,20 @@ use std::sync::{Arc, PoisonError, RwLock};
 
 use jiff::Timestamp;
 
-use super::bucket::{Bucket, Rate};
+use super::bucket::{Rate, TokenBucket};
 use super::scope::{Scope, Scopes};
 use super::secret;
 use crate::service::Error;
 use crate::store::{KeyRecord, Store};
 
-/// All keys that were ever made.
+/// All API keys, including revoked and expired ones.
 #[derive(Debug)]
 pub struct Keyring {
-    default: Option<Rate>,
-    /// Whether there is a key: the one thing that is looked at where there is none.
+    /// Rate of keys that have no rate of their own.
+    default_rate: Option<Rate>,
+    /// Whether there is a key. Requests read only this flag while there is none.
     required: AtomicBool,
-    /// Of the table that `keys` was read from.
+    /// Revision of the database table that `keys` was read at.
     revision: AtomicI64,
     keys: RwLock<HashMap<String, Arc<Key>>>,
 }
@@ -30,34 +32,35 @@ struct Key {
     id: String,
     digest: [u8; 32],
     scopes: Scopes,
-    limit: Option<(Rate, Bucket)>,
+    limit: Option<(Rate, TokenBucket)>,
     revoked: AtomicBool,
-    /// Milliseconds since the epoch, as are the following.
+    /// Milliseconds since the Unix epoch, like the two fields below.
     expires_at: AtomicI64,
-    used_at: AtomicI64,
-    /// What of `used_at` is in the database.
-    kept_at: AtomicI64,
+    last_used_at: AtomicI64,
+    /// Value of `last_used_at` in the database.
+    saved_at: AtomicI64,
 }
 
-/// Who asks: the key that was shown. Transports put it into the extensions of a request.
+/// The sender of a request, identified by its API key. Transports put it into the extensions of the request.
 #[derive(Clone, Debug)]
 pub struct Caller(Arc<Key>);
 
 impl Keyring {
-    /// Without keys; `default` limits those that have no rate of their own.
-    pub fn new(default: Option<Rate>) -> Self {
-        Self { default, required: AtomicBool::new(false), revision: AtomicI64::new(-1), keys: RwLock::default() }
+    /// A keyring without keys. `default_rate` applies to keys that have no rate of their own.
+    pub fn new(default_rate: Option<Rate>) -> Self {
+        Self { default_rate, required: AtomicBool::new(false), revision: AtomicI64::new(-1), keys: RwLock::default() }
     }
 
-    /// Whether requests need a key.
+    /// Whether requests need an API key.
     pub fn required(&self) -> bool {
         self.required.load(Ordering::Relaxed)
     }
 
-    /// Takes over what was made, revoked or given another end since the last time. Cheap when nothing was.
+    /// Reads keys from the database if any was created, revoked or given another expiry since the last call. Costs one small query
+    /// otherwise.
     ///
     /// # Errors
-    /// The database; the keys stay as they were.
+    /// [`Error::Internal`] when the database fails. The keys in memory stay as they are.
     pub async fn refresh(&self, store: &Store) -> Result<(), Error> {
         let revision = store.keys_revision().await?;
         if revision == self.revision.load(Ordering::Relaxed) {
@@ -65,13 +68,13 @@ impl Keyring {
         }
         let records = store.keys().await?;
         let mut keys = self.keys.write().unwrap_or_else(PoisonError::into_inner);
-        // Rows are not deleted; if somebody does so by hand, the key is over.
-        let gone = keys.values().filter(|key| !records.iter().any(|record| record.id == key.id));
-        gone.for_each(|key| key.revoked.store(true, Ordering::Relaxed));
+        // The server never deletes rows. A key whose row was deleted by hand counts as revoked.
+        let deleted = keys.values().filter(|key| !records.iter().any(|record| record.id == key.id));
+        deleted.for_each(|key| key.revoked.store(true, Ordering::Relaxed));
         for record in records {
             match keys.get(&record.id) {
-                Some(key) => key.end(&record),
-                None => drop(keys.insert(record.id.clone(), Arc::new(Key::new(record, self.default)))),
+                Some(key) => key.update(&record),
+                None => drop(keys.insert(record.id.clone(), Arc::new(Key::new(record, self.default_rate)))),
             }
         }
         if !keys.is_empty() {
@@ -81,34 +84,35 @@ impl Keyring {
         Ok(())
     }
 
-    /// Who shows `presented`. `None` when no key is needed.
+    /// Identifies the caller by the API key `presented`. Returns `None` when the server requires no key.
     ///
     /// # Errors
-    /// [`Error::Unauthenticated`] for none, an unknown or a wrong one, and for one that is over.
+    /// [`Error::Unauthenticated`] when the key is missing, unknown, wrong, revoked or expired.
     pub fn authenticate(&self, presented: Option<&str>, now: Timestamp) -> Result<Option<Caller>, Error> {
-        const NONE: Error = Error::Unauthenticated("an API key is needed: authorization: Bearer KEY, or x-api-key: KEY");
-        const UNKNOWN: Error = Error::Unauthenticated("this API key is not known here");
+        const MISSING: Error =
+            Error::Unauthenticated("an API key is required, as header authorization: Bearer KEY or x-api-key: KEY");
+        const UNKNOWN: Error = Error::Unauthenticated("the API key is unknown");
         if !self.required() {
             return Ok(None);
         }
-        let (id, plain) = secret::split(presented.ok_or(NONE)?).ok_or(UNKNOWN)?;
+        let (id, secret) = secret::parse(presented.ok_or(MISSING)?).ok_or(UNKNOWN)?;
         let key = self.keys.read().unwrap_or_else(PoisonError::into_inner).get(id).cloned().ok_or(UNKNOWN)?;
-        if !secret::matches(plain, &key.digest) {
+        if !secret::verify(secret, &key.digest) {
             return Err(UNKNOWN);
         }
         key.check(now)?;
         Ok(Some(Caller(key)))
     }
 
-    /// Writes down when keys were last used, where that has changed.
+    /// Saves the time of last use of the keys that were used since the last call.
     ///
     /// # Errors
-    /// The database; it is tried again the next time.
-    pub async fn keep_last_uses(&self, store: &Store) -> Result<(), Error> {
+    /// [`Error::Internal`] when the database fails. The next call tries again.
+    pub async fn save_last_used(&self, store: &Store) -> Result<(), Error> {
         let keys: Vec<Arc<Key>> = self.keys.read().unwrap_or_else(PoisonError::into_inner).values().cloned().collect();
         let changed = |key: &Arc<Key>| {
-            let used_at = key.used_at.load(Ordering::Relaxed);
-            (used_at != key.kept_at.load(Ordering::Relaxed)).then(|| (Arc::clone(key), used_at))
+            let used_at = key.last_used_at.load(Ordering::Relaxed);
+            (used_at != key.saved_at.load(Ordering::Relaxed)).then(|| (Arc::clone(key), used_at))
         };
         let used: Vec<(Arc<Key>, i64)> = keys.iter().filter_map(changed).collect();
         let rows = used.iter().filter_map(|(key, at)| Some((key.id.clone(), Timestamp::from_millisecond(*at).ok()?)));
@@ -117,7 +121,7 @@ impl Keyring {
             return Ok(());
         }
         store.touch_keys(&rows).await?;
-        used.iter().for_each(|(key, at)| key.kept_at.store(*at, Ordering::Relaxed));
+        used.iter().for_each(|(key, at)| key.saved_at.store(*at, Ordering::Relaxed));
         Ok(())
     }
 }
@@ -128,70 +132,71 @@ impl Key {
         let used_at = record.last_used_at.map_or(i64::MIN, Timestamp::as_millisecond);
         let key = Self {
             digest: record.digest,
-            scopes: Scopes::stored(&record.scopes),
-            limit: own.or(default).map(|rate| (rate, Bucket::new(rate))),
+            scopes: Scopes::from_stored(&record.scopes),
+            limit: own.or(default).map(|rate| (rate, TokenBucket::new(rate))),
             revoked: AtomicBool::new(false),
             expires_at: AtomicI64::new(i64::MAX),
-            used_at: AtomicI64::new(used_at),
-            kept_at: AtomicI64::new(used_at),
+            last_used_at: AtomicI64::new(used_at),
+            saved_at: AtomicI64::new(used_at),
             id: record.id.clone(),
         };
-        key.end(&record);
+        key.update(&record);
         key
     }
 
-    fn end(&self, record: &KeyRecord) {
+    /// Takes over expiry and revocation, the only parts of a key that change.
+    fn update(&self, record: &KeyRecord) {
         self.expires_at.store(record.expires_at.map_or(i64::MAX, Timestamp::as_millisecond), Ordering::Relaxed);
         self.revoked.store(record.revoked_at.is_some(), Ordering::Relaxed);
     }
 
     fn check(&self, now: Timestamp) -> Result<(), Error> {
         if self.revoked.load(Ordering::Relaxed) {
-            return Err(Error::Unauthenticated("this API key was revoked"));
+            return Err(Error::Unauthenticated("the API key is revoked"));
         }
         if now.as_millisecond() >= self.expires_at.load(Ordering::Relaxed) {
-            return Err(Error::Unauthenticated("this API key has expired"));
+            return Err(Error::Unauthenticated("the API key is expired"));
         }
         Ok(())
     }
 }
 
 impl Caller {
-    /// Public name of the key.
+    /// Public id of the API key.
     pub fn id(&self) -> &str {
         &self.0.id
     }
 
-    /// Checks that the key still is good, for answers that go on for a while.
+    /// Checks that the key is still valid. Streams call this repeatedly.
     ///
     /// # Errors
-    /// [`Error::Unauthenticated`] when it was revoked or has expired.
+    /// [`Error::Unauthenticated`] when the key is revoked or expired.
     pub fn check(&self, now: Timestamp) -> Result<(), Error> {
         self.0.check(now)
     }
 
-    /// Checks that what needs `scope` is open to this key.
+    /// Checks that the key has `scope`.
     ///
     /// # Errors
-    /// [`Error::PermissionDenied`], which names the scope.
+    /// [`Error::PermissionDenied`] when it does not.
     pub fn authorize(&self, scope: Scope) -> Result<(), Error> {
-        if self.0.scopes.open(scope) {
+        if self.0.scopes.allows(scope) {
             return Ok(());
         }
         let (scope, id, scopes) = (scope.name(), self.id(), self.0.scopes);
-        Err(Error::PermissionDenied(format!("this needs the scope {scope}; the API key {id} has {scopes}")))
+        Err(Error::PermissionDenied(format!("this operation requires the scope {scope}; the API key {id} has {scopes}")))
     }
 
-    /// Counts a request at `now` against the key's rate.
+    /// Counts one request at `now` against the rate of the key.
     ///
     /// # Errors
-    /// [`Error::Busy`]: too many too soon.
-    pub fn spend(&self, now: Timestamp) -> Result<(), Error> {
+    /// [`Error::Busy`] when the key is over its rate.
+    pub fn acquire(&self, now: Timestamp) -> Result<(), Error> {
         let key = &self.0;
         let ms = now.as_millisecond();
-        // A second is as exact as anybody asks for; most requests write nothing.
-        if ms.saturating_sub(key.used_at.load(Ordering::Relaxed)) >= 1000 {
-            key.used_at.store(ms, Ordering::Relaxed);
+        // One second of precision is enough, and most requests write nothing.
+        if ms.saturating_sub(key.last_used_at.load(Ordering::Relaxed)) >= 1000 {
+            key.last_used_at.store(ms, Ordering::Relaxed);
         }
         let Some((rate, bucket)) = &key.limit else { return Ok(()) };
         bucket.take(nanoseconds(now)).map_err(|retry_after| {
@@ -200,21 +205,21 @@ impl Caller {
         })
     }
 
-    /// Counts what a request that was let in turned out to be made of, beyond the request itself. It is not refused for that;
-    /// those that follow wait for it.
+    /// Counts `requests` more after an accepted request turned out to contain them (the slots of a batch). The request is not
+    /// refused; later requests of the key wait.
     pub fn charge(&self, requests: u32, now: Timestamp) {
         if let Some((_, bucket)) = &self.0.limit {
             bucket.charge(requests, nanoseconds(now));
         }
     }
 
-    /// For the next message of a stream that this key opened: checks that the key still is good, and counts it.
+    /// Checks that the key is still valid and counts one request: for the next message of an open stream.
     ///
     /// # Errors
-    /// [`Error::Unauthenticated`] when the key is over, [`Error::Busy`] when it asks too often.
-    pub fn again(&self, now: Timestamp) -> Result<(), Error> {
+    /// [`Error::Unauthenticated`] when the key is revoked or expired, [`Error::Busy`] when it is over its rate.
+    pub fn check_and_acquire(&self, now: Timestamp) -> Result<(), Error> {
         self.check(now)?;
-        self.spend(now)
+        self.acquire(now)
     }
 }
 

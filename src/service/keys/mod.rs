@@ -1,7 +1,7 @@
-//! API keys: who may ask for what, how often, until when.
+//! API keys: their scopes, rates and expiry.
 //!
-//! Keys are made and revoked in the database, also by another process while a server runs on it (`qedgix keys`); the server's
-//! [`Keyring`] follows within about a second.
+//! `qedgix keys` creates and revokes keys in the database, also while a server runs on the same data directory. The
+//! [`Keyring`] of the server notices changes within about a second.
 
 mod bucket;
 mod keyring;
@@ -22,59 +22,59 @@ use super::Error;
 use crate::invalid::{Invalid, in_range};
 use crate::store::{self, KeyRecord, Store};
 
-/// What a new key is to be.
+/// Properties of a new key.
 #[derive(Clone, Debug)]
 pub struct NewKey {
-    /// What its owner calls it.
+    /// Name for people.
     pub name: String,
-    /// What it opens.
+    /// What the key allows.
     pub scopes: Scopes,
-    /// How long it lasts; absent: until it is revoked.
+    /// Time until the key expires; `None`: it never expires.
     pub lifetime: Option<Duration>,
-    /// Requests per second; absent: the server's default.
+    /// Requests per second; `None`: the default of the server.
     pub rate: Option<f64>,
-    /// Requests at once; absent: as many as one second allows.
+    /// Requests at once; `None`: the requests of one second.
     pub burst: Option<f64>,
 }
 
-/// What can be told of a key.
+/// A key without its secret.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct KeyInfo {
-    /// Public name.
+    /// Public id.
     pub id: String,
-    /// What its owner calls it.
+    /// Name for people.
     pub name: String,
-    /// What it opens.
+    /// What the key allows.
     pub scopes: Scopes,
     /// `active`, `expired` or `revoked`.
     pub state: &'static str,
-    /// Requests per second, if not the server's default.
+    /// Requests per second; `None`: the default of the server.
     pub rate: Option<f64>,
-    /// Requests at once, if not as many as one second allows.
+    /// Requests at once; `None`: the requests of one second.
     pub burst: Option<f64>,
-    /// When it was made.
+    /// Time of creation.
     pub created_at: Timestamp,
-    /// When it ends by itself.
+    /// Time of expiry, if any.
     pub expires_at: Option<Timestamp>,
-    /// When it was revoked.
+    /// Time of revocation, if any.
     pub revoked_at: Option<Timestamp>,
-    /// When it was last used, to within half a minute while a server runs.
+    /// Time of last use. A running server saves it every 30 seconds.
     pub last_used_at: Option<Timestamp>,
 }
 
-/// A key that was just made.
-pub struct Created {
-    /// What can be told of it.
+/// A new key.
+pub struct CreatedKey {
+    /// The key without its secret.
     pub info: KeyInfo,
-    /// The whole key. Nobody can tell it again.
+    /// The whole key. It is not stored and cannot be shown again.
     pub key: String,
 }
 
-/// The database in `data_dir`, for a process that is not its server. One that is missing is made only to `create`.
+/// Opens the database in `data_dir`, for a process other than its server. With `create`, a missing database is created.
 ///
 /// # Errors
-/// There is none, or it cannot be read.
-pub async fn open(data_dir: &Path, create: bool) -> Result<Store, Error> {
+/// [`Error::Invalid`] when the database is missing and `create` is false, [`Error::Internal`] when it cannot be read.
+pub async fn open_store(data_dir: &Path, create: bool) -> Result<Store, Error> {
     if create {
         std::fs::create_dir_all(data_dir).map_err(|e| Invalid::new("--data-dir", data_dir.display(), e.to_string()))?;
     } else if !data_dir.join(store::FILE).exists() {
@@ -83,11 +83,11 @@ pub async fn open(data_dir: &Path, create: bool) -> Result<Store, Error> {
     Ok(Store::open(data_dir).await?)
 }
 
-/// Makes a key.
+/// Creates a key.
 ///
 /// # Errors
-/// A name, rate or lifetime that cannot be used.
-pub async fn create(store: &Store, new: NewKey, now: Timestamp) -> Result<Created, Error> {
+/// [`Error::Invalid`] when the name, rate, burst or lifetime is out of range.
+pub async fn create(store: &Store, new: NewKey, now: Timestamp) -> Result<CreatedKey, Error> {
     let printable = new.name.chars().all(|c| !c.is_control());
     if new.name.is_empty() || new.name.len() > 128 || !printable {
         return Err(Invalid::new("name", format!("{:?}", new.name), "1 to 128 bytes of printable text").into());
@@ -99,7 +99,7 @@ pub async fn create(store: &Store, new: NewKey, now: Timestamp) -> Result<Create
         in_range("burst", burst, Rate::BURST)?;
     }
     let expires_at = new.lifetime.map(|lifetime| after(now, lifetime, "expires")).transpose()?;
-    let plain = secret::Plain::generate().map_err(|e| Error::internal(e.to_string()))?;
+    let plain = secret::PlainKey::generate().map_err(|e| Error::internal(e.to_string()))?;
     let record = KeyRecord {
         id: plain.id().to_owned(),
         name: new.name,
@@ -113,34 +113,35 @@ pub async fn create(store: &Store, new: NewKey, now: Timestamp) -> Result<Create
         last_used_at: None,
     };
     if !store.insert_key(&record).await? {
-        return Err(Error::internal("two keys were given the same id"));
+        return Err(Error::internal("two API keys have the same id"));
     }
-    Ok(Created { info: info(record, now), key: plain.reveal() })
+    Ok(CreatedKey { info: info(record, now), key: plain.to_text() })
 }
 
 /// All keys, oldest first.
 ///
 /// # Errors
-/// The database.
+/// [`Error::Internal`] when the database fails.
 pub async fn list(store: &Store, now: Timestamp) -> Result<Vec<KeyInfo>, Error> {
     Ok(store.keys().await?.into_iter().map(|record| info(record, now)).collect())
 }
 
-/// Ends a key at once, named by its id or in full. One that is over stays as it is.
+/// Revokes a key, given as its id or in full. A key that is already revoked or expired stays as it is.
 ///
 /// # Errors
-/// There is no such key.
+/// [`Error::NotFound`] when there is no such key.
 pub async fn revoke(store: &Store, id: &str, now: Timestamp) -> Result<(), Error> {
-    let id = secret::public(id);
+    let id = secret::id_of(id);
     if store.revoke_key(id, now).await? { Ok(()) } else { Err(Error::not_found("API key", id)) }
 }
 
-/// Makes a key like another one, named by its id or in full, which ends after `grace`. The new one lasts as long as the old one did when it was made.
+/// Replaces a key, given as its id or in full: creates a key with the same properties and lifetime, and lets the old key expire after
+/// `grace`.
 ///
 /// # Errors
-/// There is no such key, or it is over.
-pub async fn rotate(store: &Store, id: &str, grace: Duration, now: Timestamp) -> Result<Created, Error> {
-    let id = secret::public(id);
+/// [`Error::NotFound`] when there is no such key, [`Error::Precondition`] when it is revoked or expired.
+pub async fn rotate(store: &Store, id: &str, grace: Duration, now: Timestamp) -> Result<CreatedKey, Error> {
+    let id = secret::id_of(id);
     let old = store.keys().await?.into_iter().find(|key| key.id == id).ok_or_else(|| Error::not_found("API key", id))?;
     let state = state(&old, now);
     if state != "active" {
@@ -149,7 +150,7 @@ pub async fn rotate(store: &Store, id: &str, grace: Duration, now: Timestamp) ->
     }
     let end = after(now, grace, "grace")?;
     let lifetime = old.expires_at.and_then(|at| Duration::try_from(at.duration_since(old.created_at)).ok());
-    let scopes = Scopes::stored(&old.scopes);
+    let scopes = Scopes::from_stored(&old.scopes);
     let created = create(store, NewKey { name: old.name, scopes, lifetime, rate: old.rate, burst: old.burst }, now).await?;
     store.end_key(id, end).await?;
     Ok(created)
@@ -171,7 +172,7 @@ fn state(record: &KeyRecord, now: Timestamp) -> &'static str {
 fn info(record: KeyRecord, now: Timestamp) -> KeyInfo {
     KeyInfo {
         state: state(&record, now),
-        scopes: Scopes::stored(&record.scopes),
+        scopes: Scopes::from_stored(&record.scopes),
         id: record.id,
         name: record.name,
         rate: record.rate,

@@ -1,4 +1,4 @@
-//! What a key opens.
+//! Scopes: the operations that an API key allows.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,24 +7,24 @@ use serde::{Serialize, Serializer};
 
 use crate::invalid::Invalid;
 
-/// A part of what the server does.
+/// A group of operations.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Scope {
-    /// Lists, shows, metrics, reflection.
+    /// Reading: lists, details, metrics, reflection.
     Read,
-    /// Acts, sessions, environments, inference.
+    /// `Act`, sessions, environments, inference.
     Act,
-    /// Submitting, cancelling, pausing, resuming, deleting jobs.
+    /// Submitting, cancelling, pausing, resuming and deleting jobs.
     Jobs,
-    /// Policies and aliases; and all of the above.
+    /// Changing policies and aliases, and everything that the other scopes allow.
     Admin,
 }
 
 impl Scope {
-    /// All, in the order in which they are written.
+    /// All scopes, in the order of their text form.
     pub const ALL: [Self; 4] = [Self::Read, Self::Act, Self::Jobs, Self::Admin];
 
-    /// Its name.
+    /// Name in flags, in the database and in JSON.
     pub fn name(self) -> &'static str {
         match self {
             Self::Read => "read",
@@ -35,7 +35,7 @@ impl Scope {
     }
 }
 
-/// Scopes of one key, at least one.
+/// The scopes of one key, at least one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Scopes(u8);
 
@@ -44,18 +44,18 @@ impl Scopes {
         1 << scope as u8
     }
 
-    /// Whether what needs `scope` is open: `admin` opens everything.
-    pub fn open(self, scope: Scope) -> bool {
+    /// Whether operations of `scope` are allowed. `admin` allows every scope.
+    pub fn allows(self, scope: Scope) -> bool {
         self.0 & (Self::bit(scope) | Self::bit(Scope::Admin)) != 0
     }
 
-    /// The scopes, without those that others imply.
+    /// The scopes as granted; `admin` is one scope here.
     pub fn iter(self) -> impl Iterator<Item = Scope> {
         Scope::ALL.into_iter().filter(move |scope| self.0 & Self::bit(*scope) != 0)
     }
 
-    /// As stored. A name that this version does not know opens nothing.
-    pub(super) fn stored(text: &str) -> Self {
+    /// Parses the text form from the database. Names that this version does not know are ignored.
+    pub(super) fn from_stored(text: &str) -> Self {
         let known = text.split(',').filter_map(|name| Scope::ALL.into_iter().find(|scope| scope.name() == name));
         Self(known.fold(0, |bits, scope| bits | Self::bit(scope)))
     }
@@ -94,15 +94,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn scopes_read_as_written_and_admin_opens_all() {
+    fn scopes_round_trip_and_admin_allows_all() {
         let scopes: Scopes = "act, read".parse().unwrap();
         assert_eq!(scopes.to_string(), "read,act");
         assert_eq!(scopes, "read,act".parse().unwrap());
-        assert_eq!(Scopes::stored(&scopes.to_string()), scopes);
-        let open = |scopes: Scopes| Scope::ALL.map(|scope| scopes.open(scope));
-        assert_eq!(open(scopes), [true, true, false, false]);
-        assert_eq!(open("admin".parse().unwrap()), [true; 4]);
-        assert_eq!(open(Scopes::stored("of a later version,jobs")), [false, false, true, false]);
+        assert_eq!(Scopes::from_stored(&scopes.to_string()), scopes);
+        let allowed = |scopes: Scopes| Scope::ALL.map(|scope| scopes.allows(scope));
+        assert_eq!(allowed(scopes), [true, true, false, false]);
+        assert_eq!(allowed("admin".parse().unwrap()), [true; 4]);
+        assert_eq!(allowed(Scopes::from_stored("unknown,jobs")), [false, false, true, false]);
         for wrong in ["", "read,", "READ", "read;act", "all"] {
             let error = wrong.parse::<Scopes>().unwrap_err();
             assert_eq!(error.field, "scopes", "{wrong}");

@@ -60,7 +60,7 @@ fn attributes(attributes: &[KeyValue]) -> BTreeMap<String, String> {
 }
 
 fn hex(bytes: &[u8]) -> String {
-    qedgix::jobs::hex(bytes)
+    hex::encode(bytes)
 }
 
 #[tokio::test]

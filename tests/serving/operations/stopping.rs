@@ -118,6 +118,6 @@ async fn what_takes_too_long_is_given_up() {
     binary.signal("TERM");
     let (code, lines) = binary.ended().await;
     assert_eq!(code, Some(0), "{lines:?}");
-    assert!(lines.iter().any(|line| line.contains("gave up on requests in flight")), "{lines:?}");
+    assert!(lines.iter().any(|line| line.contains("drain timeout")), "{lines:?}");
     assert!(soon(act).await.unwrap().is_err());
 }

@@ -25,12 +25,12 @@ async fn keys_end_and_the_server_never_falls_open() {
     server.pass(3599);
     assert_eq!(ask(&server, &short.key).await.0, 200);
     server.pass(1);
-    assert_eq!(ask(&server, &short.key).await, (401, "this API key has expired".into()));
+    assert_eq!(ask(&server, &short.key).await, (401, "the API key is expired".into()));
     keys::revoke(&server.app.store, &forever.info.id, server.app.clock.now()).await.unwrap();
     refresh(&server).await;
-    assert_eq!(ask(&server, &forever.key).await, (401, "this API key was revoked".into()));
+    assert_eq!(ask(&server, &forever.key).await, (401, "the API key is revoked".into()));
     // Nobody has a good key now, and nobody gets in.
-    assert!(ask(&server, "").await.1.starts_with("an API key is needed"));
+    assert!(ask(&server, "").await.1.starts_with("an API key is required"));
     assert_eq!(reqwest::get(server.url("/v1/policies")).await.unwrap().status(), 401);
     let mut client = server.grpc().await;
     assert_eq!(refused(client.list_policies(v1::ListPoliciesRequest::default()).await).0, Code::Unauthenticated);
@@ -73,7 +73,7 @@ async fn a_running_server_notices_by_itself() {
     let server = Server::start().await;
     assert_eq!(ask(&server, "").await.0, 200, "without keys everybody on this machine may ask");
     // Another process would do the same: a database of its own on the same file.
-    let store = keys::open(server.dir.path(), false).await.unwrap();
+    let store = keys::open_store(server.dir.path(), false).await.unwrap();
     let new = keys::NewKey { name: "k".into(), scopes: "read".parse().unwrap(), lifetime: None, rate: None, burst: None };
     let created = keys::create(&store, new, server.app.clock.now()).await.unwrap();
     let until = async |status| {
@@ -102,7 +102,7 @@ async fn a_stream_ends_with_its_key() {
     refresh(&server).await;
     ask.send(slot()).await.unwrap();
     let status = soon(answers.message()).await.unwrap_err();
-    assert_eq!((status.code(), status.message()), (Code::Unauthenticated, "this API key was revoked"));
+    assert_eq!((status.code(), status.message()), (Code::Unauthenticated, "the API key is revoked"));
 }
 
 #[tokio::test]
@@ -161,7 +161,7 @@ async fn the_last_use_is_kept_and_a_restart_changes_nothing() {
     assert_eq!(ask(&server, &created.key).await.0, 200);
     let used = async |server: &Server| keys::list(&server.app.store, server.app.clock.now()).await.unwrap()[0].last_used_at;
     assert_eq!(used(&server).await, None, "no request writes");
-    server.app.keys.keep_last_uses(&server.app.store).await.unwrap();
+    server.app.keys.save_last_used(&server.app.store).await.unwrap();
     assert_eq!(used(&server).await, Some(server.app.clock.now()));
     server.pass(5);
     assert_eq!(ask(&server, &created.key).await.0, 200);

@@ -7,13 +7,13 @@ mod keys;
 mod rates;
 mod tls;
 
-use qedgix::service::keys::{Created, NewKey, create};
+use qedgix::service::keys::{CreatedKey, NewKey, create};
 use tonic::Request;
 
 use super::harness::Server;
 
 /// A key of a server in this process, which knows it when this returns.
-async fn make(server: &Server, scopes: &str, change: impl FnOnce(&mut NewKey)) -> Created {
+async fn make(server: &Server, scopes: &str, change: impl FnOnce(&mut NewKey)) -> CreatedKey {
     let mut new = NewKey { name: "of a test".into(), scopes: scopes.parse().unwrap(), lifetime: None, rate: None, burst: None };
     change(&mut new);
     let created = create(&server.app.store, new, server.app.clock.now()).await.unwrap();

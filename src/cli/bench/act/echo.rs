@@ -1,5 +1,6 @@
-//! The yardstick: a gRPC service that decodes what `Act` is sent and answers what `Act` answered once, with the server's
-//! transport settings and nothing else of it. Like the server measured it is part of this process, or another process.
+//! The echo service that `Act` is compared with: it decodes the requests of `Act` and always returns the same `ActResponse`.
+//!
+//! It uses the transport settings of the server. It runs in this process when the server does, and in a process of its own otherwise.
 
 use std::net::SocketAddr;
 use std::process::Stdio;
@@ -16,107 +17,108 @@ use tonic::transport::Server as Transport;
 use tonic::transport::server::TcpIncoming;
 use tonic::{Request, Response, Status, Streaming};
 
-use crate::server::{KEEPALIVE, WINDOW};
+use crate::cli::output::outln;
+use crate::server::{HTTP2_WINDOW, KEEPALIVE_INTERVAL};
 use crate::wire::v1;
 use crate::wire::v1::policy_service_server::{PolicyService, PolicyServiceServer};
 
-/// Largest request, as large as any that a server may be told to take.
-const LARGEST: usize = 1 << 30;
+/// Maximum request size in bytes: the maximum of `--max-message-size`.
+const MAX_MESSAGE_SIZE: usize = 1 << 30;
 
-/// A running echo; it ends when this is dropped.
+/// A running echo service; dropping it stops the service.
 pub(super) struct Echo {
-    /// Where it listens.
+    /// Address of the service.
     pub(super) address: SocketAddr,
     _running: Running,
 }
 
 enum Running {
-    Here(JoinHandle<()>),
-    /// It ends with its standard input.
-    There {
+    Task(JoinHandle<()>),
+    /// The process ends when its standard input closes.
+    Process {
         _child: Child,
     },
 }
 
 impl Drop for Running {
     fn drop(&mut self) {
-        if let Self::Here(task) = self {
+        if let Self::Task(task) = self {
             task.abort();
         }
     }
 }
 
 impl Echo {
-    /// Starts one that answers `answer`; in a process of its own if `apart`.
+    /// Starts a service that returns `response`, in a process of its own if `own_process`.
     ///
     /// # Errors
-    /// The system refuses a port or a process.
-    pub(super) async fn start(answer: &v1::ActResponse, apart: bool) -> anyhow::Result<Self> {
-        if apart {
-            return Self::start_process(answer).await.context("starting the echo's process");
+    /// No port can be bound, or the process cannot be started.
+    pub(super) async fn start(response: &v1::ActResponse, own_process: bool) -> anyhow::Result<Self> {
+        if own_process {
+            return Self::start_process(response).await.context("cannot start the echo process");
         }
         let listener = listen().await?;
         let address = listener.local_addr()?;
-        let service = service(answer.clone());
+        let service = service(response.clone());
         let task = tokio::spawn(async move {
-            // It ends by being aborted; until then, who calls it sees what goes wrong.
+            // Callers see failures of the service, so its result is not needed. The task ends by abort.
             let _ = transport().add_service(service).serve_with_incoming(incoming(listener)).await;
         });
-        Ok(Self { address, _running: Running::Here(task) })
+        Ok(Self { address, _running: Running::Task(task) })
     }
 
-    async fn start_process(answer: &v1::ActResponse) -> anyhow::Result<Self> {
+    async fn start_process(response: &v1::ActResponse) -> anyhow::Result<Self> {
         let mut child = Command::new(std::env::current_exe()?)
             .args(["bench", "echo"])
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .kill_on_drop(true)
             .spawn()?;
-        let to = child.stdin.as_mut().context("it has no standard input")?;
-        let answer = answer.encode_to_vec();
-        to.write_u64(answer.len() as u64).await?;
-        to.write_all(&answer).await?;
+        let to = child.stdin.as_mut().context("no standard input")?;
+        let response = response.encode_to_vec();
+        to.write_u64(response.len() as u64).await?;
+        to.write_all(&response).await?;
         to.flush().await?;
-        let from = child.stdout.take().context("it has no standard output")?;
+        let from = child.stdout.take().context("no standard output")?;
         let mut line = String::new();
         BufReader::new(from).read_line(&mut line).await?;
-        let address = line.trim().parse().with_context(|| format!("it says {line:?} instead of its address"))?;
-        Ok(Self { address, _running: Running::There { _child: child } })
+        let address = line.trim().parse().with_context(|| format!("expected an address, received {line:?}"))?;
+        Ok(Self { address, _running: Running::Process { _child: child } })
     }
 }
 
-/// `qedgix bench echo`: reads the answer from standard input, prints where it listens, serves until the input ends.
+/// `qedgix bench echo`: reads the response from standard input, prints the address, and serves until standard input closes.
 ///
 /// # Errors
-/// The input is no answer, or the system refuses a port.
+/// The input is not an `ActResponse`, or no port can be bound.
 pub(in super::super) async fn serve() -> anyhow::Result<()> {
     let mut input = BufReader::new(tokio::io::stdin());
     let size = input.read_u64().await?;
-    let mut answer = Vec::new();
-    (&mut input).take(size.min(LARGEST as u64)).read_to_end(&mut answer).await?;
-    let answer = v1::ActResponse::decode(&answer[..])?;
+    let mut response = Vec::new();
+    (&mut input).take(size.min(MAX_MESSAGE_SIZE as u64)).read_to_end(&mut response).await?;
+    let response = v1::ActResponse::decode(&response[..])?;
     let listener = listen().await?;
-    println!("{}", listener.local_addr()?);
-    let until = async move {
-        // An input that breaks ends like one that is closed.
+    outln!("{}", listener.local_addr()?)?;
+    let input_closed = async move {
+        // A broken input counts as closed.
         let _ = tokio::io::copy(&mut input, &mut tokio::io::sink()).await;
     };
     tokio::select! {
-        served = transport().add_service(service(answer)).serve_with_incoming(incoming(listener)) => Ok(served?),
-        () = until => Ok(()),
+        served = transport().add_service(service(response)).serve_with_incoming(incoming(listener)) => Ok(served?),
+        () = input_closed => Ok(()),
     }
 }
 
-/// A bare transport with the server's settings.
+/// A gRPC server with the transport settings of the Qedgix server.
 fn transport() -> Transport {
     Transport::builder()
-        .http2_keepalive_interval(Some(KEEPALIVE))
+        .http2_keepalive_interval(Some(KEEPALIVE_INTERVAL))
         .max_concurrent_streams(1024)
-        .initial_stream_window_size(WINDOW)
-        .initial_connection_window_size(WINDOW)
+        .initial_stream_window_size(HTTP2_WINDOW)
+        .initial_connection_window_size(HTTP2_WINDOW)
 }
 
-/// Connections on which nothing waits for a packet to fill.
+/// Connections with TCP_NODELAY, as the server has them.
 fn incoming(listener: TcpListener) -> TcpIncoming {
     TcpIncoming::from(listener).with_nodelay(Some(true))
 }
@@ -125,19 +127,19 @@ async fn listen() -> std::io::Result<TcpListener> {
     TcpListener::bind(("127.0.0.1", 0)).await
 }
 
-fn service(answer: v1::ActResponse) -> PolicyServiceServer<Canned> {
-    PolicyServiceServer::new(Canned(Arc::new(answer))).max_decoding_message_size(LARGEST)
+fn service(response: v1::ActResponse) -> PolicyServiceServer<FixedResponse> {
+    PolicyServiceServer::new(FixedResponse(Arc::new(response))).max_decoding_message_size(MAX_MESSAGE_SIZE)
 }
 
-/// Has one answer to everything.
-struct Canned(Arc<v1::ActResponse>);
+/// Returns the same response to every `Act`.
+struct FixedResponse(Arc<v1::ActResponse>);
 
-fn absent<T>() -> Result<Response<T>, Status> {
-    Err(Status::unimplemented("the echo answers Act and ActStream"))
+fn unimplemented<T>() -> Result<Response<T>, Status> {
+    Err(Status::unimplemented("the echo service implements Act and ActStream only"))
 }
 
 #[tonic::async_trait]
-impl PolicyService for Canned {
+impl PolicyService for FixedResponse {
     async fn act(&self, _: Request<v1::ActRequest>) -> Result<Response<v1::ActResponse>, Status> {
         Ok(Response::new((*self.0).clone()))
     }
@@ -145,36 +147,36 @@ impl PolicyService for Canned {
     type ActStreamStream = BoxStream<'static, Result<v1::ActResult, Status>>;
 
     async fn act_stream(&self, request: Request<Streaming<v1::ActRequest>>) -> Result<Response<Self::ActStreamStream>, Status> {
-        let answer = self.0.clone();
-        let result = move |_| v1::ActResult { result: Some(v1::act_result::Result::Response((*answer).clone())) };
+        let response = self.0.clone();
+        let result = move |_| v1::ActResult { result: Some(v1::act_result::Result::Response((*response).clone())) };
         Ok(Response::new(request.into_inner().map(move |request| request.map(&result)).boxed()))
     }
 
     async fn act_batch(&self, _: Request<v1::ActBatchRequest>) -> Result<Response<v1::ActBatchResponse>, Status> {
-        absent()
+        unimplemented()
     }
 
     async fn open_session(&self, _: Request<v1::OpenSessionRequest>) -> Result<Response<v1::Session>, Status> {
-        absent()
+        unimplemented()
     }
 
     async fn get_session(&self, _: Request<v1::GetSessionRequest>) -> Result<Response<v1::Session>, Status> {
-        absent()
+        unimplemented()
     }
 
     async fn list_sessions(&self, _: Request<v1::ListSessionsRequest>) -> Result<Response<v1::ListSessionsResponse>, Status> {
-        absent()
+        unimplemented()
     }
 
     async fn close_session(&self, _: Request<v1::CloseSessionRequest>) -> Result<Response<v1::Session>, Status> {
-        absent()
+        unimplemented()
     }
 
     async fn list_policies(&self, _: Request<v1::ListPoliciesRequest>) -> Result<Response<v1::ListPoliciesResponse>, Status> {
-        absent()
+        unimplemented()
     }
 
     async fn get_policy(&self, _: Request<v1::GetPolicyRequest>) -> Result<Response<v1::Policy>, Status> {
-        absent()
+        unimplemented()
     }
 }

@@ -1,5 +1,7 @@
-//! Clients that send and time requests: closed loop (each sends when it has its last answer) or open loop (requests are due at
-//! fixed times and timed from then, so that a slow answer is not hidden by the requests it held up).
+//! Clients that send requests and measure latencies.
+//!
+//! Closed loop: each client sends its next request when it has the previous response. Open loop: requests are due at fixed times, and
+//! latencies count from those times, so that a slow response also shows in the latencies of the requests that it delays.
 
 use std::time::{Duration, Instant};
 
@@ -9,92 +11,96 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Status, Streaming};
 
-use super::figures::Samples;
-use super::world::World;
-use crate::cli::fly::Server;
+use super::fleet::SimulatedFleet;
+use super::metrics::CallSamples;
+use crate::cli::act_client::PolicyClient;
 use crate::wire::v1;
-use crate::wire::v1::act_result::Result as Told;
+use crate::wire::v1::act_result::Result as ActResult;
 
-/// When the next request is sent.
+/// When clients send requests.
 #[derive(Clone, Copy, Debug)]
-pub(super) enum Pace {
-    /// When the last one is answered.
-    Answers,
-    /// So many per second, of all clients together.
-    Rate(f64),
+pub(super) enum LoadMode {
+    /// When the previous response has arrived.
+    ClosedLoop,
+    /// At this rate per second, of all clients together.
+    OpenLoop(f64),
 }
 
-/// Time that a client whose call failed waits.
-const PAUSE: Duration = Duration::from_millis(10);
+/// Pause of a client after a failed call.
+const ERROR_PAUSE: Duration = Duration::from_millis(10);
 
-/// One session: its world and its way to the server.
-pub(super) struct Client {
-    world: World,
-    server: Server,
+/// One session: its simulated fleet and its connection.
+pub(super) struct LoadClient {
+    fleet: SimulatedFleet,
+    server: PolicyClient,
     stream: Option<(mpsc::Sender<v1::ActRequest>, Streaming<v1::ActResult>)>,
 }
 
-impl Client {
-    /// A client whose session is open.
+impl LoadClient {
+    /// Creates a client of an open session. With `stream`, opens an `ActStream`.
     ///
     /// # Errors
-    /// The stream is refused.
-    pub(super) async fn new(mut server: Server, world: World, stream: bool) -> Result<Self, Status> {
+    /// The server refuses the stream.
+    pub(super) async fn new(mut server: PolicyClient, fleet: SimulatedFleet, stream: bool) -> Result<Self, Status> {
         let stream = if stream {
-            let (ask, asked) = mpsc::channel(1);
-            Some((ask, server.act_stream(ReceiverStream::new(asked)).await?.into_inner()))
+            let (sender, requests) = mpsc::channel(1);
+            Some((sender, server.act_stream(ReceiverStream::new(requests)).await?.into_inner()))
         } else {
             None
         };
-        Ok(Self { world, server, stream })
+        Ok(Self { fleet, server, stream })
     }
 
-    /// Ends its session.
+    /// Closes the session.
     pub(super) async fn close(mut self) {
         drop(self.stream.take());
-        // If it is not closed it expires.
-        let _ = self.server.close_session(v1::CloseSessionRequest { session_id: self.world.session().to_owned() }).await;
+        // A session that cannot be closed expires.
+        let _ = self.server.close_session(v1::CloseSessionRequest { session_id: self.fleet.session().to_owned() }).await;
     }
 
-    /// Sends a request; the code it failed with otherwise.
+    /// Sends a request and returns the response, or the status code of the failure.
     async fn send(&mut self, request: v1::ActRequest) -> Result<v1::ActResponse, Code> {
-        let Some((ask, answers)) = &mut self.stream else {
+        let Some((sender, responses)) = &mut self.stream else {
             return self.server.act(request).await.map(tonic::Response::into_inner).map_err(|status| status.code());
         };
-        ask.send(request).await.map_err(|_| Code::Unavailable)?;
-        match answers.next().await {
-            Some(Ok(v1::ActResult { result: Some(Told::Response(answer)) })) => Ok(answer),
-            Some(Ok(v1::ActResult { result: Some(Told::Error(error)) })) => Err(Code::from(error.status)),
+        sender.send(request).await.map_err(|_| Code::Unavailable)?;
+        match responses.next().await {
+            Some(Ok(v1::ActResult { result: Some(ActResult::Response(response)) })) => Ok(response),
+            Some(Ok(v1::ActResult { result: Some(ActResult::Error(error)) })) => Err(Code::from(error.status)),
             Some(Ok(v1::ActResult { result: None })) => Err(Code::Unknown),
             Some(Err(status)) => Err(status.code()),
             None => Err(Code::Unavailable),
         }
     }
 
-    /// Flies a slot and notes how long its answer took, counted from `due` or from now.
-    async fn slot(&mut self, due: Option<Instant>, samples: &mut Samples) -> anyhow::Result<()> {
-        let request = self.world.request();
+    /// Runs one slot and records its latency, which counts from `due` or from now.
+    async fn slot(&mut self, due: Option<Instant>, samples: &mut CallSamples) -> anyhow::Result<()> {
+        let request = self.fleet.request();
         let begin = due.unwrap_or_else(Instant::now);
         match self.send(request).await {
-            Ok(answer) => {
+            Ok(response) => {
                 samples.latencies.push(begin.elapsed());
-                self.world.fly(&answer)?;
+                self.fleet.step(&response)?;
             }
             Err(code) => {
-                samples.fail(name(code));
-                self.world.restart();
-                tokio::time::sleep(PAUSE).await;
+                samples.fail(code_name(code));
+                self.fleet.next_episode();
+                tokio::time::sleep(ERROR_PAUSE).await;
             }
         }
         Ok(())
     }
 }
 
-/// Lets all clients send for `time`; returns them with what they measured.
+/// Lets all clients send for `time`, and returns them with their samples.
 ///
 /// # Errors
-/// An answer that cannot be flown.
-pub(super) async fn round(clients: Vec<Client>, pace: Pace, time: Duration) -> anyhow::Result<(Vec<Client>, Samples)> {
+/// A response does not have one heading per UAV.
+pub(super) async fn round(
+    clients: Vec<LoadClient>,
+    mode: LoadMode,
+    time: Duration,
+) -> anyhow::Result<(Vec<LoadClient>, CallSamples)> {
     let begin = Instant::now();
     let end = begin + time;
     let mut due = Vec::new();
@@ -103,14 +109,14 @@ pub(super) async fn round(clients: Vec<Client>, pace: Pace, time: Duration) -> a
         let (tick, mut ticks) = mpsc::unbounded_channel::<Instant>();
         due.push(tick);
         tasks.push(tokio::spawn(async move {
-            let mut samples = Samples::default();
-            match pace {
-                Pace::Answers => {
+            let mut samples = CallSamples::default();
+            match mode {
+                LoadMode::ClosedLoop => {
                     while Instant::now() < end {
                         client.slot(None, &mut samples).await?;
                     }
                 }
-                Pace::Rate(_) => {
+                LoadMode::OpenLoop(_) => {
                     while let Some(due) = ticks.recv().await {
                         if Instant::now() < end {
                             client.slot(Some(due), &mut samples).await?;
@@ -123,11 +129,11 @@ pub(super) async fn round(clients: Vec<Client>, pace: Pace, time: Duration) -> a
             anyhow::Ok((client, samples))
         }));
     }
-    if let Pace::Rate(rate) = pace {
-        // A thread of its own: the runtime's timers tick in milliseconds.
+    if let LoadMode::OpenLoop(rate) = mode {
+        // On a thread, because timers of the runtime have a resolution of 1 ms.
         std::thread::spawn(move || schedule(begin, end, rate, &due));
     }
-    let mut samples = Samples::default();
+    let mut samples = CallSamples::default();
     let mut clients = Vec::new();
     for done in try_join_all(tasks).await? {
         let (client, measured) = done?;
@@ -138,7 +144,7 @@ pub(super) async fn round(clients: Vec<Client>, pace: Pace, time: Duration) -> a
     Ok((clients, samples))
 }
 
-/// Tells clients, in turn, when a request is due, as soon as it is.
+/// Sends the due times of requests to the clients in turn, each when it is reached.
 fn schedule(begin: Instant, end: Instant, rate: f64, clients: &[mpsc::UnboundedSender<Instant>]) {
     for (number, client) in (0_u64..).zip(clients.iter().cycle()) {
         let due = begin + Duration::from_secs_f64(number as f64 / rate);
@@ -152,8 +158,8 @@ fn schedule(begin: Instant, end: Instant, rate: f64, clients: &[mpsc::UnboundedS
     }
 }
 
-/// A code as gRPC's documents write it.
-pub(super) fn name(code: Code) -> String {
+/// Name of a status code as in the gRPC documentation, such as `DEADLINE_EXCEEDED`.
+pub(super) fn code_name(code: Code) -> String {
     format!("{code:?}").chars().fold(String::new(), |mut name, c| {
         if c.is_uppercase() && !name.is_empty() {
             name.push('_');
@@ -168,21 +174,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn requests_are_due_at_the_rate_and_in_turn() {
+    fn due_times_follow_the_rate_and_alternate_between_clients() {
         let (a, mut due_a) = mpsc::unbounded_channel();
         let (b, mut due_b) = mpsc::unbounded_channel();
         let begin = Instant::now();
         schedule(begin, begin + Duration::from_millis(5), 1000.0, &[a, b]);
-        let mut taken = |which: usize| if which == 0 { due_a.try_recv() } else { due_b.try_recv() };
+        let mut receive = |which: usize| if which == 0 { due_a.try_recv() } else { due_b.try_recv() };
         for number in 0..5 {
-            assert_eq!(taken(number % 2), Ok(begin + Duration::from_secs_f64(number as f64 / 1000.0)));
+            assert_eq!(receive(number % 2), Ok(begin + Duration::from_secs_f64(number as f64 / 1000.0)));
         }
-        assert!(taken(0).is_err() && taken(1).is_err(), "none is due at the end");
+        assert!(receive(0).is_err() && receive(1).is_err(), "no request is due at the end");
     }
 
     #[test]
-    fn codes_are_written_as_in_the_documents() {
-        assert_eq!(name(Code::Ok), "OK");
-        assert_eq!(name(Code::DeadlineExceeded), "DEADLINE_EXCEEDED");
+    fn codes_have_their_documented_names() {
+        assert_eq!(code_name(Code::Ok), "OK");
+        assert_eq!(code_name(Code::DeadlineExceeded), "DEADLINE_EXCEEDED");
     }
 }

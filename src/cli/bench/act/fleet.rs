@@ -1,43 +1,43 @@
-//! Episodes that a client flies, and the requests that come out of them.
+//! A simulated fleet: runs episodes and makes the requests of their slots.
 
-use super::{ActArgs, Observation};
+use super::{ActArgs, ObservationForm};
 use crate::env::{EnvConfig, Episode, Point, Start};
 use crate::policy::Slot;
 use crate::wire::v1;
 use crate::wire::v1::act_request::{Memory, Observation as Sent};
 
-/// What all clients fly.
-pub(super) struct Setup {
+/// Properties of all simulated fleets.
+pub(super) struct FleetConfig {
     policy: String,
     env: EnvConfig,
-    observation: Observation,
-    /// The policy's own.
+    observation: ObservationForm,
+    /// Detection range of the policy.
     range: f64,
-    /// Lengths are multiplied by this.
+    /// Factor of all lengths in requests.
     scale: f64,
 }
 
-impl Setup {
-    /// The flags, for `policy`.
+impl FleetConfig {
+    /// Reads the flags, for `policy`.
     ///
     /// # Errors
-    /// A fleet that no environment holds.
+    /// The number of UAVs or users is out of range.
     pub(super) fn new(args: &ActArgs, policy: &v1::Policy) -> anyhow::Result<Self> {
         let hover = policy.headings as usize > EnvConfig::COMPASS;
         let env = EnvConfig { uavs: args.uavs, users: args.users, hover, start: Start::Random, ..EnvConfig::default() };
         env.validate()?;
         let range = policy.detection_range;
-        let scale = args.range.map_or(1.0, |wanted| range / wanted);
+        let scale = args.range.map_or(1.0, |requested| range / requested);
         Ok(Self { policy: args.policy.clone(), env, observation: args.observation, range, scale })
     }
 }
 
-/// One fleet in its episodes, one after another. A session sees each as a new run.
-pub(super) struct World {
+/// A fleet that runs episode after episode in one session. Each episode has its own run id.
+pub(super) struct SimulatedFleet {
     episode: Episode,
     run: u64,
     session: String,
-    observation: Observation,
+    observation: ObservationForm,
     range: f64,
     scale: f64,
     slot: Slot,
@@ -45,33 +45,33 @@ pub(super) struct World {
     users: Vec<String>,
 }
 
-impl World {
-    /// The first episode of `session`.
+impl SimulatedFleet {
+    /// Begins the first episode in `session`.
     ///
     /// # Errors
-    /// None once a [`Setup`] is there.
-    pub(super) fn new(setup: &Setup, session: String, seed: u64) -> anyhow::Result<Self> {
+    /// Never for a valid [`FleetConfig`].
+    pub(super) fn new(config: &FleetConfig, session: String, seed: u64) -> anyhow::Result<Self> {
         Ok(Self {
-            episode: Episode::new(&setup.env, seed)?,
+            episode: Episode::new(&config.env, seed)?,
             run: 0,
             session,
-            observation: setup.observation,
-            range: setup.range,
-            scale: setup.scale,
+            observation: config.observation,
+            range: config.range,
+            scale: config.scale,
             slot: Slot::default(),
-            uavs: (0..setup.env.uavs).map(|i| format!("uav-{i}")).collect(),
-            users: (0..setup.env.users).map(|i| format!("user-{i}")).collect(),
+            uavs: (0..config.env.uavs).map(|i| format!("uav-{i}")).collect(),
+            users: (0..config.env.users).map(|i| format!("user-{i}")).collect(),
         })
     }
 
-    /// Its session's name.
+    /// Id of the session.
     pub(super) fn session(&self) -> &str {
         &self.session
     }
 
-    /// What opens its session.
-    pub(super) fn open(&self, setup: &Setup) -> v1::OpenSessionRequest {
-        let (policy, session_id) = (setup.policy.clone(), self.session.clone());
+    /// The request that opens the session.
+    pub(super) fn open_request(&self, config: &FleetConfig) -> v1::OpenSessionRequest {
+        let (policy, session_id) = (config.policy.clone(), self.session.clone());
         v1::OpenSessionRequest { policy, session_id, run_id: Some(self.run_id()), seed: Some(self.episode.seed()) }
     }
 
@@ -79,13 +79,13 @@ impl World {
         format!("run-{}", self.run)
     }
 
-    /// What is asked in this slot.
+    /// The request of the current slot.
     pub(super) fn request(&mut self) -> v1::ActRequest {
         let scaled = |points: Vec<Point>| -> Vec<Point> { points.into_iter().map(|p| p.map(|x| x * self.scale)).collect() };
         let (uavs, users) = (scaled(self.episode.uavs()), scaled(self.episode.users()));
         let observation = match self.observation {
-            Observation::Scene => Sent::Scene(self.scene(&uavs, &users)),
-            Observation::Graph => Sent::Graph(self.graph(&uavs, &users)),
+            ObservationForm::Scene => Sent::Scene(self.scene(&uavs, &users)),
+            ObservationForm::Graph => Sent::Graph(self.graph(&uavs, &users)),
         };
         v1::ActRequest {
             observation: Some(observation),
@@ -103,7 +103,7 @@ impl World {
         v1::Scene { uavs: uavs.collect(), users: users.collect() }
     }
 
-    /// What UAVs detect; what users do is left to the server.
+    /// The detections of the UAVs. The server derives those of the users.
     fn graph(&mut self, uavs: &[Point], users: &[Point]) -> v1::Graph {
         let aoi = self.episode.aoi();
         self.slot.set_scene(uavs, users, aoi, self.range);
@@ -131,21 +131,21 @@ impl World {
         v1::Graph { nodes: uavs.iter().enumerate().map(uav).chain(self.users.iter().zip(aoi).map(user)).collect() }
     }
 
-    /// Flies what was answered; at the end of an episode the next one begins.
+    /// Moves the UAVs by the headings of `response`. After the last slot of an episode, begins the next episode.
     ///
     /// # Errors
-    /// Not a heading for each UAV.
-    pub(super) fn fly(&mut self, answer: &v1::ActResponse) -> anyhow::Result<()> {
-        let headings: Vec<u8> = answer.actions.iter().map(|a| a.heading_index as u8).collect();
+    /// `response` does not have one heading per UAV.
+    pub(super) fn step(&mut self, response: &v1::ActResponse) -> anyhow::Result<()> {
+        let headings: Vec<u8> = response.actions.iter().map(|a| a.heading_index as u8).collect();
         self.episode.step(&headings)?;
         if self.episode.done() {
-            self.restart();
+            self.next_episode();
         }
         Ok(())
     }
 
     /// Begins the next episode.
-    pub(super) fn restart(&mut self) {
+    pub(super) fn next_episode(&mut self) {
         self.run += 1;
         self.episode.reset(self.episode.seed().wrapping_add(self.run << 32));
     }
@@ -155,39 +155,39 @@ impl World {
 mod tests {
     use super::*;
 
-    fn world(observation: Observation, scale: f64) -> World {
+    fn fleet(observation: ObservationForm, scale: f64) -> SimulatedFleet {
         let env = EnvConfig { slots: 2, start: Start::Random, ..EnvConfig::default() };
-        let setup = Setup { policy: "qedgix".into(), env, observation, range: 0.28, scale };
-        World::new(&setup, "s".into(), 1).expect("a small fleet")
+        let config = FleetConfig { policy: "qedgix".into(), env, observation, range: 0.28, scale };
+        SimulatedFleet::new(&config, "s".into(), 1).expect("a small fleet")
     }
 
     #[test]
-    fn episodes_follow_each_other_as_runs() {
-        let mut world = world(Observation::Scene, 1.0);
-        let answer = v1::ActResponse { actions: vec![v1::Action::default(); 3], ..Default::default() };
-        let asked: Vec<_> = (0..5)
+    fn each_episode_has_its_own_run_id() {
+        let mut fleet = fleet(ObservationForm::Scene, 1.0);
+        let response = v1::ActResponse { actions: vec![v1::Action::default(); 3], ..Default::default() };
+        let sent: Vec<_> = (0..5)
             .map(|_| {
-                let request = world.request();
-                world.fly(&answer).expect("three headings");
-                (request.run_id.expect("named"), request.step.expect("counted"))
+                let request = fleet.request();
+                fleet.step(&response).expect("three headings");
+                (request.run_id.expect("set"), request.step.expect("set"))
             })
             .collect();
         let expected = [("run-0", 0), ("run-0", 1), ("run-1", 0), ("run-1", 1), ("run-2", 0)];
-        assert_eq!(asked, expected.map(|(run, step)| (run.to_owned(), step)));
-        assert!(world.fly(&v1::ActResponse::default()).is_err(), "an answer without headings");
+        assert_eq!(sent, expected.map(|(run, step)| (run.to_owned(), step)));
+        assert!(fleet.step(&v1::ActResponse::default()).is_err(), "a response without headings");
     }
 
     #[test]
-    fn scaled_lengths_scale_what_is_sent_and_who_is_seen() {
-        let nodes = |scale| match world(Observation::Graph, scale).request().observation {
+    fn scaling_changes_positions_and_detections() {
+        let nodes = |scale| match fleet(ObservationForm::Graph, scale).request().observation {
             Some(Sent::Graph(graph)) => graph.nodes,
-            _ => unreachable!("graphs were asked for"),
+            _ => unreachable!("the observation is a graph"),
         };
         let (near, far) = (nodes(0.5), nodes(20.0));
         assert_eq!((near.len(), far.len()), (8, 8));
-        let seen = |nodes: &[v1::Node]| nodes.iter().map(|n| n.detections.len()).sum::<usize>();
-        assert!(seen(&near) > seen(&far));
-        let at = |nodes: &[v1::Node]| nodes[0].position.expect("a UAV tells its position").x;
+        let detections = |nodes: &[v1::Node]| nodes.iter().map(|n| n.detections.len()).sum::<usize>();
+        assert!(detections(&near) > detections(&far));
+        let at = |nodes: &[v1::Node]| nodes[0].position.expect("UAVs have a position").x;
         assert_eq!(at(&near) * 40.0, at(&far));
         assert!(near.iter().flat_map(|n| &n.detections).all(|d| d.rel_x.hypot(d.rel_y) <= 0.28 * (1.0 + 1e-6)));
         assert!(near[3..].iter().all(|n| n.detections.is_empty() && n.aoi.is_some()));

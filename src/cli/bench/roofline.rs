@@ -1,7 +1,7 @@
-//! The floating-point floor of an update: how long its matrix products alone take, at their shapes, on as many threads.
+//! The roofline of an update: the time of its matrix products alone, with the same shapes on the same number of threads.
 //!
-//! An update multiplies every weight four times: forward online, forward target, and back to the weights and to the inputs
-//! online. The mixers, about three hundredths of the arithmetic, are left out.
+//! An update multiplies by every weight four times: forward through the online and the target network, and backward to the weights
+//! and to the inputs of the online network. The mixers, about 3 % of the arithmetic, are left out.
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -11,16 +11,16 @@ use crate::learner::objective::chunk_of;
 use crate::nn::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
 use crate::policy::{Agent, Geometry};
 
-/// What an update cannot do without.
-pub(super) struct Floor {
-    /// 10^9 floating-point operations of all its products.
+/// A lower bound of the time of an update.
+pub(super) struct Roofline {
+    /// Floating-point operations of all products, in 10^9.
     pub gflop: f64,
-    /// Median seconds that they take.
+    /// Median time of all products, in seconds.
     pub seconds: f64,
 }
 
-/// The floor of an update with `batch`.
-pub(super) fn of(agent: &Agent, batch: &Episodes, threads: usize, repeat: usize) -> Floor {
+/// Measures the roofline of an update with `batch`.
+pub(super) fn measure(agent: &Agent, batch: &Episodes, threads: usize, repeat: usize) -> Roofline {
     let chunks = batch.len.div_ceil(chunk_of(batch.uavs));
     let slots = batch.slots + 1;
     let products: Vec<[usize; 3]> = agent
@@ -31,10 +31,10 @@ pub(super) fn of(agent: &Agent, batch: &Episodes, threads: usize, repeat: usize)
     let operations: usize = products.iter().map(|[m, k, n]| 2 * m * k * n).sum();
     let mut seconds: Vec<f64> = (0..repeat).map(|_| multiply(&products, chunks, threads)).collect();
     seconds.sort_by(f64::total_cmp);
-    Floor { gflop: (4 * chunks * operations) as f64 * 1e-9, seconds: seconds[repeat / 2] }
+    Roofline { gflop: (4 * chunks * operations) as f64 * 1e-9, seconds: seconds[repeat / 2] }
 }
 
-/// Who sees whom in all slots of all episodes.
+/// The graphs of all slots of all episodes.
 fn geometry(agent: &Agent, ep: &Episodes) -> Geometry {
     let config = agent.geometry();
     let mut geometry = Geometry::default();
@@ -49,7 +49,7 @@ fn geometry(agent: &Agent, ep: &Episodes) -> Geometry {
     geometry
 }
 
-/// Seconds that the products of `chunks` chunks take.
+/// Time of the products of `chunks` chunks, in seconds.
 fn multiply(products: &[[usize; 3]], chunks: usize, threads: usize) -> f64 {
     let widest = products.iter().map(|[m, k, n]| m * k.max(n)).max().unwrap_or(0);
     let weights = products.iter().map(|[_, k, n]| k * n).max().unwrap_or(0);

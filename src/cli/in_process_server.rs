@@ -1,4 +1,4 @@
-//! A server in this process, on free loopback ports.
+//! A server inside this process, on free loopback ports, for `demo` and `bench act`.
 
 use std::net::SocketAddr;
 use std::path::Path;
@@ -11,24 +11,24 @@ use crate::server::{self, DataDir, Listeners};
 use crate::serving::Clock;
 
 /// A running server.
-pub struct LocalServer {
-    /// Where gRPC listens.
+pub struct InProcessServer {
+    /// Address of gRPC.
     pub grpc: SocketAddr,
-    /// Where REST listens.
+    /// Address of REST.
     pub http: SocketAddr,
     stop: oneshot::Sender<()>,
     done: JoinHandle<anyhow::Result<()>>,
 }
 
-impl LocalServer {
-    /// Starts it on `data_dir`, with the defaults for everything else.
+impl InProcessServer {
+    /// Starts a server on `data_dir` with default settings.
     ///
     /// # Errors
-    /// The directory is in use, or cannot be read or written.
+    /// The directory is in use by another server, or cannot be read or written.
     pub async fn start(data_dir: &Path) -> anyhow::Result<Self> {
         let free: SocketAddr = ([127, 0, 0, 1], 0).into();
         let config = Config { grpc_addr: free, http_addr: free, ..Config::new(data_dir) };
-        let data = DataDir::take(&config.data_dir)?;
+        let data = DataDir::lock(&config.data_dir)?;
         let listeners = Listeners::bind(&config).await?;
         let endpoints = listeners.endpoints()?;
         let app = server::open(&config, &data, Clock::system()).await?;
@@ -40,12 +40,12 @@ impl LocalServer {
         Ok(Self { grpc: endpoints.grpc, http: endpoints.http, stop, done })
     }
 
-    /// Stops it and waits for its end.
+    /// Stops the server and waits until it has stopped.
     ///
     /// # Errors
-    /// It failed before.
+    /// The server has failed.
     pub async fn stop(self) -> anyhow::Result<()> {
-        // It is gone already if nobody listens any more; then `done` says why.
+        // Sending fails when the server has already failed; `done` then returns its error.
         let _ = self.stop.send(());
         self.done.await?
     }
