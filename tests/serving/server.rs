@@ -113,6 +113,7 @@ fn settings_are_checked() {
     assert_eq!(refused(|c| c.max_connections = 0), "--max-connections");
     assert_eq!(refused(|c| c.max_streams = 0), "--max-streams");
     assert_eq!(refused(|c| c.read_timeout = std::time::Duration::ZERO), "--read-timeout");
+    assert_eq!(refused(|c| c.drain_timeout = std::time::Duration::from_secs(10_000_000_000)), "--drain-timeout");
     assert_eq!(refused(|c| c.key_rate = Some(0.0)), "--key-rate");
     assert_eq!(refused(|c| c.key_burst = Some(f64::NAN)), "--key-burst");
 

@@ -178,7 +178,7 @@ async fn no_secret_is_logged_shown_or_repeated() {
     let evaluate = ["evaluate", "--policy", "sweep", "--episodes", "1", "--slots", "3", "--server", &grpc];
     told += &printed(&evaluate, Some(&admin));
     told += &failed(&evaluate, Some(&wrong));
-    assert!(told.contains("is not known here"), "{told}");
+    assert!(told.contains("is unknown"), "{told}");
     told += &failed(&evaluate, Some(&limited));
     assert!(told.contains("the scope act"), "{told}");
     let train = ["train", "--server", &http, "--steps", "100"];
