@@ -17,6 +17,7 @@
 //! | [`policy`] | observations, agents, mixers, baselines |
 //! | [`figure`] | data to SVG |
 //! | [`nn`], [`env`] | mathematics; physics |
+//! | [`clock`], [`draining`] | wall and monotonic time; the flag of shutdown |
 //! | [`invalid`], [`rng`] | errors of input; random streams |
 //!
 //! Read `env`, then `policy`, then `learner`; then `service` and what it calls.
@@ -24,7 +25,9 @@
 pub mod api;
 pub mod checkpoint;
 pub mod cli;
+pub mod clock;
 pub mod config;
+pub mod draining;
 pub mod env;
 pub mod experiment;
 pub mod figure;

@@ -28,12 +28,14 @@ use self::connections::{Connections, Protocol};
 pub use self::connections::{HTTP2_WINDOW, KEEPALIVE_INTERVAL};
 pub use self::tls::Tls;
 use crate::api::{grpc, rest};
+use crate::clock::Clock;
 use crate::config::Config;
+use crate::draining::Draining;
 use crate::invalid::Invalid;
-use crate::jobs::{Jobs, LocalProcess, Settings};
+use crate::jobs::{LocalProcess, Scheduler, SchedulerConfig};
 use crate::service::keys::{Keyring, Rate};
-use crate::service::{App, Draining, Watchers, operations, policies};
-use crate::serving::{Clock, Engine, Environments, EnvironmentsConfig, Limits, Sessions};
+use crate::service::{App, Watchers, operations, policies};
+use crate::serving::{Engine, Environments, EnvironmentsConfig, Limits, Sessions};
 use crate::store::{self, Store};
 use crate::telemetry;
 
@@ -196,11 +198,11 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         Some(program) => LocalProcess { program: program.clone() },
         None => LocalProcess::same_program().map_err(Error::Worker)?,
     };
-    let settings = Settings {
+    let scheduler = SchedulerConfig {
         max_attempts: config.max_attempts,
         snapshot_every: config.snapshot_every,
         pause_grace: config.drain_timeout,
-        ..Settings::new(config.cpu_budget)
+        ..SchedulerConfig::new(config.cpu_budget)
     };
     let keys = Keyring::new(config.key_rate.map(|rate| Rate::new(rate, config.key_burst)));
     keys.refresh(&store).await.map_err(Error::Keys)?;
@@ -208,9 +210,10 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
     if config.tls.is_none() && config.validate_exposure(false).is_err() {
         tracing::warn!("this server accepts remote connections without TLS: API keys travel unencrypted (see --tls-cert)");
     }
+    let draining = Draining::default();
     let app = App {
         keys,
-        jobs: Jobs::open(store.clone(), settings, Arc::new(executor)).await?,
+        scheduler: Scheduler::open(store.clone(), scheduler, Arc::new(executor), clock.clone(), draining.clone()).await?,
         store,
         registry: Arc::default(),
         sessions: Sessions::new(sessions, clock.clone()),
@@ -218,7 +221,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         engine: Engine::start(config.engine).map_err(Error::Engine)?,
         watchers: Watchers::new(config.max_watchers, config.event_heartbeat),
         clock,
-        draining: Draining::default(),
+        draining,
     };
     policies::load(&app).await.map_err(Error::Policies)?;
     Ok(Arc::new(app))
@@ -239,7 +242,7 @@ pub async fn run(
     let workers = listeners.workers.local_addr().map_err(Error::Listener)?;
     telemetry::install_metrics();
     let stop = CancellationToken::new();
-    let health = grpc::Health::new(stop.clone());
+    let health = grpc::Health::new(app.draining.clone(), stop.clone());
     health.report(operations::vitals(&app).await);
 
     let connections = Connections {
@@ -266,7 +269,7 @@ pub async fn run(
     let serve_grpc = connections.clone().serve(listeners.grpc, Protocol::Grpc, grpc(services));
     let serve_rest = connections.serve(listeners.http, Protocol::Http, router);
 
-    let scheduling = tokio::spawn(app.jobs.clone().run(format!("http://{workers}")));
+    let scheduling = tokio::spawn(app.scheduler.clone().run(format!("http://{workers}")));
     let housekeeping = tokio::spawn(housekeeping(app.clone(), config.session_ttl.min(config.environment_ttl)));
     let monitoring = tokio::spawn(health.clone().follow(app.clone()));
     let following = tokio::spawn(keys::follow(app.clone()));
@@ -277,9 +280,8 @@ pub async fn run(
         shutdown.await;
         tracing::info!("draining");
         app.draining.begin();
-        health.drain();
         // Workers need the server to upload their snapshots, so it keeps answering until they are done.
-        app.jobs.drain(config.drain_timeout + Duration::from_secs(5)).await;
+        app.scheduler.drain(config.drain_timeout + Duration::from_secs(5)).await;
         stop.cancel();
         tokio::time::sleep(config.drain_timeout).await;
         tracing::warn!(after = ?config.drain_timeout, "drain timeout: closing requests in flight");

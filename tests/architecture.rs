@@ -5,6 +5,8 @@ use std::path::{Path, PathBuf};
 
 /// Each layer with the layers it may import from. A layer may always import from itself.
 const LAYERS: &[(&str, &[&str])] = &[
+    ("clock", &[]),
+    ("draining", &[]),
     ("invalid", &[]),
     ("rng", &[]),
     ("wire", &[]),
@@ -17,16 +19,37 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("learner", &["checkpoint", "recipe", "policy", "env", "nn", "invalid", "rng"]),
     ("experiment", &["learner", "checkpoint", "recipe", "figure", "policy", "env", "invalid", "rng"]),
     ("store", &["recipe", "invalid"]),
-    ("jobs", &["store", "checkpoint", "recipe", "learner", "policy", "env", "invalid", "rng", "wire"]),
-    ("serving", &["checkpoint", "recipe", "learner", "policy", "env", "invalid", "rng"]),
-    ("service", &["jobs", "serving", "store", "checkpoint", "recipe", "learner", "policy", "env", "invalid", "rng"]),
-    ("api", &["service", "jobs", "serving", "store", "checkpoint", "recipe", "learner", "policy", "env", "invalid", "wire"]),
+    ("jobs", &["clock", "draining", "store", "checkpoint", "recipe", "learner", "policy", "env", "invalid", "rng", "wire"]),
+    ("serving", &["clock", "checkpoint", "recipe", "learner", "policy", "env", "invalid", "rng"]),
+    (
+        "service",
+        &["clock", "draining", "jobs", "serving", "store", "checkpoint", "recipe", "learner", "policy", "env", "invalid", "rng"],
+    ),
+    (
+        "api",
+        &[
+            "clock",
+            "draining",
+            "service",
+            "jobs",
+            "serving",
+            "store",
+            "checkpoint",
+            "recipe",
+            "learner",
+            "policy",
+            "env",
+            "invalid",
+            "wire",
+        ],
+    ),
     ("telemetry", &[]),
     ("config", &["service", "jobs", "serving", "invalid"]),
-    ("server", &["api", "service", "jobs", "serving", "store", "config", "telemetry", "wire", "invalid"]),
+    ("server", &["clock", "draining", "api", "service", "jobs", "serving", "store", "config", "telemetry", "wire", "invalid"]),
     (
         "cli",
         &[
+            "clock",
             "server",
             "config",
             "telemetry",

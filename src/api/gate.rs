@@ -73,12 +73,11 @@ fn admit<B>(app: &App, request: &mut Request<B>, need: impl FnOnce(&Request<B>) 
     if need == Need::Nothing {
         return Ok(());
     }
-    let now = app.clock.now();
-    let Some(caller) = app.keys.authenticate(presented(request.headers()), now)? else { return Ok(()) };
+    let Some(caller) = app.keys.authenticate(presented(request.headers()), app.clock.now())? else { return Ok(()) };
     if let Need::Scope(scope) = need {
         caller.authorize(scope)?;
     }
-    caller.acquire(now)?;
+    caller.acquire(&app.clock)?;
     tracing::Span::current().record("key", caller.id());
     request.headers_mut().remove(header::AUTHORIZATION);
     request.headers_mut().remove(API_KEY);
@@ -109,7 +108,7 @@ impl Opener {
     /// # Errors
     /// The key is over, and the stream with it.
     pub(super) fn count(&self, app: &App) -> Result<Result<(), Error>, Status> {
-        match self.0.as_ref().map_or(Ok(()), |caller| caller.check_and_acquire(app.clock.now())) {
+        match self.0.as_ref().map_or(Ok(()), |caller| caller.check_and_acquire(&app.clock)) {
             Err(error) if !matches!(error, Error::Busy { .. }) => Err(error.into()),
             counted => Ok(counted),
         }
@@ -118,7 +117,7 @@ impl Opener {
     /// Counts what one message turned out to hold beyond itself.
     pub(super) fn charge(&self, app: &App, more: u32) {
         if let Some(caller) = &self.0 {
-            caller.charge(more, app.clock.now());
+            caller.charge(more, &app.clock);
         }
     }
 }

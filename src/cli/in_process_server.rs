@@ -6,9 +6,9 @@ use std::path::Path;
 use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
 
+use crate::clock::Clock;
 use crate::config::Config;
 use crate::server::{self, DataDir, Listeners};
-use crate::serving::Clock;
 
 /// A running server.
 pub struct InProcessServer {

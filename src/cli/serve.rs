@@ -9,9 +9,10 @@ use clap::{Args, ValueEnum};
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::output::outln;
+use crate::clock::Clock;
 use crate::config::{Config, TlsFiles};
 use crate::server::{self, DataDir, Listeners, Tls};
-use crate::serving::{Clock, EngineConfig};
+use crate::serving::EngineConfig;
 use crate::telemetry::{self, LogConfig, TraceExporter};
 
 /// Flags of `serve`.

@@ -20,9 +20,9 @@ pub struct WorkerArgs {
 /// A variable is missing, or the server refuses the attempt.
 pub fn run(args: &WorkerArgs) -> anyhow::Result<()> {
     // Before the process has threads, because threads inherit the priority.
-    worker::step_back();
+    worker::lower_priority();
     if args.tethered {
-        worker::tether()?;
+        worker::exit_with_stdin()?;
     }
     telemetry::init_logs(telemetry::LogConfig::default(), None);
     let variable =

@@ -1,4 +1,4 @@
-//! Where attempts run: the trait that every executor fulfils, and what it is told.
+//! Executors: the trait that starts workers, and its types.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -8,63 +8,63 @@ use tokio_util::sync::CancellationToken;
 
 use crate::store::Lease;
 
-/// Everything a worker is started with.
+/// What an executor needs to start a worker.
 #[derive(Clone)]
 pub struct Launch {
     /// The attempt.
     pub lease: Lease,
-    /// Secret that it shows to the server.
+    /// Secret that the worker presents to the server.
     pub token: String,
-    /// Where it reaches the server's `WorkerService`, as `http://127.0.0.1:50051`.
+    /// Address of the server's `WorkerService`, as `http://127.0.0.1:50051`.
     pub server: String,
-    /// Receives what it prints.
+    /// Receives the output of the worker.
     pub log: LogTail,
-    /// Ends it by force.
+    /// Cancelled to kill the worker.
     pub kill: CancellationToken,
 }
 
-/// How a worker ended, in words: `exit code 1`, `killed by signal 9`.
+/// How a worker process ended, as text: `exit code 1`, `killed by signal 9`.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Exit(pub String);
+pub struct WorkerExit(pub String);
 
-/// Starts workers somewhere.
+/// Starts workers, for example as local processes.
 pub trait Executor: Send + Sync + 'static {
-    /// Starts one worker; the inner future resolves when it has ended.
+    /// Starts a worker. The inner future resolves when the worker has ended.
     ///
     /// # Errors
-    /// It cannot be started.
-    fn start(&self, launch: Launch) -> BoxFuture<'_, std::io::Result<BoxFuture<'static, Exit>>>;
+    /// [`std::io::Error`] when the worker cannot be started.
+    fn start(&self, launch: Launch) -> BoxFuture<'_, std::io::Result<BoxFuture<'static, WorkerExit>>>;
 }
 
-/// The last part of what a worker printed; cheap to clone.
+/// The last part of a worker's output; cheap to clone.
 #[derive(Clone, Debug, Default)]
 pub struct LogTail(Arc<Mutex<Tail>>);
 
 #[derive(Debug, Default)]
 struct Tail {
     bytes: VecDeque<u8>,
-    cut: bool,
+    truncated: bool,
 }
 
 impl LogTail {
-    /// Bytes kept.
+    /// Most bytes kept.
     pub const LIMIT: usize = 64 << 10;
 
-    /// Adds output; the oldest goes when there is too much.
+    /// Appends output. Beyond [`LogTail::LIMIT`] the oldest bytes are dropped.
     pub fn push(&self, bytes: &[u8]) {
         let mut tail = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         tail.bytes.extend(bytes);
         let excess = tail.bytes.len().saturating_sub(Self::LIMIT);
         if excess > 0 {
-            tail.cut = true;
+            tail.truncated = true;
             tail.bytes.drain(..excess);
         }
     }
 
-    /// What is kept, from the beginning of a line.
+    /// The kept output, from the beginning of a line.
     pub fn text(&self) -> String {
         let tail = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let skip = if tail.cut { tail.bytes.iter().position(|&b| b == b'\n').map_or(0, |i| i + 1) } else { 0 };
+        let skip = if tail.truncated { tail.bytes.iter().position(|&b| b == b'\n').map_or(0, |i| i + 1) } else { 0 };
         let bytes: Vec<u8> = tail.bytes.iter().skip(skip).copied().collect();
         String::from_utf8_lossy(&bytes).replace('\0', "\u{fffd}")
     }
@@ -75,7 +75,7 @@ mod tests {
     use super::LogTail;
 
     #[test]
-    fn a_long_log_keeps_its_end_from_the_beginning_of_a_line() {
+    fn long_log_keeps_its_last_lines() {
         let log = LogTail::default();
         for i in 0..20_000 {
             log.push(format!("line {i}\n").as_bytes());

@@ -9,13 +9,13 @@ use futures::future::BoxFuture;
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::process::{Child, Command};
 
-use super::executor::{Executor, Exit, Launch, LogTail};
+use super::executor::{Executor, Launch, LogTail, WorkerExit};
 use super::worker::{ENV_ATTEMPT, ENV_JOB, ENV_SERVER, ENV_TOKEN};
 
 /// Starts `PROGRAM worker` for each attempt.
 ///
-/// The worker's standard input is a pipe that the server holds: when the server dies, however it dies, the pipe closes and
-/// the worker ends. The token goes through the environment, because command lines are for everybody to see.
+/// The worker's standard input is a pipe that the server holds. When the server ends in any way, the pipe closes and the
+/// worker ends, too. The token is passed in the environment, because other users of the machine can read command lines.
 #[derive(Clone, Debug)]
 pub struct LocalProcess {
     /// The `qedgix` binary.
@@ -23,10 +23,10 @@ pub struct LocalProcess {
 }
 
 impl LocalProcess {
-    /// With workers of the very binary that runs, even where an upgrade has replaced its file.
+    /// Starts workers from the binary of this process, even if an upgrade has replaced its file.
     ///
     /// # Errors
-    /// The system does not know which file it is.
+    /// [`std::io::Error`] when the system does not report the path of the binary.
     pub fn same_program() -> std::io::Result<Self> {
         let linux = PathBuf::from("/proc/self/exe");
         Ok(Self { program: if linux.exists() { linux } else { std::env::current_exe()? } })
@@ -34,7 +34,7 @@ impl LocalProcess {
 }
 
 impl Executor for LocalProcess {
-    fn start(&self, launch: Launch) -> BoxFuture<'_, std::io::Result<BoxFuture<'static, Exit>>> {
+    fn start(&self, launch: Launch) -> BoxFuture<'_, std::io::Result<BoxFuture<'static, WorkerExit>>> {
         async move {
             let mut command = Command::new(&self.program);
             command
@@ -47,22 +47,22 @@ impl Executor for LocalProcess {
                 .stdout(Stdio::piped())
                 .stderr(Stdio::piped())
                 .kill_on_drop(true);
-            // A group of its own: Ctrl-C in the server's terminal reaches the server alone, which then drains.
+            // A process group of its own: Ctrl-C in the server's terminal reaches only the server, which then drains.
             #[cfg(unix)]
             command.process_group(0).arg0("qedgix");
             let child = command.spawn()?;
-            Ok(attend(child, launch).boxed())
+            Ok(supervise(child, launch).boxed())
         }
         .boxed()
     }
 }
 
-/// How long output may still come after the process has ended: a grandchild may hold the pipes open.
-const LAST_WORDS: Duration = Duration::from_secs(1);
+/// Time to read the remaining output after the process has ended. A child of the worker may hold the pipes open.
+const OUTPUT_TIMEOUT: Duration = Duration::from_secs(1);
 
-async fn attend(mut child: Child, launch: Launch) -> Exit {
-    // Held until the process has ended; dropping it is what tells the worker that the server is gone.
-    let tether = child.stdin.take();
+async fn supervise(mut child: Child, launch: Launch) -> WorkerExit {
+    // Held until the process has ended: the worker ends when it is closed.
+    let stdin = child.stdin.take();
     let output = (child.stdout.take(), child.stderr.take());
     let copying = tokio::spawn(async move {
         let log = &launch.log;
@@ -78,10 +78,10 @@ async fn attend(mut child: Child, launch: Launch) -> Exit {
             child.wait().await
         }
     };
-    drop(tether);
-    // Its outcome is of no interest: what was read is in the log.
-    let _ = tokio::time::timeout(LAST_WORDS, copying).await;
-    Exit(status.map_or_else(|e| format!("lost: {e}"), describe))
+    drop(stdin);
+    // A timeout is ignored: the output read so far is in the log.
+    let _ = tokio::time::timeout(OUTPUT_TIMEOUT, copying).await;
+    WorkerExit(status.map_or_else(|e| format!("an unknown status: {e}"), describe_exit))
 }
 
 async fn copy(from: Option<impl AsyncRead + Unpin>, log: &LogTail) {
@@ -92,10 +92,10 @@ async fn copy(from: Option<impl AsyncRead + Unpin>, log: &LogTail) {
     }
 }
 
-fn describe(status: ExitStatus) -> String {
+fn describe_exit(status: ExitStatus) -> String {
     #[cfg(unix)]
     if let Some(signal) = std::os::unix::process::ExitStatusExt::signal(&status) {
-        let hint = if signal == 9 { " (SIGKILL; the system kills so when memory runs out)" } else { "" };
+        let hint = if signal == 9 { " (SIGKILL; sent by the system when memory runs out)" } else { "" };
         return format!("killed by signal {signal}{hint}");
     }
     status.code().map_or_else(|| status.to_string(), |code| format!("exit code {code}"))

@@ -1,6 +1,6 @@
-//! When and where work runs: the embedded scheduler, the CPU budget, executors, the worker process.
+//! The scheduler, the CPU budget, executors and the worker process.
 //!
-//! The scheduler and the service write states through [`crate::store`]; a worker reaches the server only through the
+//! The scheduler and the service change jobs through [`crate::store`]. A worker reaches the server only through the
 //! `WorkerService` protocol, so it can run on any machine.
 
 mod executor;
@@ -13,43 +13,42 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use jiff::Timestamp;
 use sha2::{Digest, Sha256};
 use subtle::ConstantTimeEq;
 use tokio::sync::{Notify, watch};
-use tokio::time::Instant;
-use tokio_util::sync::CancellationToken;
 
-pub use executor::{Executor, Exit, Launch, LogTail};
+pub use executor::{Executor, Launch, LogTail, WorkerExit};
 pub use local::LocalProcess;
 
-use crate::store::{self, Lease, Store, Wanted};
+use crate::clock::Clock;
+use crate::draining::Draining;
+use crate::store::{self, Lease, PendingAction, Store};
 
-/// How jobs are run.
+/// Limits and times of the scheduler.
 #[derive(Clone, Debug)]
-pub struct Settings {
+pub struct SchedulerConfig {
     /// Threads that all running jobs may use together.
     pub cpu_budget: usize,
     /// Failed attempts after which a job has failed.
     pub max_attempts: u32,
     /// Time between snapshots of a job.
     pub snapshot_every: Duration,
-    /// A worker that is not heard of for this long is killed.
-    pub silence: Duration,
-    /// A worker that does not obey a cancel for this long is killed.
+    /// Time without a heartbeat after which a worker is killed.
+    pub heartbeat_timeout: Duration,
+    /// Time after which a worker that has not obeyed a cancel is killed.
     pub cancel_grace: Duration,
-    /// A worker that has not paused (its snapshot is large) after this long is killed.
+    /// Time after which a worker that has not obeyed a pause is killed. It has to upload a snapshot, which may be large.
     pub pause_grace: Duration,
 }
 
-impl Settings {
+impl SchedulerConfig {
     /// The defaults.
     pub fn new(cpu_budget: usize) -> Self {
         Self {
             cpu_budget,
             max_attempts: 3,
             snapshot_every: Duration::from_secs(10),
-            silence: Duration::from_secs(30),
+            heartbeat_timeout: Duration::from_secs(30),
             cancel_grace: Duration::from_secs(3),
             pause_grace: Duration::from_secs(30),
         }
@@ -59,9 +58,9 @@ impl Settings {
 /// What a worker is to do next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Directive {
-    /// Go on.
+    /// Continue training.
     Continue,
-    /// Stop; nothing is needed any more.
+    /// Stop without a snapshot.
     Cancel,
     /// Upload a snapshot, then stop.
     Pause,
@@ -69,130 +68,142 @@ pub enum Directive {
 
 /// Handle to the scheduler; cheap to clone.
 #[derive(Clone)]
-pub struct Jobs(Arc<Inner>);
+pub struct Scheduler(Arc<Inner>);
 
 struct Inner {
     store: Store,
-    settings: Settings,
+    config: SchedulerConfig,
     executor: Arc<dyn Executor>,
-    /// Rung when there may be something to start.
+    clock: Clock,
+    draining: Draining,
+    /// Notified when a job may be ready to start.
     wake: Notify,
-    /// Rung when an attempt has left `running`.
-    left: Notify,
-    draining: CancellationToken,
-    /// Whether the queue could be read when it was last looked at.
-    able: watch::Sender<bool>,
-    /// By job number. A job stays here until its worker's process has ended, whatever its state says.
-    running: Mutex<HashMap<i64, Running>>,
+    /// Notified when an attempt has been removed from `running`.
+    removed: Notify,
+    /// Whether the last read of the queue succeeded.
+    queue_readable: watch::Sender<bool>,
+    /// Attempts by job number. An attempt stays here until its worker process has ended, whatever the state of its job.
+    running: Mutex<HashMap<i64, RunningAttempt>>,
 }
 
 #[derive(Clone)]
-struct Running {
+struct RunningAttempt {
     attempt: u32,
     threads: usize,
     log: LogTail,
-    /// Rung when the job's state has changed under its worker.
-    changed: Arc<Notify>,
-    heard: Arc<Mutex<Instant>>,
+    /// Notified when the job has changed while its worker runs.
+    job_changed: Arc<Notify>,
+    /// Monotonic time of the last call of the worker.
+    last_heartbeat: Arc<Mutex<Duration>>,
 }
 
-impl Jobs {
-    /// Opens the scheduler: jobs that ran when the server last stopped are queued again. Nothing starts before [`Jobs::run`].
+impl RunningAttempt {
+    fn last_heartbeat(&self) -> MutexGuard<'_, Duration> {
+        self.last_heartbeat.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Scheduler {
+    /// Opens the scheduler and queues again the jobs that ran when the server last stopped. No job starts before
+    /// [`Scheduler::run`], and none once `draining` has begun.
     ///
     /// # Errors
-    /// The database.
-    pub async fn open(store: Store, settings: Settings, executor: Arc<dyn Executor>) -> Result<Self, store::Error> {
-        for job in store.recover_jobs(Timestamp::now()).await? {
-            tracing::info!(job = %job.id, state = %job.state, step = job.step, "found a job whose server had stopped");
+    /// [`store::Error`] when the database fails.
+    pub async fn open(
+        store: Store,
+        config: SchedulerConfig,
+        executor: Arc<dyn Executor>,
+        clock: Clock,
+        draining: Draining,
+    ) -> Result<Self, store::Error> {
+        for job in store.recover_jobs(clock.now()).await? {
+            tracing::info!(job = %job.id, state = %job.state, step = job.step, "recovered a job of a server that stopped");
         }
         Ok(Self(Arc::new(Inner {
             store,
-            settings,
+            config,
             executor,
+            clock,
+            draining,
             wake: Notify::new(),
-            left: Notify::new(),
-            draining: CancellationToken::new(),
-            able: watch::Sender::new(true),
+            removed: Notify::new(),
+            queue_readable: watch::Sender::new(true),
             running: Mutex::default(),
         })))
     }
 
-    /// How jobs are run.
-    pub fn settings(&self) -> &Settings {
-        &self.0.settings
+    /// Limits and times.
+    pub fn config(&self) -> &SchedulerConfig {
+        &self.0.config
     }
 
-    /// Whether nothing is started any more.
-    pub fn draining(&self) -> bool {
-        self.0.draining.is_cancelled()
-    }
-
-    /// Whether the queue could be read when it was last looked at, and when that changes.
-    pub fn able(&self) -> watch::Receiver<bool> {
-        self.0.able.subscribe()
+    /// Whether the last read of the queue succeeded.
+    pub fn queue_readable(&self) -> watch::Receiver<bool> {
+        self.0.queue_readable.subscribe()
     }
 
     /// Threads that running jobs use.
     pub fn threads_busy(&self) -> usize {
-        scheduler::used(&self.running())
+        scheduler::threads_used(&self.running())
     }
 
-    /// Says that the queue, or what is wanted of job number `job`, has changed.
-    pub fn changed(&self, job: i64) {
+    /// Notifies the scheduler that the queue, or the state or pending action of job number `job`, has changed.
+    pub fn job_changed(&self, job: i64) {
         if let Some(running) = self.running().get(&job) {
-            running.changed.notify_one();
+            running.job_changed.notify_one();
         }
         self.0.wake.notify_one();
     }
 
-    /// Notes that an attempt's worker lives.
-    pub fn heard(&self, lease: Lease) {
-        if let Some(running) = self.running().get(&lease.job).filter(|r| r.attempt == lease.attempt) {
-            *running.heard.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
+    /// Records that the worker of an attempt has called.
+    pub fn record_heartbeat(&self, lease: Lease) {
+        if let Some(running) = self.running().get(&lease.job).filter(|running| running.attempt == lease.attempt) {
+            *running.last_heartbeat() = self.0.clock.monotonic();
         }
     }
 
-    /// What the worker of a job of which this is wanted shall do.
-    pub fn directive(&self, wanted: Option<Wanted>) -> Directive {
-        match wanted {
-            Some(Wanted::Cancel) => Directive::Cancel,
-            Some(Wanted::Pause) => Directive::Pause,
-            None if self.draining() => Directive::Pause,
+    /// The directive for the worker of a job with this pending action.
+    pub fn directive(&self, pending: Option<PendingAction>) -> Directive {
+        match pending {
+            Some(PendingAction::Cancel) => Directive::Cancel,
+            Some(PendingAction::Pause) => Directive::Pause,
+            None if self.0.draining.begun() => Directive::Pause,
             None => Directive::Continue,
         }
     }
 
-    /// What the worker of attempt `attempt` has printed so far, while it runs.
+    /// The output of the worker of attempt `attempt` so far; `None` unless that attempt is running.
     pub fn live_log(&self, job: i64, attempt: u32) -> Option<String> {
-        let running = self.running().get(&job).filter(|r| r.attempt == attempt).cloned()?;
+        let running = self.running().get(&job).filter(|running| running.attempt == attempt).cloned()?;
         Some(running.log.text())
     }
 
-    /// Starts nothing more, lets the workers pause, and waits until their processes have ended, at most for `patience`;
-    /// then they are killed. Their jobs are queued. gRPC must go on being served meanwhile: workers send their snapshots.
-    pub async fn drain(&self, patience: Duration) {
-        self.0.draining.cancel();
-        let all_left = async {
+    /// Begins draining, lets the workers pause, and waits until their processes have ended, at most for `timeout`. Workers
+    /// that do not pause in time are killed. The jobs are queued again. gRPC must be served meanwhile: workers upload
+    /// snapshots.
+    pub async fn drain(&self, timeout: Duration) {
+        self.0.draining.begin();
+        let all_removed = async {
             loop {
-                let left = self.0.left.notified();
+                let removed = self.0.removed.notified();
                 if self.running().is_empty() {
                     break;
                 }
-                left.await;
+                removed.await;
             }
         };
-        // Every attempt ends within its grace; `patience` only bounds a database that does not answer.
-        if tokio::time::timeout(patience, all_left).await.is_err() {
-            tracing::warn!("some workers had not paused in time; their jobs go on from their last snapshots");
+        // Every attempt ends within its grace period; `timeout` only bounds a database that does not answer.
+        if tokio::time::timeout(timeout, all_removed).await.is_err() {
+            tracing::warn!("some workers have not paused in time; their jobs will resume from their last snapshots");
         }
     }
 
-    fn running(&self) -> MutexGuard<'_, HashMap<i64, Running>> {
+    fn running(&self) -> MutexGuard<'_, HashMap<i64, RunningAttempt>> {
         self.0.running.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// SHA-256 of a token, as the store keeps it.
+/// SHA-256 of a token, as the database stores it.
 pub fn token_digest(token: &str) -> [u8; 32] {
     Sha256::digest(token).into()
 }

@@ -1,99 +1,104 @@
-//! Starts queued jobs while their threads fit into the budget, and sees every attempt to its end.
+//! Starts queued jobs while their threads fit into the CPU budget, and supervises every attempt until its worker has ended.
 //!
-//! Order is strict: highest priority first, then first come. A job that does not fit yet holds back those behind it, so
-//! that a wide job is not passed over for ever.
+//! The order is strict: highest priority first, then first come, first served. A job that does not fit yet holds back the
+//! jobs behind it, so that a job with many threads does not wait forever.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use futures::future::BoxFuture;
-use jiff::Timestamp;
 use tokio::sync::Notify;
-use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
-use super::{Exit, Jobs, Launch, LogTail, Running, token_digest};
-use crate::store::{Ending, Job, JobState, Lease, Wanted};
+use super::{Launch, LogTail, RunningAttempt, Scheduler, WorkerExit, token_digest};
+use crate::store::{AttemptResult, EndedAttempt, Job, JobState, Lease, PendingAction};
 
-/// Why an attempt's worker is being stopped by force.
+/// Why the scheduler kills a worker.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Killed {
-    /// It had been asked to stop and took too long.
-    Disobedient,
-    /// It was not heard of.
-    Silent,
+enum KillReason {
+    /// The worker did not stop within its grace period.
+    GraceExpired,
+    /// No heartbeat arrived within [`super::SchedulerConfig::heartbeat_timeout`].
+    HeartbeatLost,
 }
 
-/// The database, or the system's source of random numbers.
-type Fault = Box<dyn std::error::Error + Send + Sync>;
+/// Time between two tries to use a database that fails.
+const RETRY_DELAY: Duration = Duration::from_secs(1);
 
-pub(super) fn used(all: &HashMap<i64, Running>) -> usize {
+/// Why no attempt could begin: the database, or the system's source of random numbers.
+type StartError = Box<dyn std::error::Error + Send + Sync>;
+
+fn failed(reason: String) -> AttemptResult {
+    AttemptResult::Failed { reason, permanent: false }
+}
+
+pub(super) fn threads_used(all: &HashMap<i64, RunningAttempt>) -> usize {
     all.values().map(|running| running.threads).sum()
 }
 
-impl Jobs {
-    /// Runs until [`Jobs::drain`]. Workers reach this server's gRPC at `server`, as `http://127.0.0.1:50051`.
+impl Scheduler {
+    /// Starts jobs until draining begins. Workers reach this server's gRPC at `server`, as `http://127.0.0.1:50051`.
     pub async fn run(self, server: String) {
-        while !self.draining() {
+        while !self.0.draining.begun() {
             let wake = self.0.wake.notified();
             let started = self.start_all(&server).await;
-            self.0.able.send_replace(started.is_ok());
+            self.0.queue_readable.send_replace(started.is_ok());
             if let Err(e) = started {
                 tracing::error!(error = e, "the queue could not be read; trying again");
-                tokio::time::sleep(Duration::from_secs(1)).await;
+                tokio::time::sleep(RETRY_DELAY).await;
                 continue;
             }
             tokio::select! {
                 () = wake => {}
-                () = self.0.draining.cancelled() => {}
+                () = self.0.draining.wait() => {}
             }
         }
     }
 
-    async fn start_all(&self, server: &str) -> Result<(), Fault> {
-        while !self.draining()
-            && let Some(job) = self.0.store.head_of_queue().await?
+    async fn start_all(&self, server: &str) -> Result<(), StartError> {
+        while let Some(job) = self.0.store.head_of_queue().await?
             && let Some(running) = self.reserve(&job)
         {
             let begun = self.begin(&job).await;
             let Ok(Some((lease, token))) = begun else {
-                // Cancelled or paused in the meantime, or a fault.
+                // Cancelled or paused in the meantime, or an error.
                 self.release(job.number);
                 begun?;
                 continue;
             };
-            let (jobs, span) = (self.clone(), tracing::info_span!("attempt", job = %lease.id, attempt = lease.attempt));
+            let (scheduler, span) = (self.clone(), tracing::info_span!("attempt", job = %lease.id, attempt = lease.attempt));
             let server = server.to_owned();
             let attempt = async move {
                 let (log, kill) = (running.log.clone(), CancellationToken::new());
-                jobs.see_through(Launch { lease, token, server, log, kill }, &running).await;
-                jobs.release(lease.job);
-                jobs.0.left.notify_waiters();
-                jobs.0.wake.notify_one();
+                scheduler.supervise(Launch { lease, token, server, log, kill }, &running).await;
+                scheduler.release(lease.job);
             };
             tokio::spawn(attempt.instrument(span));
         }
         Ok(())
     }
 
-    /// Takes the threads for a job, if they are free. The number of threads changes no result, so a job that is wider than
-    /// the budget (which was larger when it came) runs with what there is.
-    fn reserve(&self, job: &Job) -> Option<Running> {
+    /// Reserves the threads of a job, if they are free. The number of threads does not affect results, so a job with more
+    /// threads than the budget (which was larger when the job was submitted) runs with the whole budget.
+    ///
+    /// Returns `None` once draining has begun. That is checked under the lock, so [`Scheduler::drain`] either sees the
+    /// attempt or prevents it.
+    fn reserve(&self, job: &Job) -> Option<RunningAttempt> {
         let mut all = self.running();
-        let budget = self.0.settings.cpu_budget;
+        let budget = self.0.config.cpu_budget;
         let threads = job.spec.threads.min(budget);
-        // Its former worker may still be on its way out.
-        if used(&all) + threads > budget || all.contains_key(&job.number) {
+        // The worker of the previous attempt may not have ended yet.
+        if self.0.draining.begun() || threads_used(&all) + threads > budget || all.contains_key(&job.number) {
             return None;
         }
-        let running = Running {
+        let running = RunningAttempt {
             attempt: job.attempts + 1,
             threads,
             log: LogTail::default(),
-            changed: Arc::new(Notify::new()),
-            heard: Arc::new(Mutex::new(Instant::now())),
+            job_changed: Arc::new(Notify::new()),
+            last_heartbeat: Arc::new(Mutex::new(self.0.clock.monotonic())),
         };
         all.insert(job.number, running.clone());
         Some(running)
@@ -101,111 +106,205 @@ impl Jobs {
 
     fn release(&self, job: i64) {
         self.running().remove(&job);
+        self.0.removed.notify_waiters();
+        self.0.wake.notify_one();
     }
 
-    async fn begin(&self, job: &Job) -> Result<Option<(Lease, String)>, Fault> {
+    async fn begin(&self, job: &Job) -> Result<Option<(Lease, String)>, StartError> {
         let mut secret = [0; 32];
         getrandom::fill(&mut secret)?;
         let token = hex::encode(secret);
-        let lease = self.0.store.begin_attempt(job.id, token_digest(&token), Timestamp::now()).await?;
+        let lease = self.0.store.begin_attempt(job.id, token_digest(&token), self.0.clock.now()).await?;
         Ok(lease.map(|lease| (lease, token)))
     }
 
-    async fn see_through(&self, launch: Launch, running: &Running) {
+    /// Starts a worker, waits for its end and records it.
+    async fn supervise(&self, launch: Launch, running: &RunningAttempt) {
         let (lease, kill) = (launch.lease, launch.kill.clone());
         tracing::info!(threads = running.threads, "starting a worker");
-        let ending = match self.0.executor.start(launch).await {
+        let result = match self.0.executor.start(launch).await {
             Ok(exit) => self.wait(lease, exit, &kill, running).await,
-            Err(e) => self.failed(format!("the worker could not be started: {e}")),
+            Err(e) => failed(format!("the worker could not be started: {e}")),
         };
-        self.end(lease, &ending, &running.log).await;
+        self.end(lease, &result, &running.log).await;
     }
 
-    fn failed(&self, reason: String) -> Ending {
-        Ending::Failed { reason, max_attempts: self.0.settings.max_attempts }
-    }
-
-    /// Waits for the worker's process, and ends it by force where that is needed.
-    async fn wait(&self, lease: Lease, mut exit: BoxFuture<'_, Exit>, kill: &CancellationToken, running: &Running) -> Ending {
+    /// Waits for the worker process, and kills it when needed. The result is for a worker that has not reported its own.
+    async fn wait(
+        &self,
+        lease: Lease,
+        mut exit: BoxFuture<'_, WorkerExit>,
+        kill: &CancellationToken,
+        running: &RunningAttempt,
+    ) -> AttemptResult {
         let force = async {
-            let why = self.reason_to_kill(lease, running).await;
-            tracing::warn!(reason = ?why, "ending the worker by force");
+            let reason = self.kill_reason(lease, running).await;
+            tracing::warn!(?reason, "killing the worker");
             kill.cancel();
-            why
+            reason
         };
         tokio::select! {
-            exit = &mut exit => self.failed(format!("the worker ended with {}", exit.0)),
-            why = force => {
+            exit = &mut exit => failed(format!("the worker ended with {}", exit.0)),
+            reason = force => {
                 exit.await;
-                match why {
-                    Killed::Disobedient => Ending::Stopped,
-                    Killed::Silent => {
-                        self.failed(format!("nothing was heard of the worker for {} s", self.0.settings.silence.as_secs_f64()))
+                match reason {
+                    KillReason::GraceExpired => AttemptResult::Stopped,
+                    KillReason::HeartbeatLost => {
+                        let timeout = self.0.config.heartbeat_timeout.as_secs_f64();
+                        failed(format!("no heartbeat of the worker for {timeout} s"))
                     }
                 }
             }
         }
     }
 
-    /// Resolves when the worker must be killed.
-    async fn reason_to_kill(&self, lease: Lease, running: &Running) -> Killed {
-        let settings = &self.0.settings;
-        let mut deadline: Option<Instant> = None;
+    /// Returns when the worker must be killed.
+    async fn kill_reason(&self, lease: Lease, running: &RunningAttempt) -> KillReason {
+        let (config, clock) = (&self.0.config, &self.0.clock);
+        let mut deadline: Option<Duration> = None;
         let mut drained = false;
         loop {
-            let heard = *running.heard.lock().unwrap_or_else(PoisonError::into_inner);
-            let silent_at = heard + settings.silence;
-            let next = deadline.map_or(silent_at, |deadline| deadline.min(silent_at));
+            let heartbeat_deadline = running.last_heartbeat().saturating_add(config.heartbeat_timeout);
+            let next = deadline.map_or(heartbeat_deadline, |deadline| deadline.min(heartbeat_deadline));
             tokio::select! {
-                () = running.changed.notified() => {}
-                () = self.0.draining.cancelled(), if !drained => drained = true,
-                () = tokio::time::sleep_until(next) => {
-                    if deadline.is_some_and(|deadline| deadline <= Instant::now()) {
-                        return Killed::Disobedient;
+                () = running.job_changed.notified() => {}
+                () = self.0.draining.wait(), if !drained => drained = true,
+                () = clock.sleep_until(next) => {
+                    let now = clock.monotonic();
+                    if deadline.is_some_and(|deadline| deadline <= now) {
+                        return KillReason::GraceExpired;
                     }
-                    if *running.heard.lock().unwrap_or_else(PoisonError::into_inner) + settings.silence <= Instant::now() {
-                        return Killed::Silent;
+                    // A heartbeat may have arrived while this slept.
+                    if running.last_heartbeat().saturating_add(config.heartbeat_timeout) <= now {
+                        return KillReason::HeartbeatLost;
                     }
                     continue;
                 }
             }
             let grace = match self.0.store.job(lease.id).await {
-                Ok(Some(Job { state: JobState::Running, wanted, .. })) => match wanted {
-                    Some(Wanted::Cancel) => Some(settings.cancel_grace),
-                    Some(Wanted::Pause) => Some(settings.pause_grace),
-                    None => drained.then_some(settings.pause_grace),
+                Ok(Some(Job { state: JobState::Running, pending_action, .. })) => match pending_action {
+                    Some(PendingAction::Cancel) => Some(config.cancel_grace),
+                    Some(PendingAction::Pause) => Some(config.pause_grace),
+                    None => drained.then_some(config.pause_grace),
                 },
-                // The attempt is over; the process has no reason to stay.
-                Ok(_) => Some(settings.cancel_grace),
+                // The attempt has ended, so its process has to end, too.
+                Ok(_) => Some(config.cancel_grace),
                 Err(e) => {
                     tracing::error!(error = %e, "the job could not be read");
                     None
                 }
             };
             if let Some(grace) = grace {
-                let by = Instant::now() + grace;
+                let by = clock.monotonic().saturating_add(grace);
                 deadline = Some(deadline.map_or(by, |deadline| deadline.min(by)));
             }
         }
     }
 
-    /// Records the end of the process. It changes nothing where the worker has told its outcome itself.
-    async fn end(&self, lease: Lease, ending: &Ending, log: &LogTail) {
+    /// Records the end of the process. An attempt that the worker has ended itself stays as it is.
+    async fn end(&self, lease: Lease, result: &AttemptResult, log: &LogTail) {
         let text = log.text();
         loop {
             let ended = async {
                 self.0.store.keep_log(lease, &text).await?;
-                self.0.store.end_attempt(lease, ending, Timestamp::now()).await
+                let (max_attempts, now) = (self.0.config.max_attempts, self.0.clock.now());
+                self.0.store.end_attempt(EndedAttempt { lease, result, policy: None, max_attempts, now }).await
             };
             match ended.await {
                 Ok(Some(job)) => {
-                    tracing::warn!(state = %job.state, reason = job.reason, "the worker ended without an outcome");
+                    tracing::warn!(state = %job.state, reason = job.reason, "the worker ended without reporting a result");
                     return;
                 }
                 Ok(None) => return,
-                Err(e) => tracing::error!(error = %e, "the end of an attempt could not be written; trying again"),
+                Err(e) => tracing::error!(error = %e, "the end of an attempt could not be recorded; trying again"),
             }
-            tokio::time::sleep(Duration::from_secs(1)).await;
+            tokio::time::sleep(RETRY_DELAY).await;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use futures::FutureExt;
+    use jiff::Timestamp;
+    use uuid::Uuid;
+
+    use super::*;
+    use crate::clock::{Clock, ManualClock};
+    use crate::draining::Draining;
+    use crate::jobs::{Executor, SchedulerConfig};
+    use crate::recipe::{Algorithm, Preset, TrainConfig};
+    use crate::store::{JobId, JobKind, JobSpec, NewJob, Store};
+
+    /// Starts workers that run until they are killed.
+    struct Endless;
+
+    impl Executor for Endless {
+        fn start(&self, launch: Launch) -> BoxFuture<'_, std::io::Result<BoxFuture<'static, WorkerExit>>> {
+            let exit = async move {
+                launch.kill.cancelled().await;
+                WorkerExit("killed by signal 9".into())
+            };
+            async { Ok(exit.boxed()) }.boxed()
+        }
+    }
+
+    async fn with_a_job(clock: Clock) -> (tempfile::TempDir, Scheduler, JobId) {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).await.unwrap();
+        let config = TrainConfig::preset(Algorithm::Qmix, Preset::Practical);
+        let spec = JobSpec { kind: JobKind::Train, name: None, labels: BTreeMap::new(), threads: 1, priority: 0, config };
+        let id = JobId(Uuid::from_u128(1));
+        store.submit_job(NewJob { id, spec, now: clock.now(), idempotency: None }).await.unwrap();
+        let config = SchedulerConfig { max_attempts: 1, ..SchedulerConfig::new(1) };
+        let scheduler = Scheduler::open(store, config, Arc::new(Endless), clock, Draining::default()).await.unwrap();
+        (dir, scheduler, id)
+    }
+
+    #[tokio::test]
+    async fn no_attempt_starts_after_drain_has_seen_none() {
+        let (_dir, scheduler, _) = with_a_job(Clock::system()).await;
+        // The scheduler has read the queue and is about to reserve the threads when the server drains.
+        let job = scheduler.0.store.head_of_queue().await.unwrap().unwrap();
+        scheduler.drain(Duration::from_secs(30)).await;
+        assert!(scheduler.reserve(&job).is_none());
+    }
+
+    #[tokio::test]
+    async fn drain_does_not_wait_for_an_attempt_that_could_not_begin() {
+        let (_dir, scheduler, _) = with_a_job(Clock::system()).await;
+        let job = scheduler.0.store.head_of_queue().await.unwrap().unwrap();
+        scheduler.reserve(&job).unwrap();
+        let mut drain = std::pin::pin!(scheduler.drain(Duration::from_secs(3600)));
+        assert!(futures::poll!(&mut drain).is_pending());
+        scheduler.release(job.number);
+        assert!(futures::poll!(&mut drain).is_ready());
+    }
+
+    #[tokio::test]
+    async fn heartbeats_are_timed_by_monotonic_time_and_attempts_by_wall_time() {
+        let time = ManualClock::new(Timestamp::from_second(1_000).unwrap());
+        let (_dir, scheduler, id) = with_a_job(time.clock()).await;
+        let running = tokio::spawn(scheduler.clone().run("http://127.0.0.1:1".into()));
+        let mut changes = scheduler.0.store.changes(1);
+        while scheduler.0.store.job(id).await.unwrap().unwrap().state != JobState::Running {
+            changes.changed().await.unwrap();
+        }
+        // A correction of the wall time by a day kills nobody; the attempt that ends afterwards shows the corrected time.
+        time.set_wall(Timestamp::from_second(90_000).unwrap());
+        for _ in 0..100 {
+            tokio::task::yield_now().await;
+        }
+        assert_eq!(scheduler.0.store.job(id).await.unwrap().unwrap().state, JobState::Running);
+        time.advance(scheduler.config().heartbeat_timeout);
+        while scheduler.0.store.job(id).await.unwrap().unwrap().state != JobState::Failed {
+            changes.changed().await.unwrap();
+        }
+        let attempt = scheduler.0.store.attempts(id).await.unwrap().remove(0);
+        assert_eq!(attempt.started_at.as_second(), 1_000);
+        assert_eq!(attempt.ended_at.unwrap().as_second(), 90_030);
+        running.abort();
     }
 }

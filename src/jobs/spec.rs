@@ -1,4 +1,4 @@
-//! What a person may ask of a job, from JSON. Both transports come here, so that they accept the same.
+//! Parses job requests from JSON. Both transports use it, so they accept the same requests.
 
 use std::collections::BTreeMap;
 
@@ -10,29 +10,30 @@ use crate::invalid::{Invalid, expectation, in_range};
 use crate::recipe::{Algorithm, EXACT, Preset, TrainConfig, integral};
 use crate::store::{JobKind, JobSpec};
 
-/// Everything that a job may say.
+/// The fields of a job request.
 pub const FIELDS: [&str; 10] =
     ["kind", "algorithm", "preset", "environment", "training", "threads", "priority", "seed", "name", "labels"];
 
-/// A job as it was sent: checked, every default filled in, and the digest by which the same body is known again.
+/// A checked job request.
 #[derive(Clone, Debug)]
-pub struct Request {
-    /// What it asks for.
+pub struct JobRequest {
+    /// The specification, with all defaults filled in.
     pub spec: JobSpec,
-    /// SHA-256 of the body in canonical form.
+    /// SHA-256 of the request in canonical form, by which idempotency recognises a repeated request.
     pub digest: [u8; 32],
 }
 
-/// Reads a job. Integral numbers count as integers however they are written, because a `Struct` has no integers.
+/// Parses a job request. Numbers with integral values are accepted as integers in any notation, because a protobuf `Struct`
+/// has no integers.
 ///
 /// # Errors
-/// The first field that is unknown, of the wrong type or out of range.
-pub fn parse(mut document: Value, cpu_budget: usize) -> Result<Request, Invalid> {
+/// [`Invalid`] with the first field that is unknown, has the wrong type, or is out of range.
+pub fn parse(mut document: Value, cpu_budget: usize) -> Result<JobRequest, Invalid> {
     integral(&mut document);
-    // Objects are ordered by key, so this is canonical.
+    // Canonical, because objects are ordered by key.
     let digest = Sha256::digest(document.to_string()).into();
     let Value::Object(mut fields) = document else {
-        return Err(Invalid::schema("job", kind_of(&document), "an object"));
+        return Err(Invalid::schema("job", type_name(&document), "an object"));
     };
     if let Some(unknown) = fields.keys().find(|key| !FIELDS.contains(&key.as_str())) {
         return Err(Invalid::schema(unknown, "an unknown field", format!("one of {}", FIELDS.join(", "))));
@@ -61,10 +62,10 @@ pub fn parse(mut document: Value, cpu_budget: usize) -> Result<Request, Invalid>
     }
     check_labels(&labels)?;
     let config = TrainConfig::resolve(algorithm, preset, &environment, &training, seed)?;
-    Ok(Request { spec: JobSpec { kind, name, labels, threads, priority, config }, digest })
+    Ok(JobRequest { spec: JobSpec { kind, name, labels, threads, priority, config }, digest })
 }
 
-/// The field, or its default where it is absent or null.
+/// Takes a field, or its default if it is absent or null.
 fn take<T: DeserializeOwned>(fields: &mut Map<String, Value>, name: &str, default: T) -> Result<T, Invalid> {
     match fields.remove(name) {
         None | Some(Value::Null) => Ok(default),
@@ -72,7 +73,7 @@ fn take<T: DeserializeOwned>(fields: &mut Map<String, Value>, name: &str, defaul
     }
 }
 
-fn kind_of(value: &Value) -> &'static str {
+fn type_name(value: &Value) -> &'static str {
     match value {
         Value::Null => "null",
         Value::Bool(_) => "a boolean",
@@ -111,8 +112,8 @@ mod tests {
 
     use super::*;
 
-    fn refused(document: Value) -> Invalid {
-        parse(document, 2).expect_err("must be refused")
+    fn parse_error(document: Value) -> Invalid {
+        parse(document, 2).expect_err("an invalid request")
     }
 
     #[test]
@@ -124,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn each_field_is_checked_and_named() {
+    fn invalid_fields_are_reported_by_name() {
         let cases = [
             (json!([]), "job", true),
             (json!({"algoritm": "qmix"}), "algoritm", true),
@@ -150,21 +151,21 @@ mod tests {
             (json!({"labels": {"a": "\n"}}), "labels.a", false),
         ];
         for (document, field, schema) in cases {
-            let e = refused(document.clone());
+            let e = parse_error(document.clone());
             assert_eq!((e.field.as_str(), e.schema), (field, schema), "{document}: {e}");
         }
     }
 
     #[test]
-    fn the_same_body_has_the_same_digest_however_it_is_written() {
+    fn digest_does_not_depend_on_notation() {
         let digest = |text: &str| parse(serde_json::from_str(text).unwrap(), 2).unwrap().digest;
         assert_eq!(digest(r#"{"seed": 2, "threads": 1}"#), digest(r#"{"threads":1.0,"seed":2.0}"#));
         assert_ne!(digest(r#"{"seed": 2}"#), digest(r#"{"seed": 3}"#));
     }
 
     #[test]
-    fn a_configuration_survives_json_to_the_bit() {
-        // Numbers whose shortest decimal form has more than 2^53 units: the ones that hasty parsers round twice.
+    fn configuration_is_stored_exactly_as_json() {
+        // The digits of these numbers exceed 2^53, so a fast float parser may round twice.
         let text = r#"{"environment": {"slots": 11, "speed": 0.09232400000000001}, "training": {"gamma": 0.9232400000000001}}"#;
         let config = parse(serde_json::from_str(text).unwrap(), 2).unwrap().spec.config;
         assert_eq!(config.training.gamma, 0.923_240_000_000_000_1);

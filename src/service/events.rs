@@ -1,7 +1,7 @@
-//! Following a job: what has happened to it and what happens, in the order in which it was committed, until it has ended.
+//! Watching a job: its past and future events in the order of their commits, until the job has ended.
 //!
-//! A watch reads a page when it is asked for one: a caller that reads slowly holds a page and no more. How many watches
-//! there are at a time is bounded.
+//! A watch reads a page of events at a time, so a slow caller holds one page in memory. The number of open watches is
+//! limited.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -11,69 +11,71 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 
 use super::{App, Error, jobs};
 use crate::invalid::in_range;
-use crate::store::{Happened, Job, JobEvent};
+use crate::store::{Job, JobEvent, JobEventKind};
 
-/// Who may watch, and how often they hear that the server lives.
+/// Limits of watches.
 #[derive(Debug)]
 pub struct Watchers {
-    free: Arc<Semaphore>,
-    most: usize,
+    permits: Arc<Semaphore>,
+    max: usize,
     heartbeat: Duration,
 }
 
 impl Watchers {
-    /// At most `most` watches at a time; a silent one gives a sign of life every `heartbeat`, where the transport has none.
-    pub fn new(most: usize, heartbeat: Duration) -> Self {
-        Self { free: Arc::new(Semaphore::new(most)), most, heartbeat }
+    /// At most `max` watches at a time. A watch without events sends a heartbeat every `heartbeat` on transports that have
+    /// none of their own.
+    pub fn new(max: usize, heartbeat: Duration) -> Self {
+        Self { permits: Arc::new(Semaphore::new(max)), max, heartbeat }
     }
 
-    /// Watches that are open.
+    /// Number of open watches.
     pub fn open(&self) -> usize {
-        self.most - self.free.available_permits()
+        self.max - self.permits.available_permits()
     }
 
-    /// Silence after which a watch gives a sign of life.
+    /// Time without events after which a watch sends a heartbeat.
     pub fn heartbeat(&self) -> Duration {
         self.heartbeat
     }
 }
 
-/// A job that is followed.
+/// A watch of a job.
 pub struct Watch {
     app: Arc<App>,
     id: String,
     job: i64,
     after: u64,
-    over: bool,
+    ended: bool,
     changes: watch::Receiver<()>,
-    _place: OwnedSemaphorePermit,
+    _permit: OwnedSemaphorePermit,
 }
 
-/// Follows job `id` behind its event `after`; 0: from its beginning.
+/// Watches job `id` from the event after `after`; 0 is from the beginning.
 ///
 /// # Errors
-/// There is no such job or event, there are too many watches, or the server drains.
+/// [`Error::NotFound`], [`Error::Invalid`] when the job has no event `after` yet, [`Error::Busy`] when too many watches are
+/// open, [`Error::Draining`].
 pub async fn watch(app: &Arc<App>, id: &str, after: u64) -> Result<Watch, Error> {
     app.admit()?;
-    let Watchers { free, most, .. } = &app.watchers;
-    let place = free.clone().try_acquire_owned().map_err(|_| Error::Busy {
-        message: format!("{most} jobs are watched already, which is the limit"),
+    let Watchers { permits, max, .. } = &app.watchers;
+    let permit = permits.clone().try_acquire_owned().map_err(|_| Error::Busy {
+        message: format!("{max} watches are open, which is the limit"),
         retry_after: Duration::from_secs(5),
     })?;
     let Job { number: job, state, last_event, .. } = jobs::get(app, id).await?;
     in_range("after", after, 0..=last_event)?;
-    let over = state.ended() && after == last_event;
-    Ok(Watch { app: app.clone(), id: id.to_owned(), job, after, over, changes: app.store.changes(job), _place: place })
+    let ended = state.ended() && after == last_event;
+    Ok(Watch { app: app.clone(), id: id.to_owned(), job, after, ended, changes: app.store.changes(job), _permit: permit })
 }
 
 impl Watch {
-    /// Whether nothing more will come.
-    pub fn is_over(&self) -> bool {
-        self.over
+    /// Whether the last event was returned.
+    pub fn has_ended(&self) -> bool {
+        self.ended
     }
 
-    /// The events, oldest first, until the job has ended; with [`Error::Draining`], [`Error::NotFound`] where the job is
-    /// deleted, or a fault of the database at its end otherwise.
+    /// The events, oldest first, until the job has ended. The stream ends early with [`Error::Draining`], with
+    /// [`Error::NotFound`] when the job is deleted, or with [`Error::Internal`].
     pub fn events(self) -> impl Stream<Item = Result<JobEvent, Error>> + Send + use<> {
         let pages = futures::stream::try_unfold(self, |mut watch| async {
             let page = watch.page().await?;
@@ -82,19 +84,19 @@ impl Watch {
         pages.try_flatten()
     }
 
-    /// The next events as soon as there are some; `None` behind the last.
+    /// Waits for the next events; `None` after the last.
     async fn page(&mut self) -> Result<Option<Vec<JobEvent>>, Error> {
-        while !self.over {
+        while !self.ended {
             self.app.admit()?;
-            // Marked before it is looked: what is committed from now on rings again.
+            // Marked before reading, so that a later commit notifies again.
             self.changes.borrow_and_update();
             let events = self.app.store.events(self.job, self.after).await?;
             if let Some(last) = events.last() {
                 self.after = last.id;
-                self.over = matches!(last.what, Happened::State { state, .. } if state.ended());
+                self.ended = matches!(last.kind, JobEventKind::State { state, .. } if state.ended());
                 return Ok(Some(events));
             }
-            // A job that is gone has no events either.
+            // A deleted job has no events either.
             jobs::get(&self.app, &self.id).await?;
             tokio::select! {
                 changed = self.changes.changed() => changed.map_err(Error::internal)?,

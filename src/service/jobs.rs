@@ -1,4 +1,4 @@
-//! What people do with jobs: submit, look, cancel, pause, resume, forget.
+//! The use cases of jobs: submit, get, list, cancel, pause, resume, delete, and read metrics, checkpoints and logs.
 
 use serde_json::Value;
 use uuid::Uuid;
@@ -9,14 +9,16 @@ use super::{App, Error, Page, PageRequest, policies};
 use crate::invalid::Invalid;
 use crate::jobs::spec;
 use crate::store::{
-    Attempt, Changed, Checkpoint, Job, JobId, JobState, JobSummary, MetricCursor, MetricRow, NewJob, Submitted, Verb, Wanted,
+    ActionResult, Attempt, Checkpoint, Job, JobAction, JobId, JobState, JobSummary, MetricCursor, MetricRow, NewJob,
+    PendingAction, SubmitResult,
 };
 
-/// Puts a job into the queue and tells whether it is new: the same `key` with the same document is the same job.
-/// What is returned is on the disk.
+/// Queues a job and returns it, and whether it is new: a repeated idempotency `key` with the same document returns the
+/// existing job. The job is on the disk when this returns.
 ///
 /// # Errors
-/// A document that is no job, a key that came with another document, a server that drains.
+/// [`Error::Invalid`] for an invalid document or key, [`Error::Conflict`] when the key came with another document,
+/// [`Error::Draining`].
 pub async fn submit(app: &App, document: Value, key: Option<String>) -> Result<(Job, bool), Error> {
     if let Some(key) = &key {
         let printable = key.bytes().all(|b| (b' '..=b'~').contains(&b));
@@ -24,9 +26,9 @@ pub async fn submit(app: &App, document: Value, key: Option<String>) -> Result<(
             return Err(Invalid::new("idempotency_key", format!("{key:?}"), "1 to 255 printable ASCII characters").into());
         }
     }
-    let request = spec::parse(document, app.jobs.settings().cpu_budget)?;
+    let request = spec::parse(document, app.scheduler.config().cpu_budget)?;
     if let Some(name) = &request.spec.name {
-        // Found out now rather than when the policy is trained.
+        // Reported now instead of after training.
         policies::check_publishable(name)?;
     }
     app.admit()?;
@@ -34,15 +36,15 @@ pub async fn submit(app: &App, document: Value, key: Option<String>) -> Result<(
     let idempotency = key.map(|key| (key, request.digest));
     let new = NewJob { id, spec: request.spec, now: app.clock.now(), idempotency };
     match app.store.submit_job(new).await? {
-        Submitted::New(job) => {
-            tracing::info!(job = %job.id, algorithm = ?job.spec.config.algorithm, threads = job.spec.threads, "submitted");
+        SubmitResult::Created(job) => {
+            tracing::info!(job = %job.id, algorithm = ?job.spec.config.algorithm, threads = job.spec.threads, "job submitted");
             metrics::counter!("qedgix_jobs_submitted_total").increment(1);
-            app.jobs.changed(job.number);
+            app.scheduler.job_changed(job.number);
             Ok((job, true))
         }
-        Submitted::Again(job) => Ok((job, false)),
-        Submitted::Conflict => {
-            let message = "this idempotency key came with another job before; use a new key for a new job".into();
+        SubmitResult::Existing(job) => Ok((job, false)),
+        SubmitResult::Conflict => {
+            let message = "this idempotency key was used with another job; use a new key for a new job".into();
             Err(Error::Conflict { code: "idempotency_conflict", message })
         }
     }
@@ -55,7 +57,7 @@ fn parse_id(id: &str) -> Result<JobId, Error> {
 /// The job `id`.
 ///
 /// # Errors
-/// There is none.
+/// [`Error::NotFound`].
 pub async fn get(app: &App, id: &str) -> Result<Job, Error> {
     app.store.job(parse_id(id)?).await?.ok_or_else(|| Error::not_found("job", id))
 }
@@ -70,34 +72,34 @@ pub async fn list(app: &App, state: Option<JobState>, page: &PageRequest) -> Res
     Ok(Page::new(jobs, more, |job| job.number.to_string()))
 }
 
-/// Does `verb` to the job `id`. A running job is told; it changes when its worker has stopped.
+/// Applies `action` to the job `id`. A running job gets a pending action and changes when its worker has stopped.
 ///
 /// # Errors
-/// There is no such job, or it is not in a state for the verb.
-pub async fn change(app: &App, id: &str, verb: Verb) -> Result<Job, Error> {
-    if verb == Verb::Resume {
+/// [`Error::NotFound`], or [`Error::Precondition`] when the state of the job does not allow the action.
+pub async fn change(app: &App, id: &str, action: JobAction) -> Result<Job, Error> {
+    if action == JobAction::Resume {
         app.admit()?;
     }
-    match app.store.change_job(parse_id(id)?, verb, app.clock.now()).await? {
-        Changed::Done(job) => {
-            tracing::info!(job = %job.id, state = %job.state, ?verb, "changed");
-            app.jobs.changed(job.number);
+    match app.store.change_job(parse_id(id)?, action, app.clock.now()).await? {
+        ActionResult::Accepted(job) => {
+            tracing::info!(job = %job.id, state = %job.state, ?action, "job changed");
+            app.scheduler.job_changed(job.number);
             Ok(*job)
         }
-        Changed::Missing => Err(Error::not_found("job", id)),
-        Changed::Refused(job) => {
-            let allowed = match verb {
-                Verb::Cancel => "only a job that has not ended can be cancelled",
-                Verb::Pause => "only a queued or running job can be paused",
-                Verb::Resume => "only a paused job can be resumed",
-                Verb::Delete => "only a job that has ended can be deleted; cancel it first",
+        ActionResult::NotFound => Err(Error::not_found("job", id)),
+        ActionResult::WrongState(job) => {
+            let allowed = match action {
+                JobAction::Cancel => "only a job that has not ended can be cancelled",
+                JobAction::Pause => "only a queued or running job can be paused",
+                JobAction::Resume => "only a paused job can be resumed",
+                JobAction::Delete => "only a job that has ended can be deleted; cancel it first",
             };
-            let doing = match job.wanted {
-                Some(Wanted::Cancel) => " and being cancelled",
-                Some(Wanted::Pause) => " and being paused",
+            let pending = match job.pending_action {
+                Some(PendingAction::Cancel) => " and being cancelled",
+                Some(PendingAction::Pause) => " and being paused",
                 None => "",
             };
-            let message = format!("job {id} is {}{doing}; {allowed}", job.state);
+            let message = format!("job {id} is {}{pending}; {allowed}", job.state);
             Err(Error::Precondition { code: "wrong_state", message })
         }
     }
@@ -122,33 +124,33 @@ fn parse_metric_cursor(cursor: &str) -> Option<MetricCursor> {
     Some(MetricCursor { name: name.to_owned(), step }).filter(|_| is_metric_name(name))
 }
 
-/// Checkpoints of a job, without their bytes, oldest first.
+/// Checkpoints of a job without their bytes, oldest first.
 ///
 /// # Errors
-/// There is no such job.
+/// [`Error::NotFound`].
 pub async fn checkpoints(app: &App, id: &str) -> Result<Vec<Checkpoint>, Error> {
     let job = get(app, id).await?;
     Ok(app.store.checkpoints(job.id).await?)
 }
 
-/// One checkpoint with its bytes.
+/// A checkpoint with its bytes.
 ///
 /// # Errors
-/// There is none.
+/// [`Error::NotFound`].
 pub async fn checkpoint(app: &App, id: &str) -> Result<(Checkpoint, Vec<u8>), Error> {
     let missing = || Error::not_found("checkpoint", id);
     app.store.checkpoint(Uuid::try_parse(id).map_err(|_| missing())?).await?.ok_or_else(missing)
 }
 
-/// All attempts at a job with the last output of their workers, oldest first.
+/// All attempts of a job with the last output of their workers, oldest first.
 ///
 /// # Errors
-/// There is no such job.
+/// [`Error::NotFound`].
 pub async fn logs(app: &App, id: &str) -> Result<Vec<Attempt>, Error> {
     let job = get(app, id).await?;
     let mut attempts = app.store.attempts(job.id).await?;
     for attempt in &mut attempts {
-        if let Some(log) = app.jobs.live_log(job.number, attempt.number) {
+        if let Some(log) = app.scheduler.live_log(job.number, attempt.number) {
             attempt.log = log;
         }
     }

@@ -1,4 +1,4 @@
-//! Use cases: one function each, one error type. Both transports call only this.
+//! Use cases: one function each, with one error type. Both transports call only this layer.
 
 pub mod act;
 pub mod environments;
@@ -18,62 +18,42 @@ use std::sync::Arc;
 pub use error::Error;
 pub use events::Watchers;
 pub use paging::{Page, PageRequest};
-use tokio_util::sync::CancellationToken;
 
-use crate::jobs::Jobs;
-use crate::serving::{Clock, Engine, Environments, Registry, Sessions};
+use crate::clock::Clock;
+use crate::draining::Draining;
+use crate::jobs::Scheduler;
+use crate::serving::{Engine, Environments, Registry, Sessions};
 use crate::store::Store;
 
-/// What use cases work with; shared by all connections behind an `Arc`.
+/// Everything that use cases work with. All connections share it behind an `Arc`.
 pub struct App {
-    /// Durable state.
+    /// The database.
     pub store: Store,
-    /// The scheduler.
-    pub jobs: Jobs,
-    /// Policies that can be asked.
+    /// The scheduler of jobs.
+    pub scheduler: Scheduler,
+    /// The published policies and baselines.
     pub registry: Arc<Registry>,
-    /// Fleets whose memory the server keeps.
+    /// Open sessions.
     pub sessions: Sessions,
-    /// Environments that learners elsewhere fly.
+    /// Hosted environments.
     pub environments: Environments,
-    /// Where headings are computed.
+    /// Runs policies in batches.
     pub engine: Engine,
-    /// Who may ask.
+    /// API keys.
     pub keys: keys::Keyring,
-    /// Who follows a job.
+    /// Limits of watches of jobs.
     pub watchers: Watchers,
-    /// The time of day.
+    /// Wall time and monotonic time.
     pub clock: Clock,
     /// Whether the server is shutting down.
     pub draining: Draining,
 }
 
-/// Whether the server is shutting down: new work is refused, work in flight goes on.
-#[derive(Debug, Default)]
-pub struct Draining(CancellationToken);
-
-impl Draining {
-    /// From now on new work is refused.
-    pub fn begin(&self) {
-        self.0.cancel();
-    }
-
-    /// Whether [`Draining::begin`] was called.
-    pub fn begun(&self) -> bool {
-        self.0.is_cancelled()
-    }
-
-    /// Returns when it is called.
-    pub async fn wait(&self) {
-        self.0.cancelled().await;
-    }
-}
-
 impl App {
-    /// Lets new work in.
+    /// Admits new work.
     ///
     /// # Errors
-    /// [`Error::Draining`].
+    /// [`Error::Draining`] once draining has begun.
     pub fn admit(&self) -> Result<(), Error> {
         if self.draining.begun() { Err(Error::Draining) } else { Ok(()) }
     }

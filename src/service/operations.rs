@@ -21,12 +21,16 @@ pub struct Vitals {
 
 /// Looks which parts of the server work.
 pub async fn vitals(app: &App) -> Vitals {
-    Vitals { database: database(app).await.is_ok(), policies: !app.registry.is_empty(), scheduler: *app.jobs.able().borrow() }
+    Vitals {
+        database: database(app).await.is_ok(),
+        policies: !app.registry.is_empty(),
+        scheduler: *app.scheduler.queue_readable().borrow(),
+    }
 }
 
 /// Returns when [`vitals`] are worth another look.
 pub async fn vitals_changed(app: &App) {
-    let mut able = app.jobs.able();
+    let mut able = app.scheduler.queue_readable();
     tokio::select! {
         // The sender lives in `app`.
         _ = able.changed() => {}
@@ -91,8 +95,8 @@ pub async fn figures(app: &App) -> Figures {
         environments: app.environments.table().len(),
         policy_versions: app.registry.len(),
         engine_queue: app.engine.waiting(),
-        threads_busy: app.jobs.threads_busy(),
-        threads: app.jobs.settings().cpu_budget,
+        threads_busy: app.scheduler.threads_busy(),
+        threads: app.scheduler.config().cpu_budget,
         watchers: app.watchers.open(),
         jobs,
     }

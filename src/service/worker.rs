@@ -1,4 +1,5 @@
-//! What workers do: fetch their job, report, upload, learn what is wanted, finish. Each call shows the token of its attempt.
+//! The use cases of workers: fetch a task, report metrics, upload snapshots and checkpoints, receive directives, finish.
+//! Every call carries the token of its attempt.
 
 use sha2::{Digest, Sha256};
 use uuid::Uuid;
@@ -7,119 +8,103 @@ use super::{App, Error, policies};
 use crate::invalid::{Invalid, in_range};
 use crate::jobs::{Directive, equal_secrets, token_digest};
 use crate::recipe::TrainConfig;
-use crate::store::{Ending, JobId, Lease, Metric, NewCheckpoint, OpenSnapshot, Snapshot, Wanted};
+use crate::store::{AttemptResult, EndedAttempt, JobId, Lease, Metric, NewCheckpoint, PartialSnapshot, PendingAction, Snapshot};
 
-/// Largest piece of an upload, in bytes.
-pub const CHUNK: usize = 1 << 20;
+/// Largest chunk of an upload, in bytes.
+pub const MAX_CHUNK: usize = 1 << 20;
 /// Largest checkpoint, in bytes.
-const LARGEST_CHECKPOINT: u64 = 256 << 20;
+const MAX_CHECKPOINT: u64 = 256 << 20;
 /// Most metrics in one report.
-const MOST_METRICS: usize = 10_000;
+const MAX_METRICS: usize = 10_000;
 
-/// Who calls, as the call's metadata say.
+/// The credentials in the metadata of a call.
 #[derive(Clone, Debug)]
 pub struct Credentials {
-    /// The job.
+    /// Id of the job.
     pub job: String,
-    /// The attempt.
+    /// Number of the attempt.
     pub attempt: String,
     /// The attempt's secret.
     pub token: String,
 }
 
-/// The work of an attempt.
+/// What a worker needs to run an attempt.
 #[derive(Clone, Debug)]
-pub struct Work {
-    /// What to train.
+pub struct AttemptTask {
+    /// The training configuration.
     pub config: TrainConfig,
-    /// Threads it may use.
+    /// Threads that the worker may use.
     pub threads: usize,
-    /// The snapshot to go on from.
+    /// The snapshot to resume from.
     pub snapshot: Option<Snapshot>,
     /// Time between snapshots.
     pub snapshot_every: std::time::Duration,
 }
 
-/// How a worker ends.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Finish {
-    /// All steps are done.
-    Succeeded,
-    /// Stopped before the end, as asked.
-    Stopped,
-    /// Gave up.
-    Failed {
-        /// Why.
-        reason: String,
-        /// Whether it would come again.
-        permanent: bool,
-    },
-}
-
-/// The attempt that these credentials belong to, if it lasts.
+/// The attempt that the credentials belong to. Counts as a heartbeat.
 ///
 /// # Errors
-/// [`Error::Unauthenticated`] for wrong credentials, [`Error::Precondition`] for those of an attempt that is over.
+/// [`Error::Unauthenticated`] for wrong credentials, [`Error::Precondition`] when the attempt has ended.
 pub async fn authenticate(app: &App, credentials: &Credentials) -> Result<Lease, Error> {
-    const WRONG: Error = Error::Unauthenticated("this token is not that of an attempt at this job");
+    const WRONG: Error = Error::Unauthenticated("the token does not belong to this attempt");
     let (Some(id), Ok(attempt)) = (JobId::parse(&credentials.job), credentials.attempt.parse()) else { return Err(WRONG) };
     let record = app.store.lease(id, attempt).await?.ok_or(WRONG)?;
     if !equal_secrets(&record.token, &token_digest(&credentials.token)) {
         return Err(WRONG);
     }
-    if !record.live {
+    if !record.active {
         return Err(fenced(record.lease));
     }
-    app.jobs.heard(record.lease);
+    app.scheduler.record_heartbeat(record.lease);
     Ok(record.lease)
 }
 
 fn fenced(lease: Lease) -> Error {
-    let message = format!("attempt {} at job {} is over", lease.attempt, lease.id);
+    let message = format!("attempt {} of job {} has ended", lease.attempt, lease.id);
     Error::Precondition { code: "attempt_over", message }
 }
 
-fn must_live(live: bool, lease: Lease) -> Result<(), Error> {
-    if live { Ok(()) } else { Err(fenced(lease)) }
+fn require_active(active: bool, lease: Lease) -> Result<(), Error> {
+    if active { Ok(()) } else { Err(fenced(lease)) }
 }
 
-/// The work of this attempt.
+/// The task of an attempt.
 ///
 /// # Errors
-/// The attempt is over.
-pub async fn fetch(app: &App, lease: Lease) -> Result<Work, Error> {
+/// [`Error::Precondition`] when the job was deleted.
+pub async fn fetch(app: &App, lease: Lease) -> Result<AttemptTask, Error> {
     let job = app.store.job(lease.id).await?.ok_or_else(|| fenced(lease))?;
-    let settings = app.jobs.settings();
-    Ok(Work {
-        threads: job.spec.threads.min(settings.cpu_budget),
+    let config = app.scheduler.config();
+    Ok(AttemptTask {
+        threads: job.spec.threads.min(config.cpu_budget),
         config: job.spec.config,
         snapshot: app.store.snapshot(lease.id).await?,
-        snapshot_every: settings.snapshot_every,
+        snapshot_every: config.snapshot_every,
     })
 }
 
 /// The newest snapshot of the job.
 ///
 /// # Errors
-/// There is none.
+/// [`Error::NotFound`] when the job has none.
 pub async fn snapshot(app: &App, lease: Lease) -> Result<Snapshot, Error> {
     app.store.snapshot(lease.id).await?.ok_or_else(|| Error::not_found("snapshot", lease.id.to_string()))
 }
 
-/// Chunk `number` of a snapshot, `None` behind the last.
+/// Chunk `number` of a snapshot; `None` after the last.
 ///
 /// # Errors
-/// The database.
+/// [`Error::Internal`] when the database fails.
 pub async fn snapshot_chunk(app: &App, snapshot: &Snapshot, number: u32) -> Result<Option<Vec<u8>>, Error> {
     Ok(app.store.snapshot_chunk(snapshot.id, number).await?)
 }
 
-/// Commits metrics and progress together.
+/// Stores metrics and progress in one transaction.
 ///
 /// # Errors
-/// A metric that is none, or an attempt that is over.
+/// [`Error::Invalid`] for an invalid metric or step, [`Error::Precondition`] when the attempt has ended.
 pub async fn report(app: &App, lease: Lease, metrics: &[Metric], step: u64) -> Result<(), Error> {
-    in_range("metrics", metrics.len(), 0..=MOST_METRICS)?;
+    in_range("metrics", metrics.len(), 0..=MAX_METRICS)?;
     check_step("step", step)?;
     for (i, metric) in metrics.iter().enumerate() {
         if !is_metric_name(&metric.name) {
@@ -128,7 +113,7 @@ pub async fn report(app: &App, lease: Lease, metrics: &[Metric], step: u64) -> R
         }
         check_step(&format!("metrics[{i}].step"), metric.step)?;
     }
-    must_live(app.store.report(lease, metrics, step, app.clock.now()).await?, lease)
+    require_active(app.store.report(lease, metrics, step, app.clock.now()).await?, lease)
 }
 
 pub(super) fn is_metric_name(name: &str) -> bool {
@@ -140,83 +125,87 @@ fn check_step(field: &str, step: u64) -> Result<(), Invalid> {
     in_range(field, step, 0..=i64::MAX as u64)
 }
 
-/// What the worker shall do next.
+/// What the worker is to do next.
 ///
 /// # Errors
-/// The attempt is over.
+/// [`Error::Precondition`] when the job was deleted.
 pub async fn heartbeat(app: &App, lease: Lease) -> Result<Directive, Error> {
     let job = app.store.job(lease.id).await?.ok_or_else(|| fenced(lease))?;
-    Ok(app.jobs.directive(job.wanted))
+    Ok(app.scheduler.directive(job.pending_action))
 }
 
-/// Ends the attempt. A job that is done is published: its best policy.
+/// Ends the attempt. The best policy of a job that succeeds is published.
 ///
 /// # Errors
-/// The attempt is over, or the checkpoint cannot be published.
-pub async fn finish(app: &App, lease: Lease, finish: Finish) -> Result<(), Error> {
-    let ending = match finish {
-        Finish::Succeeded => succeed(app, lease).await?,
-        Finish::Stopped => Ending::Stopped,
-        Finish::Failed { reason, permanent } => {
-            let reason = reason.chars().take(2000).collect();
-            Ending::Failed { reason, max_attempts: if permanent { 1 } else { app.jobs.settings().max_attempts } }
+/// [`Error::Precondition`] when the attempt has ended, [`Error::Internal`] when the database fails.
+pub async fn finish(app: &App, lease: Lease, result: AttemptResult) -> Result<(), Error> {
+    let (result, policy) = match result {
+        AttemptResult::Succeeded => publish_best(app, lease).await?,
+        AttemptResult::Stopped => (AttemptResult::Stopped, None),
+        AttemptResult::Failed { reason, permanent } => {
+            (AttemptResult::Failed { reason: reason.chars().take(2000).collect(), permanent }, None)
         }
     };
-    let job = app.store.end_attempt(lease, &ending, app.clock.now()).await?.ok_or_else(|| fenced(lease))?;
-    tracing::info!(job = %job.id, attempt = lease.attempt, state = %job.state, reason = job.reason, "attempt over");
-    app.jobs.changed(lease.job);
+    let max_attempts = app.scheduler.config().max_attempts;
+    let ended = EndedAttempt { lease, result: &result, policy: policy.as_deref(), max_attempts, now: app.clock.now() };
+    let job = app.store.end_attempt(ended).await?.ok_or_else(|| fenced(lease))?;
+    tracing::info!(job = %job.id, attempt = lease.attempt, state = %job.state, reason = job.reason, "attempt ended");
+    app.scheduler.job_changed(lease.job);
     Ok(())
 }
 
-/// Publishes what a job has made, unless it was cancelled meanwhile. Publishing the same again changes nothing, so a
-/// server that dies in between loses nothing.
-async fn succeed(app: &App, lease: Lease) -> Result<Ending, Error> {
+/// Publishes the best policy of a job, unless the job is being cancelled. Publishing the same policy again changes nothing,
+/// so a server that stops between publishing and ending the attempt loses nothing.
+async fn publish_best(app: &App, lease: Lease) -> Result<(AttemptResult, Option<String>), Error> {
     let job = app.store.job(lease.id).await?.ok_or_else(|| fenced(lease))?;
-    if job.wanted == Some(Wanted::Cancel) {
-        return Ok(Ending::Stopped);
+    if job.pending_action == Some(PendingAction::Cancel) {
+        return Ok((AttemptResult::Stopped, None));
     }
-    let Some(checkpoint) = app.store.best_checkpoint(lease.id).await? else { return Ok(Ending::Succeeded(None)) };
-    // The tail of an id is random; its head is the time, which jobs sent together share.
+    let Some(checkpoint) = app.store.best_checkpoint(lease.id).await? else { return Ok((AttemptResult::Succeeded, None)) };
+    // The end of an id is random. Its beginning is the time, which jobs submitted together share.
     let id = lease.id.to_string();
     let name = job.spec.name.unwrap_or_else(|| format!("job-{}", &id[id.len() - 8..]));
     match policies::publish(app, &name, checkpoint).await {
-        Ok(policy) => Ok(Ending::Succeeded(Some(policy.to_string()))),
-        // The same checkpoint would be refused again.
-        Err(Error::Invalid(e)) => Ok(Ending::Failed { reason: format!("its policy cannot be published: {e}"), max_attempts: 1 }),
+        Ok(policy) => Ok((AttemptResult::Succeeded, Some(policy.to_string()))),
+        // Another attempt would fail with the same checkpoint.
+        Err(Error::Invalid(e)) => {
+            let reason = format!("the policy cannot be published: {e}");
+            Ok((AttemptResult::Failed { reason, permanent: true }, None))
+        }
         Err(e) => Err(e),
     }
 }
 
-/// What an upload announces.
+/// Size and digest that an upload declares.
 #[derive(Clone, Debug)]
-pub struct Announced {
-    /// Bytes.
+pub struct UploadHeader {
+    /// Size in bytes.
     pub size: u64,
     /// SHA-256, lower-case hexadecimal.
     pub sha256: String,
 }
 
-/// Bytes on their way in, hashed as they come.
-struct Incoming {
-    announced: Announced,
+/// Checks the data of an upload against its header.
+struct UploadDigest {
+    header: UploadHeader,
     received: u64,
     hash: Sha256,
 }
 
-impl Incoming {
-    fn new(announced: Announced) -> Self {
-        Self { announced, received: 0, hash: Sha256::new() }
+impl UploadDigest {
+    fn new(header: UploadHeader) -> Self {
+        Self { header, received: 0, hash: Sha256::new() }
     }
 
-    /// Takes the next piece.
-    async fn take(&mut self, bytes: &bytes::Bytes) -> Result<(), Error> {
-        in_range("data", bytes.len(), 1..=CHUNK)?;
+    /// Adds the next chunk.
+    async fn update(&mut self, bytes: &bytes::Bytes) -> Result<(), Error> {
+        in_range("data", bytes.len(), 1..=MAX_CHUNK)?;
         self.received += bytes.len() as u64;
-        if self.received > self.announced.size {
-            return Err(Invalid::new("data", self.received, format!("the {} bytes announced", self.announced.size)).into());
+        if self.received > self.header.size {
+            return Err(Invalid::new("data", self.received, format!("the {} bytes in the header", self.header.size)).into());
         }
         let (mut hash, bytes) = (std::mem::take(&mut self.hash), bytes.clone());
-        // A megabyte takes milliseconds: too long for a thread that serves.
+        // Hashing a megabyte takes milliseconds, which is too long on a thread that serves connections.
         self.hash = tokio::task::spawn_blocking(move || {
             hash.update(&bytes);
             hash
@@ -226,93 +215,94 @@ impl Incoming {
         Ok(())
     }
 
-    /// Checks that all came, unharmed.
-    fn finish(self) -> Result<Announced, Error> {
-        if self.received != self.announced.size {
-            return Err(Invalid::new("data", self.received, format!("the {} bytes announced", self.announced.size)).into());
+    /// Checks size and digest of the whole.
+    fn verify(self) -> Result<UploadHeader, Error> {
+        if self.received != self.header.size {
+            return Err(Invalid::new("data", self.received, format!("the {} bytes in the header", self.header.size)).into());
         }
         let sha256 = hex::encode(self.hash.finalize());
-        if sha256 != self.announced.sha256 {
-            return Err(Invalid::new("sha256", &self.announced.sha256, format!("{sha256}, that of the data received")).into());
+        if sha256 != self.header.sha256 {
+            return Err(Invalid::new("sha256", &self.header.sha256, format!("{sha256}, the SHA-256 of the data")).into());
         }
-        Ok(self.announced)
+        Ok(self.header)
     }
 }
 
-/// A snapshot on its way in.
+/// An upload of a snapshot.
 pub struct SnapshotUpload {
     lease: Lease,
-    open: OpenSnapshot,
-    incoming: Incoming,
+    partial: PartialSnapshot,
+    digest: UploadDigest,
 }
 
 impl SnapshotUpload {
-    /// Begins.
+    /// Begins an upload of a snapshot taken at `step`.
     ///
     /// # Errors
-    /// The attempt is over.
-    pub async fn begin(app: &App, lease: Lease, step: u64, announced: Announced) -> Result<Self, Error> {
+    /// [`Error::Invalid`] for a step or size out of range, [`Error::Precondition`] when the attempt has ended.
+    pub async fn begin(app: &App, lease: Lease, step: u64, header: UploadHeader) -> Result<Self, Error> {
         check_step("header.step", step)?;
-        in_range("header.size", announced.size, 1..=i64::MAX as u64)?;
-        let open = app.store.open_snapshot(lease, step, app.clock.now()).await?.ok_or_else(|| fenced(lease))?;
-        Ok(Self { lease, open, incoming: Incoming::new(announced) })
+        in_range("header.size", header.size, 1..=i64::MAX as u64)?;
+        let partial = app.store.begin_snapshot(lease, step, app.clock.now()).await?.ok_or_else(|| fenced(lease))?;
+        Ok(Self { lease, partial, digest: UploadDigest::new(header) })
     }
 
-    /// Takes the next piece.
+    /// Adds the next chunk.
     ///
     /// # Errors
-    /// Too much data, or the attempt is over.
+    /// [`Error::Invalid`] for more data than declared, [`Error::Precondition`] when the attempt has ended.
     pub async fn push(&mut self, app: &App, bytes: bytes::Bytes) -> Result<(), Error> {
-        self.incoming.take(&bytes).await?;
-        app.jobs.heard(self.lease);
-        must_live(app.store.extend_snapshot(&mut self.open, &bytes).await?, self.lease)
+        self.digest.update(&bytes).await?;
+        app.scheduler.record_heartbeat(self.lease);
+        require_active(app.store.append_snapshot(&mut self.partial, &bytes).await?, self.lease)
     }
 
     /// Makes it the job's snapshot.
     ///
     /// # Errors
-    /// What came is not what was announced, or the attempt is over.
+    /// [`Error::Invalid`] when size or digest differ from the header, [`Error::Precondition`] when the attempt has ended.
     pub async fn complete(self, app: &App) -> Result<(), Error> {
-        let announced = self.incoming.finish()?;
-        must_live(app.store.complete_snapshot(self.open, &announced.sha256).await?, self.lease)
+        let header = self.digest.verify()?;
+        require_active(app.store.complete_snapshot(self.partial, &header.sha256).await?, self.lease)
     }
 }
 
-/// A checkpoint on its way in; `bytes` of `new` grow.
+/// An upload of a checkpoint.
 pub struct CheckpointUpload {
     lease: Lease,
+    /// The checkpoint; its `bytes` grow with every chunk.
     new: NewCheckpoint,
-    incoming: Incoming,
+    digest: UploadDigest,
 }
 
 impl CheckpointUpload {
-    /// Begins.
+    /// Begins an upload of a checkpoint of `size` bytes.
     ///
     /// # Errors
-    /// It is too large.
+    /// [`Error::Invalid`] for a step or size out of range.
     pub fn begin(lease: Lease, new: NewCheckpoint, size: u64) -> Result<Self, Error> {
         check_step("header.step", new.step)?;
-        in_range("header.size", size, 1..=LARGEST_CHECKPOINT)?;
-        let announced = Announced { size, sha256: new.sha256.clone() };
-        Ok(Self { lease, new, incoming: Incoming::new(announced) })
+        in_range("header.size", size, 1..=MAX_CHECKPOINT)?;
+        let header = UploadHeader { size, sha256: new.sha256.clone() };
+        Ok(Self { lease, new, digest: UploadDigest::new(header) })
     }
 
-    /// Takes the next piece.
+    /// Adds the next chunk.
     ///
     /// # Errors
-    /// Too much data.
+    /// [`Error::Invalid`] for more data than declared.
     pub async fn push(&mut self, bytes: bytes::Bytes) -> Result<(), Error> {
-        self.incoming.take(&bytes).await?;
+        self.digest.update(&bytes).await?;
         self.new.bytes.extend_from_slice(&bytes);
         Ok(())
     }
 
-    /// Keeps it and tells its id.
+    /// Stores the checkpoint and returns its id.
     ///
     /// # Errors
-    /// What came is not what was announced, or the attempt is over.
+    /// [`Error::Invalid`] when size or digest differ from the header, [`Error::Precondition`] when the attempt has ended.
     pub async fn complete(self, app: &App) -> Result<Uuid, Error> {
-        self.incoming.finish()?;
+        self.digest.verify()?;
         app.store.keep_checkpoint(self.lease, self.new, app.clock.now()).await?.ok_or_else(|| fenced(self.lease))
     }
 }

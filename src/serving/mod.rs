@@ -4,7 +4,6 @@
 //! Knows neither wire formats nor SQL; `service` brings policies out of the store and puts answers together.
 
 pub mod bundled;
-mod clock;
 mod engine;
 mod environments;
 mod error;
@@ -17,7 +16,6 @@ mod registry;
 mod sessions;
 mod table;
 
-pub use clock::Clock;
 pub use engine::{Engine, EngineConfig, Outcome, Room, Task, Timings};
 pub use environments::{
     Blueprint, CopyState, Environment, EnvironmentInfo, Environments, EnvironmentsConfig, Finished, Flight, Progress, Reset,

@@ -6,14 +6,14 @@
 //! that a late caller is told what happened.
 
 use std::collections::{HashMap, VecDeque};
-use std::sync::atomic::{AtomicI64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 use std::time::Duration;
 
-use jiff::Timestamp;
 use uuid::Uuid;
 
-use super::{Clock, Error};
+use super::Error;
+use crate::clock::Clock;
 
 /// Limits of a table.
 #[derive(Clone, Copy, Debug)]
@@ -46,22 +46,21 @@ pub trait Entry {
 /// How long what is over is kept for callers that missed its last answer.
 pub(super) const GRACE: Duration = Duration::from_secs(10);
 
-/// When something was used last, in milliseconds since the epoch.
+/// When something was used last: milliseconds of monotonic time.
 #[derive(Debug)]
-pub struct LastUse(AtomicI64);
+pub struct LastUse(AtomicU64);
 
 impl LastUse {
-    pub(super) fn at(now: Timestamp) -> Self {
-        Self(AtomicI64::new(now.as_millisecond()))
+    pub(super) fn at(now: Duration) -> Self {
+        Self(AtomicU64::new(now.as_millis() as u64))
     }
 
-    pub(super) fn touch(&self, now: Timestamp) {
-        self.0.fetch_max(now.as_millisecond(), Ordering::Relaxed);
+    pub(super) fn touch(&self, now: Duration) {
+        self.0.fetch_max(now.as_millis() as u64, Ordering::Relaxed);
     }
 
-    fn idle(&self, now: Timestamp) -> u128 {
-        let idle = now.as_millisecond().saturating_sub(self.0.load(Ordering::Relaxed));
-        u128::try_from(idle).unwrap_or(0)
+    fn idle(&self, now: Duration) -> Duration {
+        now.saturating_sub(Duration::from_millis(self.0.load(Ordering::Relaxed)))
     }
 }
 
@@ -128,8 +127,8 @@ impl<T: Entry> Table<T> {
         self.names.write().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn is_idle(&self, entry: &T, now: Timestamp) -> bool {
-        entry.used().idle(now) > self.limits.ttl.as_millis()
+    fn is_idle(&self, entry: &T, now: Duration) -> bool {
+        entry.used().idle(now) > self.limits.ttl
     }
 
     /// Idle time after which entries expire.
@@ -147,7 +146,7 @@ impl<T: Entry> Table<T> {
     /// # Errors
     /// There are too many.
     pub(super) fn find_or_add(&self, id: &str, make: impl FnOnce() -> T) -> Result<Found<T>, Error> {
-        let now = self.clock.now();
+        let now = self.clock.monotonic();
         let mut names = self.write();
         if let Some(existing) = names.open.get(id).filter(|entry| !self.is_idle(entry, now)) {
             return Ok(Found::Existing(existing.clone()));
@@ -160,11 +159,11 @@ impl<T: Entry> Table<T> {
     /// # Errors
     /// There are too many.
     pub(super) fn replace(&self, id: &str, make: impl FnOnce() -> T) -> Result<Arc<T>, Error> {
-        let now = self.clock.now();
+        let now = self.clock.monotonic();
         self.insert(&mut self.write(), id, now, make)
     }
 
-    fn insert(&self, names: &mut Names<T>, id: &str, now: Timestamp, make: impl FnOnce() -> T) -> Result<Arc<T>, Error> {
+    fn insert(&self, names: &mut Names<T>, id: &str, now: Duration, make: impl FnOnce() -> T) -> Result<Arc<T>, Error> {
         let full = |names: &Names<T>| names.open.len() >= self.limits.max && !names.open.contains_key(id);
         if full(names) {
             self.sweep_names(names, now, Duration::ZERO);
@@ -183,7 +182,7 @@ impl<T: Entry> Table<T> {
     /// # Errors
     /// It expired, or there is none.
     pub fn get(&self, id: &str) -> Result<Arc<T>, Error> {
-        let now = self.clock.now();
+        let now = self.clock.monotonic();
         {
             let names = self.read();
             match names.open.get(id) {
@@ -214,7 +213,7 @@ impl<T: Entry> Table<T> {
 
     /// Entries with names after `after`, in order, at most `limit`, and whether there are more.
     pub fn list(&self, after: &str, limit: usize) -> (Vec<Arc<T>>, bool) {
-        let now = self.clock.now();
+        let now = self.clock.monotonic();
         let names = self.read();
         let alive = |entry: &&Arc<T>| entry.id() > after && !entry.over() && !self.is_idle(entry, now);
         let mut entries: Vec<&Arc<T>> = names.open.values().filter(alive).collect();
@@ -235,12 +234,12 @@ impl<T: Entry> Table<T> {
 
     /// Forgets what is idle for too long.
     pub fn sweep(&self) {
-        let now = self.clock.now();
+        let now = self.clock.monotonic();
         self.sweep_names(&mut self.write(), now, GRACE);
     }
 
-    fn sweep_names(&self, names: &mut Names<T>, now: Timestamp, grace: Duration) {
-        names.open.retain(|_, entry| !entry.over() || entry.used().idle(now) < grace.as_millis());
+    fn sweep_names(&self, names: &mut Names<T>, now: Duration, grace: Duration) {
+        names.open.retain(|_, entry| !entry.over() || entry.used().idle(now) < grace);
         // What somebody holds is in use, however long the slot in flight takes.
         let gone = |entry: &Arc<T>| Arc::strong_count(entry) == 1 && self.is_idle(entry, now);
         let gone: Vec<String> = names.open.iter().filter(|(_, entry)| gone(entry)).map(|(id, _)| id.clone()).collect();

@@ -1,80 +1,95 @@
-//! Attempts at jobs: one worker's turn each, from its token to its outcome. Only the newest attempt that has not ended may
-//! write anything; whoever holds an older token is fenced.
+//! Attempts: one worker process working on a job each, from its token to its outcome. Only the newest attempt of a job may
+//! write, and only until it has ended; workers of older attempts are fenced.
 
 use jiff::Timestamp;
 use sqlx::{FromRow, SqliteConnection};
 
-use super::jobs::{Transition, find, named, transition};
-use super::{Job, JobId, JobState, Result, Store, Wanted, corrupt, timestamp};
+use super::jobs::{Transition, find, named_enum, transition};
+use super::{Job, JobId, JobState, PendingAction, Result, Store, corrupt, timestamp};
 
-named! {
-    /// How an attempt ended.
-    Outcome {
-        /// The job is done.
+named_enum! {
+    /// How an attempt ended, as the database records it.
+    AttemptOutcome {
+        /// All steps are done.
         Succeeded = "succeeded",
         /// The worker died or gave up.
         Failed = "failed",
-        /// Somebody cancelled the job.
+        /// A user cancelled the job.
         Cancelled = "cancelled",
-        /// Somebody paused the job.
+        /// A user paused the job.
         Paused = "paused",
-        /// The server stopped, or the worker had to; not a failure.
+        /// The server or the worker was stopped. Not a failure.
         Interrupted = "interrupted",
     }
 }
 
-/// The right to work at a job: one attempt.
+/// The right of one attempt to work on a job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Lease {
-    /// The job.
+    /// Id of the job.
     pub id: JobId,
-    /// Its number.
+    /// Number of the job.
     pub job: i64,
-    /// The attempt, from 1.
+    /// Number of the attempt, from 1.
     pub attempt: u32,
 }
 
-/// What is known of a lease that somebody claims.
+/// A lease as stored, to check the token of a worker.
 #[derive(Clone, Debug)]
 pub struct LeaseRecord {
     /// The lease.
     pub lease: Lease,
-    /// SHA-256 of its token.
+    /// SHA-256 of the token.
     pub token: Vec<u8>,
-    /// Whether it still lasts.
-    pub live: bool,
+    /// Whether the attempt may write.
+    pub active: bool,
 }
 
-/// How an attempt ends.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Ending {
-    /// All is done, and published as this `NAME:VERSION`.
-    Succeeded(Option<String>),
-    /// Stopped before the end, as asked; the job does what was wanted of it, else it waits for its next turn.
+/// How a worker ends its attempt. The scheduler reports it for a worker that cannot.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum AttemptResult {
+    /// All steps are done.
+    Succeeded,
+    /// The worker stopped early, as requested. The pending action is applied; without one the job is queued again.
     Stopped,
-    /// Died or gave up; the job is tried again until this many attempts have failed.
+    /// The worker died or gave up.
     Failed {
-        /// What happened.
+        /// Why.
         reason: String,
-        /// Failures after which the job has failed.
-        max_attempts: u32,
+        /// Whether another attempt would fail in the same way, so that none is made.
+        permanent: bool,
     },
 }
 
-/// An attempt as it stands.
+/// The end of an attempt.
+#[derive(Clone, Debug)]
+pub struct EndedAttempt<'a> {
+    /// The attempt.
+    pub lease: Lease,
+    /// How it ended.
+    pub result: &'a AttemptResult,
+    /// `NAME:VERSION` under which its policy was published.
+    pub policy: Option<&'a str>,
+    /// Failed attempts after which the job has failed.
+    pub max_attempts: u32,
+    /// When it ended.
+    pub now: Timestamp,
+}
+
+/// The current record of an attempt.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Attempt {
-    /// From 1.
+    /// Number of the attempt, from 1.
     pub number: u32,
-    /// When it began.
+    /// When the attempt began.
     pub started_at: Timestamp,
-    /// When it ended.
+    /// When the attempt ended.
     pub ended_at: Option<Timestamp>,
-    /// How it ended.
-    pub outcome: Option<Outcome>,
-    /// What happened.
+    /// How the attempt ended.
+    pub outcome: Option<AttemptOutcome>,
+    /// Why the attempt failed.
     pub reason: Option<String>,
-    /// Last output of its worker, known when the worker's process has ended.
+    /// Last output of the worker. Stored when the worker process has ended.
     pub log: String,
 }
 
@@ -88,33 +103,39 @@ struct AttemptRow {
     log: String,
 }
 
-/// Whether the lease still lasts.
-pub(super) async fn live(db: &mut SqliteConnection, lease: Lease) -> Result<bool> {
+/// Whether the attempt may write: it is the newest of its job and has not ended.
+pub(super) async fn is_active(db: &mut SqliteConnection, lease: Lease) -> Result<bool> {
     let sql = "SELECT 1 FROM attempts a JOIN jobs j ON j.number = a.job
                WHERE a.job = ? AND a.number = ? AND a.number = j.attempts AND a.ended_at IS NULL";
     Ok(sqlx::query(sql).bind(lease.job).bind(lease.attempt).fetch_optional(&mut *db).await?.is_some())
 }
 
-/// Ends an attempt and moves its job on. Does nothing when it has ended before.
-async fn end(db: &mut SqliteConnection, lease: Lease, ending: &Ending, now: Timestamp) -> Result<Option<Job>> {
-    if !live(db, lease).await? {
+/// Ends an attempt and changes the state of its job. Does nothing if the attempt has already ended.
+async fn end(db: &mut SqliteConnection, ended: EndedAttempt<'_>) -> Result<Option<Job>> {
+    let EndedAttempt { lease, result, policy, max_attempts, now } = ended;
+    if !is_active(db, lease).await? {
         return Ok(None);
     }
-    let job = find(db, lease.id).await?.ok_or_else(|| corrupt("job", lease.id, "vanished within a transaction"))?;
-    // A cancel that was acknowledged is kept, even where the worker was faster.
-    let (outcome, state) = match (ending, job.wanted) {
-        (Ending::Succeeded(_) | Ending::Stopped, Some(Wanted::Cancel)) => (Outcome::Cancelled, JobState::Cancelled),
-        (Ending::Succeeded(_), _) => (Outcome::Succeeded, JobState::Succeeded),
-        (Ending::Stopped, Some(Wanted::Pause)) => (Outcome::Paused, JobState::Paused),
-        (Ending::Stopped, None) => (Outcome::Interrupted, JobState::Queued),
-        (Ending::Failed { .. }, Some(Wanted::Cancel)) => (Outcome::Failed, JobState::Cancelled),
-        (Ending::Failed { max_attempts, .. }, wanted) => match wanted {
-            _ if job.failures + 1 >= *max_attempts => (Outcome::Failed, JobState::Failed),
-            Some(_) => (Outcome::Failed, JobState::Paused),
-            None => (Outcome::Failed, JobState::Queued),
-        },
+    let job = find(db, lease.id).await?.ok_or_else(|| corrupt("job", lease.id, "deleted within a transaction"))?;
+    // An acknowledged cancel wins, even over a worker that succeeded before it noticed.
+    let (outcome, state) = match (result, job.pending_action) {
+        (AttemptResult::Succeeded | AttemptResult::Stopped, Some(PendingAction::Cancel)) => {
+            (AttemptOutcome::Cancelled, JobState::Cancelled)
+        }
+        (AttemptResult::Succeeded, _) => (AttemptOutcome::Succeeded, JobState::Succeeded),
+        (AttemptResult::Stopped, Some(PendingAction::Pause)) => (AttemptOutcome::Paused, JobState::Paused),
+        (AttemptResult::Stopped, None) => (AttemptOutcome::Interrupted, JobState::Queued),
+        (AttemptResult::Failed { .. }, Some(PendingAction::Cancel)) => (AttemptOutcome::Failed, JobState::Cancelled),
+        (AttemptResult::Failed { permanent, .. }, pending) => {
+            let state = match pending {
+                _ if *permanent || job.failures + 1 >= max_attempts => JobState::Failed,
+                Some(_) => JobState::Paused,
+                None => JobState::Queued,
+            };
+            (AttemptOutcome::Failed, state)
+        }
     };
-    let reason = if let Ending::Failed { reason, .. } = ending { Some(reason.as_str()) } else { None };
+    let reason = if let AttemptResult::Failed { reason, .. } = result { Some(reason.as_str()) } else { None };
     let sql = "UPDATE attempts SET ended_at = ?3, outcome = ?4, reason = ?5 WHERE job = ?1 AND number = ?2";
     sqlx::query(sql)
         .bind(lease.job)
@@ -124,8 +145,8 @@ async fn end(db: &mut SqliteConnection, lease: Lease, ending: &Ending, now: Time
         .bind(reason)
         .execute(&mut *db)
         .await?;
-    let failed = i64::from(outcome == Outcome::Failed);
-    let policy = if let (Ending::Succeeded(policy), JobState::Succeeded) = (ending, state) { policy.as_deref() } else { None };
+    let failed = i64::from(outcome == AttemptOutcome::Failed);
+    let policy = policy.filter(|_| state == JobState::Succeeded);
     let sql = "UPDATE jobs SET failures = failures + ?2, policy = coalesce(?3, policy) WHERE number = ?1";
     sqlx::query(sql).bind(lease.job).bind(failed).bind(policy).execute(&mut *db).await?;
     transition(db, Transition { job: lease.job, to: state, attempt: lease.attempt, reason, now }).await?;
@@ -133,10 +154,11 @@ async fn end(db: &mut SqliteConnection, lease: Lease, ending: &Ending, now: Time
 }
 
 impl Store {
-    /// Gives `job`, if it is still queued, to a worker that will show the token with this SHA-256.
+    /// Begins an attempt of the job `id` whose worker presents the token with the SHA-256 `token`. Returns `None` unless the
+    /// job is queued.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn begin_attempt(&self, id: JobId, token: [u8; 32], now: Timestamp) -> Result<Option<Lease>> {
         let mut tx = self.begin().await?;
         let Some(job) = find(&mut tx, id).await?.filter(|job| job.state == JobState::Queued) else { return Ok(None) };
@@ -154,36 +176,37 @@ impl Store {
         let to = JobState::Running;
         transition(&mut tx, Transition { job: lease.job, to, attempt: lease.attempt, reason: None, now }).await?;
         tx.commit().await?;
-        self.ring(lease.job);
+        self.notify(lease.job);
         Ok(Some(lease))
     }
 
-    /// Ends an attempt and moves its job on; nothing when it has ended before.
+    /// Ends an attempt and changes the state of its job. Returns the job, or `None` if the attempt has already ended.
     ///
     /// # Errors
-    /// The database.
-    pub async fn end_attempt(&self, lease: Lease, ending: &Ending, now: Timestamp) -> Result<Option<Job>> {
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn end_attempt(&self, ended: EndedAttempt<'_>) -> Result<Option<Job>> {
         let mut tx = self.begin().await?;
-        let job = end(&mut tx, lease, ending, now).await?;
+        let number = ended.lease.job;
+        let job = end(&mut tx, ended).await?;
         tx.commit().await?;
-        self.ring(lease.job);
+        self.notify(number);
         Ok(job)
     }
 
-    /// Keeps the last output of an attempt's worker.
+    /// Stores the last output of an attempt's worker.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn keep_log(&self, lease: Lease, log: &str) -> Result<()> {
         let sql = "UPDATE attempts SET log = ?3 WHERE job = ?1 AND number = ?2";
         sqlx::query(sql).bind(lease.job).bind(lease.attempt).bind(log).execute(&self.write).await?;
         Ok(())
     }
 
-    /// After a restart: whoever worked for the server before does so no longer, and their jobs wait for their next turn.
+    /// Ends the attempts that were running when the server last stopped, and queues their jobs again. Returns these jobs.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn recover_jobs(&self, now: Timestamp) -> Result<Vec<Job>> {
         let mut tx = self.begin().await?;
         let sql = "SELECT id, number, attempts FROM jobs WHERE state = 'running'";
@@ -191,29 +214,32 @@ impl Store {
         let mut jobs = Vec::with_capacity(rows.len());
         for (id, job, attempt) in rows {
             let id = JobId::parse(&id).ok_or_else(|| corrupt("job", &id, "not an id"))?;
-            jobs.extend(end(&mut tx, Lease { id, job, attempt: attempt as u32 }, &Ending::Stopped, now).await?);
+            let lease = Lease { id, job, attempt: attempt as u32 };
+            // A stopped attempt is not a failure, so the limit has no effect.
+            let ended = EndedAttempt { lease, result: &AttemptResult::Stopped, policy: None, max_attempts: u32::MAX, now };
+            jobs.extend(end(&mut tx, ended).await?);
         }
         sqlx::query("DELETE FROM snapshots WHERE sha256 IS NULL").execute(&mut *tx).await?;
         tx.commit().await?;
         Ok(jobs)
     }
 
-    /// What is known of attempt `attempt` at job `id`.
+    /// The lease of attempt `attempt` of job `id`.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn lease(&self, id: JobId, attempt: u32) -> Result<Option<LeaseRecord>> {
         let sql = "SELECT j.number, a.token, a.number = j.attempts AND a.ended_at IS NULL FROM jobs j
                    JOIN attempts a ON a.job = j.number WHERE j.id = ? AND a.number = ?";
         let row: Option<(i64, Vec<u8>, bool)> =
             sqlx::query_as(sql).bind(id.to_string()).bind(attempt).fetch_optional(&self.read).await?;
-        Ok(row.map(|(job, token, live)| LeaseRecord { lease: Lease { id, job, attempt }, token, live }))
+        Ok(row.map(|(job, token, active)| LeaseRecord { lease: Lease { id, job, attempt }, token, active }))
     }
 
-    /// All attempts at a job, oldest first.
+    /// All attempts of a job, oldest first.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn attempts(&self, id: JobId) -> Result<Vec<Attempt>> {
         let sql = "SELECT a.* FROM attempts a JOIN jobs j ON j.number = a.job WHERE j.id = ? ORDER BY a.number";
         let rows: Vec<AttemptRow> = sqlx::query_as(sql).bind(id.to_string()).fetch_all(&self.read).await?;
@@ -223,7 +249,7 @@ impl Store {
                     number: row.number as u32,
                     started_at: timestamp(row.started_at)?,
                     ended_at: row.ended_at.map(timestamp).transpose()?,
-                    outcome: row.outcome.as_deref().map(Outcome::read).transpose()?,
+                    outcome: row.outcome.as_deref().map(AttemptOutcome::from_column).transpose()?,
                     reason: row.reason,
                     log: row.log,
                 })

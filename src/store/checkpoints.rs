@@ -1,4 +1,4 @@
-//! Checkpoints that jobs produce: the best policy of each job and its last, as safetensors.
+//! Checkpoints that jobs produce: the best and the last policy of each job, as safetensors.
 
 use std::collections::BTreeMap;
 
@@ -6,53 +6,53 @@ use jiff::Timestamp;
 use sqlx::FromRow;
 use uuid::Uuid;
 
-use super::attempts::live;
-use super::jobs::named;
+use super::attempts::is_active;
+use super::jobs::named_enum;
 use super::{JobId, Lease, Result, Store, corrupt, timestamp};
 
-named! {
+named_enum! {
     /// Which of a job's policies a checkpoint is.
     CheckpointKind {
-        /// The one that evaluated best.
+        /// The policy with the best evaluation.
         Best = "best",
-        /// The one at the end of training.
+        /// The policy at the end of training.
         Last = "last",
     }
 }
 
-/// A checkpoint to keep.
+/// A checkpoint to store.
 #[derive(Clone, Debug)]
 pub struct NewCheckpoint {
     /// Which of the job's policies.
     pub kind: CheckpointKind,
-    /// Environment steps it was taken at.
+    /// Environment steps of training before it.
     pub step: u64,
     /// SHA-256 of `bytes`, lower-case hexadecimal.
     pub sha256: String,
-    /// Figures it was taken at.
+    /// Metrics of the policy.
     pub metrics: BTreeMap<String, f64>,
-    /// Safetensors.
+    /// The checkpoint, as safetensors.
     pub bytes: Vec<u8>,
 }
 
 /// A checkpoint without its bytes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Checkpoint {
-    /// Its name; a better policy gets another.
+    /// The id. A better policy gets a new one.
     pub id: Uuid,
-    /// Whose.
+    /// The job that produced it.
     pub job: JobId,
     /// Which of the job's policies.
     pub kind: CheckpointKind,
-    /// Attempt that took it.
+    /// The attempt that produced it.
     pub attempt: u32,
-    /// Environment steps it was taken at.
+    /// Environment steps of training before it.
     pub step: u64,
     /// SHA-256, lower-case hexadecimal.
     pub sha256: String,
-    /// Bytes.
+    /// Size in bytes.
     pub size: u64,
-    /// Figures it was taken at.
+    /// Metrics of the policy.
     pub metrics: BTreeMap<String, f64>,
     /// The job's resolved training configuration.
     pub config: serde_json::Value,
@@ -81,7 +81,7 @@ impl TryFrom<CheckpointRow> for Checkpoint {
         Ok(Self {
             id: Uuid::try_parse(&row.id).map_err(|e| corrupt("checkpoint", &row.id, e))?,
             job: JobId::parse(&row.job).ok_or_else(|| corrupt("job", &row.job, "not an id"))?,
-            kind: CheckpointKind::read(&row.kind)?,
+            kind: CheckpointKind::from_column(&row.kind)?,
             attempt: row.attempt as u32,
             step: row.step as u64,
             sha256: row.sha256,
@@ -93,21 +93,21 @@ impl TryFrom<CheckpointRow> for Checkpoint {
     }
 }
 
-/// Checkpoints of one job, or one of them.
+/// Checkpoints of job `?1`, or checkpoint `?2`.
 const SELECT: &str = "SELECT c.id, j.id AS job, c.kind, c.attempt, c.step, c.sha256, c.size, c.metrics, c.config, c.created_at
     FROM checkpoints c JOIN jobs j ON j.number = c.job
     WHERE (?1 IS NULL OR j.id = ?1) AND (?2 IS NULL OR c.id = ?2) ORDER BY c.created_at, c.id";
 
 impl Store {
-    /// Keeps a checkpoint in place of the former one of its kind, and tells its id: the former one's, if it is the same.
-    /// `None` when the lease lasts no longer.
+    /// Stores a checkpoint in place of the previous one of its kind. Returns its id, which is the previous one's if the two
+    /// are the same, or `None` if the attempt has ended.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn keep_checkpoint(&self, lease: Lease, new: NewCheckpoint, now: Timestamp) -> Result<Option<Uuid>> {
         let metrics = serde_json::to_string(&new.metrics).map_err(|e| corrupt("checkpoint", new.kind, e))?;
         let mut tx = self.begin().await?;
-        if !live(&mut tx, lease).await? {
+        if !is_active(&mut tx, lease).await? {
             return Ok(None);
         }
         let sql = "SELECT id FROM checkpoints WHERE job = ? AND kind = ? AND sha256 = ? AND step = ?";
@@ -144,27 +144,27 @@ impl Store {
     /// Checkpoints of a job, oldest first.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn checkpoints(&self, job: JobId) -> Result<Vec<Checkpoint>> {
         let rows: Vec<CheckpointRow> =
             sqlx::query_as(SELECT).bind(job.to_string()).bind(None::<String>).fetch_all(&self.read).await?;
         rows.into_iter().map(Checkpoint::try_from).collect()
     }
 
-    /// Bytes of a job's best checkpoint, or of its last where there is no best.
+    /// Bytes of a job's best checkpoint, or else of its last.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn best_checkpoint(&self, job: JobId) -> Result<Option<Vec<u8>>> {
         let sql = "SELECT c.bytes FROM checkpoints c JOIN jobs j ON j.number = c.job
                    WHERE j.id = ? ORDER BY c.kind = 'best' DESC LIMIT 1";
         Ok(sqlx::query_scalar(sql).bind(job.to_string()).fetch_optional(&self.read).await?)
     }
 
-    /// One checkpoint and its bytes.
+    /// The checkpoint `id` and its bytes.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn checkpoint(&self, id: Uuid) -> Result<Option<(Checkpoint, Vec<u8>)>> {
         let mut tx = self.read.begin().await?;
         let row: Option<CheckpointRow> =

@@ -1,6 +1,5 @@
-//! What happens to a job, in the order in which it was committed: changes of state and reported metrics share one row of
-//! numbers per job. A number is never given twice, so whoever has seen the events up to one goes on behind it, also after a
-//! restart.
+//! The event log of each job: changes of state and reported metrics in the order of their commits. Event ids increase per
+//! job and are never reused, so a reader can continue after any event, also after a restart.
 
 use sqlx::FromRow;
 use tokio::sync::watch;
@@ -8,30 +7,30 @@ use tokio::sync::watch;
 use super::{JobState, MetricRow, Result, Store, timestamp};
 use jiff::Timestamp;
 
-/// Something that happened to a job.
+/// An event of a job.
 #[derive(Clone, Debug, PartialEq)]
 pub struct JobEvent {
-    /// Its number: later is larger.
+    /// Id; later events have larger ids.
     pub id: u64,
-    /// What it was.
-    pub what: Happened,
+    /// What happened.
+    pub kind: JobEventKind,
 }
 
-/// What happened.
+/// The kinds of events.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Happened {
-    /// The job came into another state.
+pub enum JobEventKind {
+    /// The state of the job changed.
     State {
-        /// The new one.
+        /// The new state.
         state: JobState,
-        /// The newest attempt at that time; 0: none.
+        /// The newest attempt at that time; 0 before the first.
         attempt: u32,
-        /// Why.
+        /// Why the state changed.
         reason: Option<String>,
-        /// When.
+        /// When the state changed.
         at: Timestamp,
     },
-    /// Metrics were reported together. Those whose values were reported again with other values are with their last report.
+    /// Metrics of one report. A metric that was reported again with another value belongs to its last report.
     Metrics(Vec<MetricRow>),
 }
 
@@ -47,41 +46,41 @@ struct Row {
     value: Option<f64>,
 }
 
-/// Rows of one page, unless a single event has more.
+/// Rows per page, unless a single event has more.
 const PAGE: i64 = 1000;
 
-/// Bells of changes. Jobs that share one wake each other's listeners, who look and see nothing.
-const BELLS: usize = 64;
+/// Number of channels. Jobs that share a channel wake each other's listeners, which then find no event.
+const CHANNELS: usize = 64;
 
-/// Rung whenever something has happened to a job.
+/// Notifies listeners of new events, in one channel per job number modulo [`CHANNELS`].
 #[derive(Debug)]
-pub(super) struct Bells([watch::Sender<()>; BELLS]);
+pub(super) struct Notifier([watch::Sender<()>; CHANNELS]);
 
-impl Bells {
+impl Notifier {
     pub(super) fn new() -> Self {
         Self(std::array::from_fn(|_| watch::Sender::new(())))
     }
 
-    fn of(&self, job: i64) -> &watch::Sender<()> {
-        &self.0[job as usize % BELLS]
+    fn channel(&self, job: i64) -> &watch::Sender<()> {
+        &self.0[job as usize % CHANNELS]
     }
 }
 
 impl Store {
-    /// Says that something was committed about job number `job`.
-    pub(super) fn ring(&self, job: i64) {
-        self.bells.of(job).send_replace(());
+    /// Notifies listeners that an event of job number `job` was committed.
+    pub(super) fn notify(&self, job: i64) {
+        self.notifier.channel(job).send_replace(());
     }
 
-    /// Changes whenever something has been committed about job number `job`, and now and then besides.
+    /// A receiver that changes whenever an event of job number `job` was committed, and sometimes without one.
     pub fn changes(&self, job: i64) -> watch::Receiver<()> {
-        self.bells.of(job).subscribe()
+        self.notifier.channel(job).subscribe()
     }
 
-    /// What happened to job number `job` behind event `after`, oldest first: a page of it, every event whole.
+    /// A page of the events of job number `job` after event `after`, oldest first. Every event is complete.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn events(&self, job: i64, after: u64) -> Result<Vec<JobEvent>> {
         let sql = "SELECT seq, at, state, attempt, reason, '' AS name, 0 AS step, NULL AS value
                      FROM events WHERE job = ?1 AND seq > ?2
@@ -92,8 +91,8 @@ impl Store {
         loop {
             let rows: Vec<Row> = sqlx::query_as(sql).bind(job).bind(after as i64).bind(limit).fetch_all(&self.read).await?;
             let full = rows.len() as i64 == limit;
-            let mut events = gather(rows)?;
-            // The last event of a full page may have more rows.
+            let mut events = group_rows(rows)?;
+            // The last event of a full page may have more rows, so it belongs to the next page.
             if !full || events.pop().is_some_and(|_| !events.is_empty()) {
                 return Ok(events);
             }
@@ -102,19 +101,19 @@ impl Store {
     }
 }
 
-fn gather(rows: Vec<Row>) -> Result<Vec<JobEvent>> {
+fn group_rows(rows: Vec<Row>) -> Result<Vec<JobEvent>> {
     let mut events: Vec<JobEvent> = Vec::new();
     for Row { seq, at, state, attempt, reason, name, step, value } in rows {
         let (id, at) = (seq as u64, timestamp(at)?);
         if let Some(state) = state {
-            let what = Happened::State { state: JobState::read(&state)?, attempt: attempt as u32, reason, at };
-            events.push(JobEvent { id, what });
+            let kind = JobEventKind::State { state: JobState::from_column(&state)?, attempt: attempt as u32, reason, at };
+            events.push(JobEvent { id, kind });
             continue;
         }
         let row = MetricRow { name, step: step as u64, value, at };
         match events.last_mut() {
-            Some(JobEvent { id: last, what: Happened::Metrics(rows) }) if *last == id => rows.push(row),
-            _ => events.push(JobEvent { id, what: Happened::Metrics(vec![row]) }),
+            Some(JobEvent { id: last, kind: JobEventKind::Metrics(rows) }) if *last == id => rows.push(row),
+            _ => events.push(JobEvent { id, kind: JobEventKind::Metrics(vec![row]) }),
         }
     }
     Ok(events)

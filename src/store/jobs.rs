@@ -1,4 +1,4 @@
-//! Jobs as records: what was asked, which state it is in, and the rules by which states change.
+//! Jobs: their specifications, their states, and the rules by which states change.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -13,13 +13,13 @@ use uuid::Uuid;
 use super::{Error, Result, Store, corrupt, timestamp};
 use crate::recipe::{Algorithm, Preset, TrainConfig};
 
-/// Names a job for ever.
+/// Identifies a job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
 #[serde(transparent)]
 pub struct JobId(pub Uuid);
 
 impl JobId {
-    /// The id written as `text`, in its usual form only.
+    /// Parses an id in its canonical form: lower case, with hyphens.
     pub fn parse(text: &str) -> Option<Self> {
         let id = Uuid::try_parse(text).ok()?;
         (id.to_string() == text).then_some(Self(id))
@@ -32,8 +32,8 @@ impl fmt::Display for JobId {
     }
 }
 
-/// An enum stored, sent and shown by name.
-macro_rules! named {
+/// Defines an enum whose values are stored and sent by name.
+macro_rules! named_enum {
     ($(#[$doc:meta])* $type:ident { $($(#[$variant_doc:meta])* $variant:ident = $name:tt,)+ }) => {
         $(#[$doc])*
         #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize, utoipa::ToSchema)]
@@ -45,19 +45,19 @@ macro_rules! named {
             /// All names.
             pub const NAMES: &[&str] = &[$($name),+];
 
-            /// Its name.
+            /// The name of this value.
             pub fn as_str(self) -> &'static str {
                 match self { $(Self::$variant => $name,)+ }
             }
 
-            /// The one called `name`.
+            /// The value called `name`.
             pub fn parse(name: &str) -> Option<Self> {
                 match name { $($name => Some(Self::$variant),)+ _ => None }
             }
 
-            /// The one called `name` in the database.
-            #[allow(dead_code, reason = "some are only written")]
-            pub(super) fn read(name: &str) -> crate::store::Result<Self> {
+            /// Parses a name from the database.
+            #[allow(dead_code, reason = "some types are only written")]
+            pub(super) fn from_column(name: &str) -> crate::store::Result<Self> {
                 Self::parse(name).ok_or_else(|| crate::store::corrupt(stringify!($type), name, "unknown"))
             }
         }
@@ -69,9 +69,9 @@ macro_rules! named {
         }
     };
 }
-pub(super) use named;
+pub(super) use named_enum;
 
-named! {
+named_enum! {
     /// What a job does.
     JobKind {
         /// Trains a policy.
@@ -83,55 +83,55 @@ named! {
     }
 }
 
-named! {
-    /// Where a job is in its life.
+named_enum! {
+    /// The state of a job.
     JobState {
-        /// Waits for its turn.
+        /// Waits to be started.
         Queued = "queued",
-        /// Has a worker.
+        /// A worker works on it.
         Running = "running",
         /// Waits to be resumed.
         Paused = "paused",
-        /// Ended because somebody said so.
+        /// Ended by a cancel.
         Cancelled = "cancelled",
-        /// Ended with all done.
+        /// Ended with all steps done.
         Succeeded = "succeeded",
-        /// Ended because its attempts failed.
+        /// Ended because too many attempts failed.
         Failed = "failed",
     }
 }
 
 impl JobState {
-    /// Whether nothing will change any more.
+    /// Whether the state is final.
     pub fn ended(self) -> bool {
         matches!(self, Self::Cancelled | Self::Succeeded | Self::Failed)
     }
 }
 
-named! {
-    /// What a running job was asked for.
-    Wanted {
-        /// To end.
+named_enum! {
+    /// An action on a running job that its worker has not carried out yet.
+    PendingAction {
+        /// End the job.
         Cancel = "cancel",
-        /// To make room.
+        /// Stop the worker and keep its snapshot.
         Pause = "pause",
     }
 }
 
-/// What a job was asked to do, every default filled in.
+/// The specification of a job, with all defaults filled in.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct JobSpec {
-    /// What it does.
+    /// What the job does.
     pub kind: JobKind,
-    /// Name for people, and of the policy it publishes.
+    /// Display name, and name of the policy that the job publishes.
     pub name: Option<String>,
-    /// Labels for people.
+    /// Labels, which the server does not interpret.
     pub labels: BTreeMap<String, String>,
-    /// Threads it may use.
+    /// Threads that the worker may use.
     pub threads: usize,
-    /// Higher goes first.
+    /// Jobs with a higher priority start first.
     pub priority: i64,
-    /// The whole training configuration.
+    /// The complete training configuration.
     pub config: TrainConfig,
 }
 
@@ -185,31 +185,31 @@ pub type JobSummary = Job<SpecSummary>;
 pub struct Job<S = JobSpec> {
     /// Its name for ever.
     pub id: JobId,
-    /// Order of arrival.
+    /// Key of the record; jobs submitted later have larger numbers.
     pub number: i64,
-    /// Where it is in its life.
+    /// The state.
     pub state: JobState,
-    /// What it was asked for and has not done yet.
-    pub wanted: Option<Wanted>,
-    /// Why it failed, or what became of its last attempt.
+    /// Action that the worker has not carried out yet.
+    pub pending_action: Option<PendingAction>,
+    /// Why the job, or its last attempt, failed.
     pub reason: Option<String>,
-    /// What it does.
+    /// The specification.
     pub spec: S,
-    /// Attempts begun.
+    /// Number of attempts that have begun.
     pub attempts: u32,
-    /// Attempts that failed.
+    /// Number of attempts that have failed.
     pub failures: u32,
     /// Environment steps done.
     pub step: u64,
-    /// `NAME:VERSION` it was published as.
+    /// `NAME:VERSION` of the published policy.
     pub policy: Option<String>,
-    /// Number of its newest event.
+    /// Id of the newest event.
     pub last_event: u64,
-    /// When it was submitted.
+    /// When the job was submitted.
     pub created_at: Timestamp,
-    /// When its first attempt began.
+    /// When the first attempt began.
     pub started_at: Option<Timestamp>,
-    /// When it ended.
+    /// When the job ended.
     pub ended_at: Option<Timestamp>,
 }
 
@@ -217,13 +217,13 @@ impl Job {
     /// The job as lists return it, and the configuration that they leave out.
     pub fn split(self) -> (JobSummary, TrainConfig) {
         let spec = SpecSummary::from(&self.spec);
-        let Self { spec: JobSpec { config, .. }, id, number, state, wanted, reason, attempts, failures, .. } = self;
+        let Self { spec: JobSpec { config, .. }, id, number, state, pending_action, reason, attempts, failures, .. } = self;
         let Self { step, policy, last_event, created_at, started_at, ended_at, .. } = self;
         let summary = Job {
             id,
             number,
             state,
-            wanted,
+            pending_action,
             reason,
             spec,
             attempts,
@@ -264,8 +264,8 @@ impl<S: DeserializeOwned> TryFrom<JobRow> for Job<S> {
         Ok(Self {
             id: JobId::parse(&row.id).ok_or_else(|| corrupt("job", &row.id, "not an id"))?,
             number: row.number,
-            state: JobState::read(&row.state)?,
-            wanted: row.wanted.as_deref().map(Wanted::read).transpose()?,
+            state: JobState::from_column(&row.state)?,
+            pending_action: row.wanted.as_deref().map(PendingAction::from_column).transpose()?,
             reason: row.reason,
             spec: serde_json::from_str(&row.spec).map_err(|e| corrupt("job", &row.id, e))?,
             attempts: row.attempts as u32,
@@ -280,55 +280,55 @@ impl<S: DeserializeOwned> TryFrom<JobRow> for Job<S> {
     }
 }
 
-/// A job to be.
+/// A job to submit.
 #[derive(Clone, Debug)]
 pub struct NewJob {
-    /// Its name.
+    /// The id.
     pub id: JobId,
-    /// What it does.
+    /// The specification.
     pub spec: JobSpec,
-    /// When it was submitted.
+    /// The current time.
     pub now: Timestamp,
-    /// The sender's key, and the SHA-256 of what came with it.
+    /// The idempotency key of the request, and the SHA-256 of its body.
     pub idempotency: Option<(String, [u8; 32])>,
 }
 
-/// What became of a submission.
+/// The result of a submission.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Submitted {
-    /// It is in the queue.
-    New(Job),
-    /// It was submitted before, under the same key.
-    Again(Job),
-    /// The key came before with another body.
+pub enum SubmitResult {
+    /// The job was created and queued.
+    Created(Job),
+    /// A job with the same idempotency key and body exists.
+    Existing(Job),
+    /// A job with the same idempotency key and another body exists.
     Conflict,
 }
 
-/// What somebody wants of a job.
+/// An action of a user on a job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Verb {
-    /// End it.
+pub enum JobAction {
+    /// End the job.
     Cancel,
-    /// Take it off the machine.
+    /// Stop the job's worker until the job is resumed.
     Pause,
-    /// Put it back into the queue.
+    /// Queue a paused job again.
     Resume,
-    /// Forget it.
+    /// Delete the record of a job that has ended.
     Delete,
 }
 
-/// What became of a verb.
+/// The result of a [`JobAction`].
 #[derive(Clone, Debug, PartialEq)]
-pub enum Changed {
-    /// Done, or begun; the job as it is now.
-    Done(Box<Job>),
-    /// Not in this state.
-    Refused(Box<Job>),
+pub enum ActionResult {
+    /// The action is done or begun; the job after it.
+    Accepted(Box<Job>),
+    /// The state of the job does not allow the action.
+    WrongState(Box<Job>),
     /// There is no such job.
-    Missing,
+    NotFound,
 }
 
-/// A change of state, with what the event log needs.
+/// A change of state and its entry in the event log.
 pub(super) struct Transition<'a> {
     pub(super) job: i64,
     pub(super) to: JobState,
@@ -337,7 +337,7 @@ pub(super) struct Transition<'a> {
     pub(super) now: Timestamp,
 }
 
-/// Moves a job to another state and says so in its events. A job that ends keeps no snapshot.
+/// Moves a job to another state and appends an event. Deletes the snapshot of a job that ends.
 pub(super) async fn transition(db: &mut SqliteConnection, t: Transition<'_>) -> Result<()> {
     let now = t.now.as_millisecond();
     let ended = t.to.ended().then_some(now);
@@ -362,46 +362,46 @@ pub(super) async fn find(db: &mut SqliteConnection, id: JobId) -> Result<Option<
     row.map(Job::try_from).transpose()
 }
 
-async fn known(db: &mut SqliteConnection, id: JobId) -> Result<Job> {
-    find(db, id).await?.ok_or_else(|| corrupt("job", id, "vanished within a transaction"))
+async fn get_existing(db: &mut SqliteConnection, id: JobId) -> Result<Job> {
+    find(db, id).await?.ok_or_else(|| corrupt("job", id, "deleted within a transaction"))
 }
 
 impl Store {
-    /// Puts a job into the queue; committed when this returns.
+    /// Queues a job.
     ///
     /// # Errors
-    /// The database.
-    pub async fn submit_job(&self, new: NewJob) -> Result<Submitted> {
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn submit_job(&self, new: NewJob) -> Result<SubmitResult> {
         let mut tx = self.begin().await?;
         if let Some((key, body)) = &new.idempotency {
             let sql = "SELECT k.body, j.id FROM idempotency_keys k JOIN jobs j ON j.number = k.job WHERE k.key = ?";
             let first: Option<(Vec<u8>, String)> = sqlx::query_as(sql).bind(key).fetch_optional(&mut *tx).await?;
             if let Some((first, id)) = first {
                 if first != body {
-                    return Ok(Submitted::Conflict);
+                    return Ok(SubmitResult::Conflict);
                 }
                 let id = JobId::parse(&id).ok_or_else(|| corrupt("job", &id, "not an id"))?;
-                return Ok(Submitted::Again(known(&mut tx, id).await?));
+                return Ok(SubmitResult::Existing(get_existing(&mut tx, id).await?));
             }
         }
         let job = insert(&mut tx, &new).await?;
         tx.commit().await?;
-        Ok(Submitted::New(job))
+        Ok(SubmitResult::Created(job))
     }
 
     /// The job `id`.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn job(&self, id: JobId) -> Result<Option<Job>> {
         find(&mut *self.read.acquire().await?, id).await
     }
 
-    /// Summaries of jobs, newest first: those in `state`, older than number `before`; and whether there are more than fit. At
-    /// most `limit` of them, and no more than take about `max_bytes`, but at least one.
+    /// Summaries of jobs, newest first: those in `state`, with numbers below `before`; and whether there are more. At most
+    /// `limit` summaries of together about `max_bytes` bytes, but at least one.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn job_summaries(
         &self,
         state: Option<JobState>,
@@ -409,7 +409,7 @@ impl Store {
         limit: usize,
         max_bytes: usize,
     ) -> Result<(Vec<JobSummary>, bool)> {
-        /// What a summary takes besides its texts.
+        /// Bytes of a summary besides its texts.
         const FIXED: usize = 512;
         let sql =
             "SELECT number, id, state, wanted, reason, attempts, failures, step, policy, seq, created_at, started_at, ended_at,
@@ -429,59 +429,60 @@ impl Store {
         Ok((jobs, false))
     }
 
-    /// How many jobs there are in each state.
+    /// The number of jobs in each state.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn job_counts(&self) -> Result<Vec<(JobState, u64)>> {
         let sql = "SELECT state, count(*) FROM jobs GROUP BY state";
         let rows: Vec<(String, i64)> = sqlx::query_as(sql).fetch_all(&self.read).await?;
         let count = |name: &str| rows.iter().find(|(state, _)| state == name).map_or(0, |(_, count)| *count as u64);
-        JobState::NAMES.iter().map(|name| Ok((JobState::read(name)?, count(name)))).collect()
+        JobState::NAMES.iter().map(|name| Ok((JobState::from_column(name)?, count(name)))).collect()
     }
 
-    /// The job whose turn it is: highest priority, then first come.
+    /// The queued job that starts next: highest priority, then first come, first served.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn head_of_queue(&self) -> Result<Option<Job>> {
         let sql = "SELECT * FROM jobs WHERE state = 'queued' ORDER BY priority DESC, number LIMIT 1";
         let row: Option<JobRow> = sqlx::query_as(sql).fetch_optional(&self.read).await?;
         row.map(Job::try_from).transpose()
     }
 
-    /// Does what `verb` says, if the job's state allows it; a running job is marked and changes when its worker has stopped.
+    /// Applies `action` if the state of the job allows it. A running job gets a pending action and changes when its worker
+    /// has stopped.
     ///
     /// # Errors
-    /// The database.
-    pub async fn change_job(&self, id: JobId, verb: Verb, now: Timestamp) -> Result<Changed> {
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn change_job(&self, id: JobId, action: JobAction, now: Timestamp) -> Result<ActionResult> {
         use JobState::{Cancelled, Paused, Queued, Running};
         let mut tx = self.begin().await?;
-        let Some(job) = find(&mut tx, id).await? else { return Ok(Changed::Missing) };
-        match (verb, job.state, job.wanted) {
-            (Verb::Cancel, Cancelled, _)
-            | (Verb::Cancel, Running, Some(Wanted::Cancel))
-            | (Verb::Pause, Paused, _)
-            | (Verb::Pause, Running, Some(Wanted::Pause))
-            | (Verb::Resume, Queued, _)
-            | (Verb::Resume, Running, None) => return Ok(Changed::Done(Box::new(job))),
-            (Verb::Cancel, Queued | Paused, _) => change_now(&mut tx, &job, Cancelled, now).await?,
-            (Verb::Pause, Queued, _) => change_now(&mut tx, &job, Paused, now).await?,
-            (Verb::Resume, Paused, _) => change_now(&mut tx, &job, Queued, now).await?,
-            (Verb::Cancel, Running, _) => mark(&mut tx, &job, Wanted::Cancel).await?,
-            (Verb::Pause, Running, None) => mark(&mut tx, &job, Wanted::Pause).await?,
-            (Verb::Delete, state, _) if state.ended() => {
+        let Some(job) = find(&mut tx, id).await? else { return Ok(ActionResult::NotFound) };
+        match (action, job.state, job.pending_action) {
+            (JobAction::Cancel, Cancelled, _)
+            | (JobAction::Cancel, Running, Some(PendingAction::Cancel))
+            | (JobAction::Pause, Paused, _)
+            | (JobAction::Pause, Running, Some(PendingAction::Pause))
+            | (JobAction::Resume, Queued, _)
+            | (JobAction::Resume, Running, None) => return Ok(ActionResult::Accepted(Box::new(job))),
+            (JobAction::Cancel, Queued | Paused, _) => transition_now(&mut tx, &job, Cancelled, now).await?,
+            (JobAction::Pause, Queued, _) => transition_now(&mut tx, &job, Paused, now).await?,
+            (JobAction::Resume, Paused, _) => transition_now(&mut tx, &job, Queued, now).await?,
+            (JobAction::Cancel, Running, _) => set_pending_action(&mut tx, &job, PendingAction::Cancel).await?,
+            (JobAction::Pause, Running, None) => set_pending_action(&mut tx, &job, PendingAction::Pause).await?,
+            (JobAction::Delete, state, _) if state.ended() => {
                 sqlx::query("DELETE FROM jobs WHERE number = ?").bind(job.number).execute(&mut *tx).await?;
                 tx.commit().await?;
-                self.ring(job.number);
-                return Ok(Changed::Done(Box::new(job)));
+                self.notify(job.number);
+                return Ok(ActionResult::Accepted(Box::new(job)));
             }
-            _ => return Ok(Changed::Refused(Box::new(job))),
+            _ => return Ok(ActionResult::WrongState(Box::new(job))),
         }
-        let job = known(&mut tx, id).await?;
+        let job = get_existing(&mut tx, id).await?;
         tx.commit().await?;
-        self.ring(job.number);
-        Ok(Changed::Done(Box::new(job)))
+        self.notify(job.number);
+        Ok(ActionResult::Accepted(Box::new(job)))
     }
 }
 
@@ -503,15 +504,15 @@ async fn insert(tx: &mut Transaction<'_, Sqlite>, new: &NewJob) -> Result<Job> {
         let sql = "INSERT INTO idempotency_keys (key, body, job, created_at) VALUES (?, ?, ?, ?)";
         sqlx::query(sql).bind(key).bind(body.as_slice()).bind(number).bind(now).execute(&mut **tx).await?;
     }
-    known(tx, new.id).await
+    get_existing(tx, new.id).await
 }
 
-async fn change_now(tx: &mut Transaction<'_, Sqlite>, job: &Job, to: JobState, now: Timestamp) -> Result<()> {
+async fn transition_now(tx: &mut Transaction<'_, Sqlite>, job: &Job, to: JobState, now: Timestamp) -> Result<()> {
     transition(tx, Transition { job: job.number, to, attempt: job.attempts, reason: None, now }).await
 }
 
-async fn mark(tx: &mut Transaction<'_, Sqlite>, job: &Job, wanted: Wanted) -> Result<()> {
+async fn set_pending_action(tx: &mut Transaction<'_, Sqlite>, job: &Job, action: PendingAction) -> Result<()> {
     let sql = "UPDATE jobs SET wanted = ? WHERE number = ?";
-    sqlx::query(sql).bind(wanted.as_str()).bind(job.number).execute(&mut **tx).await?;
+    sqlx::query(sql).bind(action.as_str()).bind(job.number).execute(&mut **tx).await?;
     Ok(())
 }

@@ -1,37 +1,37 @@
-//! API keys: digests of their secrets and what they open.
+//! API keys: the digests of their secrets, their scopes and their limits.
 
 use jiff::Timestamp;
-use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
+use sqlx::{Row, SqliteConnection};
 
 use super::{Result, Store, corrupt, timestamp};
 
-/// An API key as it is kept.
+/// An API key as stored.
 #[derive(Clone, Debug, PartialEq)]
 pub struct KeyRecord {
-    /// Public name.
+    /// Public id.
     pub id: String,
-    /// What its owner calls it.
+    /// Display name.
     pub name: String,
     /// SHA-256 of the secret.
     pub digest: [u8; 32],
-    /// What it opens: names separated by commas.
+    /// Scopes: names separated by commas.
     pub scopes: String,
-    /// Requests per second; absent: the server's default.
+    /// Requests per second; `None` is the server's default.
     pub rate: Option<f64>,
-    /// Requests at once; absent: as many as one second allows.
+    /// Requests at once; `None` is as many as one second allows.
     pub burst: Option<f64>,
-    /// When it was made.
+    /// When it was created.
     pub created_at: Timestamp,
-    /// When it ends by itself.
+    /// When it expires.
     pub expires_at: Option<Timestamp>,
     /// When it was revoked.
     pub revoked_at: Option<Timestamp>,
-    /// When it was last shown, to within the time between two writes of it.
+    /// When it was last used. Written from time to time.
     pub last_used_at: Option<Timestamp>,
 }
 
-/// The revision that a change of a key gets, as SQL.
+/// SQL of the revision that the next change of a key gets.
 macro_rules! next_revision {
     () => {
         "(SELECT COALESCE(MAX(revision), 0) + 1 FROM api_keys)"
@@ -39,54 +39,61 @@ macro_rules! next_revision {
 }
 
 impl Store {
-    /// Keeps a new key; false when the id is taken.
+    /// Stores a new key. Returns false if its id is taken.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn insert_key(&self, key: &KeyRecord) -> Result<bool> {
-        let sql = concat!(
-            "INSERT INTO api_keys (id, name, digest, scopes, rate, burst, created_at, expires_at, revision)
-             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ",
-            next_revision!(),
-            ") ON CONFLICT (id) DO NOTHING"
-        );
-        let done = sqlx::query(sql)
-            .bind(&key.id)
-            .bind(&key.name)
-            .bind(key.digest.as_slice())
-            .bind(&key.scopes)
-            .bind(key.rate)
-            .bind(key.burst)
-            .bind(key.created_at.as_millisecond())
-            .bind(key.expires_at.map(Timestamp::as_millisecond))
-            .execute(&self.write)
-            .await?;
-        Ok(done.rows_affected() == 1)
+        let mut tx = self.begin().await?;
+        let inserted = insert(&mut tx, key).await?;
+        tx.commit().await?;
+        Ok(inserted)
     }
 
-    /// All keys, in the order in which they were made.
+    /// Stores a new key and lets the key `old` expire at `expires_at`, unless it expires earlier, in one transaction. Returns
+    /// false, and changes nothing, if `old` is not active at the creation of `new` or the id of `new` is taken.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn rotate_key(&self, old: &str, new: &KeyRecord, expires_at: Timestamp) -> Result<bool> {
+        let mut tx = self.begin().await?;
+        let sql = concat!(
+            "UPDATE api_keys SET expires_at = MIN(COALESCE(expires_at, ?1), ?1), revision = ",
+            next_revision!(),
+            " WHERE id = ?2 AND revoked_at IS NULL AND (expires_at IS NULL OR expires_at > ?3)"
+        );
+        let update = sqlx::query(sql).bind(expires_at.as_millisecond()).bind(old).bind(new.created_at.as_millisecond());
+        let expires = update.execute(&mut *tx).await?.rows_affected() == 1;
+        let rotated = expires && insert(&mut tx, new).await?;
+        if rotated {
+            tx.commit().await?;
+        }
+        Ok(rotated)
+    }
+
+    /// All keys, oldest first.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
     pub async fn keys(&self) -> Result<Vec<KeyRecord>> {
         let sql = "SELECT id, name, digest, scopes, rate, burst, created_at, expires_at, revoked_at, last_used_at
                    FROM api_keys ORDER BY created_at, id";
         sqlx::query(sql).fetch_all(&self.read).await?.iter().map(read).collect()
     }
 
-    /// A number that changes whenever a key is made, revoked or given another end; 0 while there is none.
+    /// A number that increases whenever a key is created, revoked, or gets another expiry; 0 without keys.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn keys_revision(&self) -> Result<i64> {
         let row = sqlx::query("SELECT COALESCE(MAX(revision), 0) FROM api_keys").fetch_one(&self.read).await?;
         Ok(row.try_get(0)?)
     }
 
-    /// Revokes a key at `now`; false when there is none. One that is revoked already stays as it is.
+    /// Revokes a key at `now`. A revoked key keeps its time. Returns false if there is no such key.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn revoke_key(&self, id: &str, now: Timestamp) -> Result<bool> {
         let sql =
             concat!("UPDATE api_keys SET revoked_at = COALESCE(revoked_at, ?), revision = ", next_revision!(), " WHERE id = ?");
@@ -94,24 +101,10 @@ impl Store {
         Ok(done.rows_affected() == 1)
     }
 
-    /// Lets a key end at `at` if it does not end before.
+    /// Stores when keys were last used.
     ///
     /// # Errors
-    /// The database.
-    pub async fn end_key(&self, id: &str, at: Timestamp) -> Result<()> {
-        let sql = concat!(
-            "UPDATE api_keys SET expires_at = MIN(COALESCE(expires_at, ?1), ?1), revision = ",
-            next_revision!(),
-            " WHERE id = ?2"
-        );
-        sqlx::query(sql).bind(at.as_millisecond()).bind(id).execute(&self.write).await?;
-        Ok(())
-    }
-
-    /// Notes when keys were last used.
-    ///
-    /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn touch_keys(&self, used: &[(String, Timestamp)]) -> Result<()> {
         let mut tx = self.begin().await?;
         for (id, at) in used {
@@ -122,10 +115,31 @@ impl Store {
     }
 }
 
+async fn insert(db: &mut SqliteConnection, key: &KeyRecord) -> Result<bool> {
+    let sql = concat!(
+        "INSERT INTO api_keys (id, name, digest, scopes, rate, burst, created_at, expires_at, revision)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ",
+        next_revision!(),
+        ") ON CONFLICT (id) DO NOTHING"
+    );
+    let done = sqlx::query(sql)
+        .bind(&key.id)
+        .bind(&key.name)
+        .bind(key.digest.as_slice())
+        .bind(&key.scopes)
+        .bind(key.rate)
+        .bind(key.burst)
+        .bind(key.created_at.as_millisecond())
+        .bind(key.expires_at.map(Timestamp::as_millisecond))
+        .execute(&mut *db)
+        .await?;
+    Ok(done.rows_affected() == 1)
+}
+
 fn read(row: &SqliteRow) -> Result<KeyRecord> {
     let id: String = row.try_get("id")?;
     let digest: Vec<u8> = row.try_get("digest")?;
-    let digest = digest.try_into().map_err(|_| corrupt("API key", &id, "its digest has not 32 bytes"))?;
+    let digest = digest.try_into().map_err(|_| corrupt("API key", &id, "its digest does not have 32 bytes"))?;
     let time = |column| row.try_get::<Option<i64>, _>(column)?.map(timestamp).transpose();
     Ok(KeyRecord {
         digest,

@@ -1,57 +1,57 @@
-//! Figures over a job's steps. A row is (job, name, step): reporting it again replaces it, so that work done again after a
-//! crash neither misses nor doubles a row.
+//! Metrics of jobs, keyed by job, name and step. Reporting a key again replaces its value, so work that is repeated after a
+//! crash neither loses nor duplicates a row.
 
 use jiff::Timestamp;
 
-use super::attempts::live;
+use super::attempts::is_active;
 use super::{JobId, Lease, Result, Store, timestamp};
 
-/// A figure as a worker reports it.
+/// A metric as a worker reports it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Metric {
-    /// As `eval/mean_aoi`.
+    /// Name, as `eval/mean_aoi`.
     pub name: String,
-    /// Environment steps.
+    /// Environment steps of training.
     pub step: u64,
-    /// The figure; what is not finite is kept as unknown.
+    /// The value. Stored as NULL if it is not finite.
     pub value: f64,
 }
 
-/// A figure as it is kept.
+/// A metric as stored.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MetricRow {
-    /// As `eval/mean_aoi`.
+    /// Name, as `eval/mean_aoi`.
     pub name: String,
-    /// Environment steps.
+    /// Environment steps of training.
     pub step: u64,
-    /// Absent where it was not finite.
+    /// The value; `None` if it was not finite.
     pub value: Option<f64>,
-    /// When it was reported.
+    /// When the value was reported first.
     pub at: Timestamp,
 }
 
-/// The last row of a page; the next begins behind it.
+/// The last row of a page; the next page begins after it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MetricCursor {
-    /// Its name.
+    /// Name of the row.
     pub name: String,
-    /// Its step.
+    /// Step of the row.
     pub step: u64,
 }
 
 impl Store {
-    /// Commits metrics and progress together; false when the lease lasts no longer.
+    /// Stores metrics and progress in one transaction. Returns false if the attempt has ended.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn report(&self, lease: Lease, metrics: &[Metric], step: u64, now: Timestamp) -> Result<bool> {
         let mut tx = self.begin().await?;
-        if !live(&mut tx, lease).await? {
+        if !is_active(&mut tx, lease).await? {
             return Ok(false);
         }
         let sql = "UPDATE jobs SET step = ?, seq = seq + 1 WHERE number = ? RETURNING seq";
         let seq: i64 = sqlx::query_scalar(sql).bind(step as i64).bind(lease.job).fetch_one(&mut *tx).await?;
-        // What is told again as it was stays where it was told first.
+        // A repeated value keeps the event of its first report.
         let sql = "INSERT INTO metrics (job, name, step, value, at, seq) VALUES (?, ?, ?, ?, ?, ?)
                    ON CONFLICT (job, name, step) DO UPDATE SET value = excluded.value, at = excluded.at, seq = excluded.seq
                    WHERE value IS NOT excluded.value";
@@ -67,14 +67,14 @@ impl Store {
                 .await?;
         }
         tx.commit().await?;
-        self.ring(lease.job);
+        self.notify(lease.job);
         Ok(true)
     }
 
-    /// Metrics of a job by name and step: those called `name`, behind `after`, at most `limit`.
+    /// At most `limit` metrics of a job by name and step: those called `name`, after `after`.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn metrics(
         &self,
         id: JobId,

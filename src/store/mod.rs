@@ -1,4 +1,5 @@
-//! The only SQL: one SQLite file in WAL mode, one writer, embedded migrations. What was acknowledged survives `kill -9`.
+//! The database: all SQL of the program. One SQLite file in WAL mode, one writer, embedded migrations. Every method returns
+//! after its change is on the disk, so acknowledged changes survive `kill -9`.
 
 mod attempts;
 mod checkpoints;
@@ -10,15 +11,17 @@ mod policies;
 mod promotions;
 mod snapshots;
 
-pub use attempts::{Attempt, Ending, Lease, LeaseRecord, Outcome};
+pub use attempts::{Attempt, AttemptOutcome, AttemptResult, EndedAttempt, Lease, LeaseRecord};
 pub use checkpoints::{Checkpoint, CheckpointKind, NewCheckpoint};
-pub use events::{Happened, JobEvent};
-pub use jobs::{Changed, Job, JobId, JobKind, JobSpec, JobState, JobSummary, NewJob, SpecSummary, Submitted, Verb, Wanted};
+pub use events::{JobEvent, JobEventKind};
+pub use jobs::{
+    ActionResult, Job, JobAction, JobId, JobKind, JobSpec, JobState, JobSummary, NewJob, PendingAction, SpecSummary, SubmitResult,
+};
 pub use keys::KeyRecord;
 pub use metrics::{Metric, MetricCursor, MetricRow};
 pub use policies::{NewPolicyVersion, PolicyVersion, PublishedPolicy};
 pub use promotions::{AliasMove, PolicyAlias, Promotion, PromotionFilter};
-pub use snapshots::{OpenSnapshot, Snapshot};
+pub use snapshots::{PartialSnapshot, Snapshot};
 
 use std::path::Path;
 use std::sync::Arc;
@@ -33,16 +36,16 @@ static MIGRATIONS: sqlx::migrate::Migrator = sqlx::migrate!("./migrations");
 /// Name of the database file inside the data directory.
 pub const FILE: &str = "qedgix.sqlite";
 
-/// Why the database did not do as told.
+/// Why an operation on the database failed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// SQLite or the disk.
+    /// SQLite or the disk failed.
     #[error("database: {0}")]
     Sqlx(#[from] sqlx::Error),
-    /// The file was written by another version.
+    /// The file cannot be migrated, for example because a newer version has written it.
     #[error("database migration: {0}")]
     Migrate(#[from] sqlx::migrate::MigrateError),
-    /// What is stored does not read as what was written.
+    /// A stored record cannot be parsed.
     #[error("database holds an unreadable {what}: {reason}")]
     Corrupt {
         /// Which record.
@@ -55,35 +58,35 @@ pub enum Error {
 /// Handle to the database; cheap to clone.
 #[derive(Clone, Debug)]
 pub struct Store {
-    /// Readers; WAL lets them go on while somebody writes.
+    /// Connections for reading. In WAL mode they do not wait for the writer.
     read: SqlitePool,
-    /// A single connection: writers queue here instead of meeting `SQLITE_BUSY`.
+    /// A single connection for writing: writers queue for it instead of failing with `SQLITE_BUSY`.
     write: SqlitePool,
-    bells: Arc<events::Bells>,
+    notifier: Arc<events::Notifier>,
 }
 
 impl Store {
-    /// Opens (and creates or migrates) the database in `data_dir`, which exists.
+    /// Opens the database in the existing directory `data_dir`. Creates and migrates it when needed.
     ///
     /// # Errors
-    /// The file cannot be opened or was migrated by a newer version.
+    /// [`Error::Sqlx`] when the file cannot be opened; [`Error::Migrate`] when a newer version has migrated it.
     pub async fn open(data_dir: &Path) -> Result<Self, Error> {
         let options = SqliteConnectOptions::new()
             .filename(data_dir.join(FILE))
             .create_if_missing(true)
             .journal_mode(SqliteJournalMode::Wal)
-            // FULL: a commit is on the disk before it is acknowledged.
+            // FULL: a commit is on the disk when it returns.
             .synchronous(SqliteSynchronous::Full)
             .foreign_keys(true)
             .busy_timeout(Duration::from_secs(10));
         let write = SqlitePoolOptions::new().max_connections(1).connect_with(options.clone()).await?;
         MIGRATIONS.run(&write).await?;
         let read = SqlitePoolOptions::new().max_connections(4).connect_with(options.read_only(true)).await?;
-        Ok(Self { read, write, bells: Arc::new(events::Bells::new()) })
+        Ok(Self { read, write, notifier: Arc::new(events::Notifier::new()) })
     }
 
-    /// A transaction that writes. It takes the lock at once: one that reads first and finds that another process (`qedgix keys`)
-    /// wrote meanwhile could not go on.
+    /// Begins a transaction that writes. It takes the lock at once: a transaction that first reads fails at its first write
+    /// if another process (`qedgix keys`) has written meanwhile.
     async fn begin(&self) -> Result<Transaction<'static, Sqlite>> {
         Ok(self.write.begin_with("BEGIN IMMEDIATE").await?)
     }

@@ -7,46 +7,46 @@ use sqlx::{Row, SqliteConnection};
 use super::promotions::{AliasMove, move_alias};
 use super::{Error, Store};
 
-/// A published version, with the checkpoint's bytes.
+/// A published version with its checkpoint.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PolicyVersion {
     /// Name of the policy.
     pub name: String,
-    /// From 1, one more for each new checkpoint.
+    /// Number of the version: 1, 2, ...
     pub version: u64,
     /// SHA-256 of `checkpoint`, in hexadecimal.
     pub digest: String,
-    /// Safetensors.
+    /// The checkpoint, as safetensors.
     pub checkpoint: Vec<u8>,
-    /// Milliseconds since the epoch.
+    /// When it was published, in milliseconds since the Unix epoch.
     pub created_at: i64,
 }
 
-/// What to publish.
+/// A version to publish.
 #[derive(Clone, Copy, Debug)]
 pub struct NewPolicyVersion<'a> {
-    /// Name of the policy, new or known.
+    /// Name of the policy; it may be new.
     pub name: &'a str,
     /// SHA-256 of `checkpoint`, in hexadecimal.
     pub digest: &'a str,
-    /// Safetensors.
+    /// The checkpoint, as safetensors.
     pub checkpoint: &'a [u8],
-    /// When.
+    /// The current time.
     pub now: Timestamp,
-    /// An alias that shall mean it.
+    /// An alias to point to the version.
     pub alias: Option<&'a str>,
-    /// Who does it, where that is known.
+    /// Id of the caller's API key.
     pub by: Option<&'a str>,
 }
 
-/// What became of it.
+/// The result of a publication.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PublishedPolicy {
-    /// The version's number.
+    /// Number of the version.
     pub version: u64,
-    /// When it was published, in milliseconds since the epoch.
+    /// When it was published, in milliseconds since the Unix epoch.
     pub created_at: i64,
-    /// Whether the name had no version of these bytes before.
+    /// Whether the version is new: the policy had none with this checkpoint.
     pub new: bool,
 }
 
@@ -54,16 +54,17 @@ impl Store {
     /// Checks that the database answers.
     ///
     /// # Errors
-    /// It does not.
+    /// [`Error`] when the database fails.
     pub async fn ping(&self) -> Result<(), Error> {
         sqlx::query("SELECT 1").execute(&self.read).await?;
         Ok(())
     }
 
-    /// Stores a new version, unless the name has one of this digest, and moves the alias to it, all or nothing.
+    /// Publishes a checkpoint as a new version, or finds the version of the policy with this digest, and moves the alias to
+    /// it, in one transaction.
     ///
     /// # Errors
-    /// The database fails.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn publish_policy(&self, new: NewPolicyVersion<'_>) -> Result<PublishedPolicy, Error> {
         let mut tx = self.begin().await?;
         let sql = "SELECT version, created_at FROM policy_versions WHERE name = ? AND digest = ?";
@@ -80,19 +81,19 @@ impl Store {
         Ok(published)
     }
 
-    /// Names and numbers of all published versions.
+    /// Names and numbers of all versions.
     ///
     /// # Errors
-    /// The database fails.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn policy_versions(&self) -> Result<Vec<(String, u64)>, Error> {
         let rows = sqlx::query("SELECT name, version FROM policy_versions ORDER BY name, version").fetch_all(&self.read).await?;
         rows.iter().map(|row| Ok((row.try_get(0)?, row.try_get::<i64, _>(1)? as u64))).collect()
     }
 
-    /// A published version with its checkpoint, if there is one.
+    /// The version `version` of policy `name`.
     ///
     /// # Errors
-    /// The database fails.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn policy_version(&self, name: &str, version: u64) -> Result<Option<PolicyVersion>, Error> {
         let query = "SELECT name, version, digest, checkpoint, created_at FROM policy_versions WHERE name = ? AND version = ?";
         let row = sqlx::query(query).bind(name).bind(version as i64).fetch_optional(&self.read).await?;

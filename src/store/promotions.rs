@@ -1,50 +1,51 @@
-//! What aliases mean and have meant, and which versions are not to be served. An alias moves together with its history.
+//! Aliases of policies with their history, and which versions are unloaded. An alias and its history change in one
+//! transaction.
 
 use jiff::Timestamp;
 use sqlx::{FromRow, SqliteConnection};
 
 use super::{Result, Store, timestamp};
 
-/// A name for a version that may move.
+/// An alias: a movable name of a version.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PolicyAlias {
     /// Name of the policy.
     pub name: String,
     /// The alias.
     pub alias: String,
-    /// The version it means.
+    /// The version that the alias points to.
     pub version: u64,
 }
 
-/// An alias to move.
+/// A move of an alias.
 #[derive(Clone, Copy, Debug)]
 pub struct AliasMove<'a> {
     /// Name of the policy.
     pub name: &'a str,
     /// The alias.
     pub alias: &'a str,
-    /// A version that exists, or nothing more.
+    /// The version to point to, which must exist; `None` deletes the alias.
     pub to: Option<u64>,
-    /// When.
+    /// When the alias moves.
     pub at: Timestamp,
-    /// Who does it, where that is known.
+    /// Id of the caller's API key.
     pub by: Option<&'a str>,
 }
 
-/// A move that was made.
+/// An entry in the history of a policy's aliases.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Promotion {
-    /// Order of moves.
+    /// Id; later moves have larger ids.
     pub id: i64,
     /// The alias.
     pub alias: String,
-    /// What it means since then; nothing when it was deleted.
+    /// The version that the alias points to after the move; `None` if it was deleted.
     pub version: Option<u64>,
-    /// What it meant before.
+    /// The version that the alias pointed to before; `None` if it was new.
     pub previous: Option<u64>,
-    /// When.
+    /// When the alias moves.
     pub at: Timestamp,
-    /// Who did it, where that is known.
+    /// Id of the caller's API key.
     pub by: Option<String>,
 }
 
@@ -58,19 +59,19 @@ struct PromotionRow {
     by: Option<String>,
 }
 
-/// Which moves are asked for.
+/// Selects entries of the history.
 #[derive(Clone, Copy, Debug)]
 pub struct PromotionFilter<'a> {
     /// Name of the policy.
     pub name: &'a str,
-    /// Only of this alias.
+    /// Only moves of this alias.
     pub alias: Option<&'a str>,
-    /// Only those before this one.
+    /// Only moves with ids below this.
     pub before: Option<i64>,
 }
 
-/// Moves an alias and writes that down; what it meant before is returned. It may mean that version already: then nothing
-/// happened, and nothing is written down.
+/// Moves an alias and appends to its history. Returns the version that the alias pointed to before. If that is the new
+/// version, nothing changes.
 pub(super) async fn move_alias(db: &mut SqliteConnection, m: AliasMove<'_>) -> Result<Option<u64>> {
     let sql = "SELECT version FROM policy_aliases WHERE name = ? AND alias = ?";
     let previous: Option<i64> = sqlx::query_scalar(sql).bind(m.name).bind(m.alias).fetch_optional(&mut *db).await?;
@@ -99,10 +100,10 @@ pub(super) async fn move_alias(db: &mut SqliteConnection, m: AliasMove<'_>) -> R
 }
 
 impl Store {
-    /// Moves an alias and writes that down, together; what it meant before is returned.
+    /// Moves an alias and appends to its history, in one transaction. Returns the version that the alias pointed to before.
     ///
     /// # Errors
-    /// The database fails, or there is no such version.
+    /// [`Error`](super::Error) when the version does not exist or the database fails.
     pub async fn move_policy_alias(&self, m: AliasMove<'_>) -> Result<Option<u64>> {
         let mut tx = self.begin().await?;
         let previous = move_alias(&mut tx, m).await?;
@@ -113,17 +114,17 @@ impl Store {
     /// All aliases.
     ///
     /// # Errors
-    /// The database fails.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn policy_aliases(&self) -> Result<Vec<PolicyAlias>> {
         let sql = "SELECT name, alias, version FROM policy_aliases ORDER BY name, alias";
         let rows: Vec<(String, String, i64)> = sqlx::query_as(sql).fetch_all(&self.read).await?;
         Ok(rows.into_iter().map(|(name, alias, version)| PolicyAlias { name, alias, version: version as u64 }).collect())
     }
 
-    /// Moves of aliases, newest first, at most `limit`.
+    /// At most `limit` moves of aliases, newest first.
     ///
     /// # Errors
-    /// The database fails.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn promotions(&self, filter: PromotionFilter<'_>, limit: u32) -> Result<Vec<Promotion>> {
         let sql = "SELECT id, alias, version, previous, at, by FROM policy_promotions
                    WHERE name = ?1 AND (?2 IS NULL OR alias = ?2) AND (?3 IS NULL OR id < ?3) ORDER BY id DESC LIMIT ?4";
@@ -138,14 +139,14 @@ impl Store {
         rows.into_iter().map(read).collect()
     }
 
-    /// Remembers that these versions of a policy are to be served, or are not.
+    /// Marks versions of a policy as loaded or unloaded.
     ///
     /// # Errors
-    /// The database fails.
-    pub async fn serve_policy_versions(&self, name: &str, versions: &[u64], serve: bool, now: Timestamp) -> Result<()> {
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn set_policy_versions_loaded(&self, name: &str, versions: &[u64], loaded: bool, now: Timestamp) -> Result<()> {
         let mut tx = self.begin().await?;
         for &version in versions {
-            let query = if serve {
+            let query = if loaded {
                 sqlx::query("DELETE FROM policies_unloaded WHERE name = ? AND version = ?").bind(name).bind(version as i64)
             } else {
                 let sql = "INSERT INTO policies_unloaded (name, version, at) VALUES (?, ?, ?) ON CONFLICT DO NOTHING";
@@ -157,10 +158,10 @@ impl Store {
         Ok(())
     }
 
-    /// Names and numbers of the versions that are not to be served.
+    /// Names and numbers of the unloaded versions.
     ///
     /// # Errors
-    /// The database fails.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn unloaded_policies(&self) -> Result<Vec<(String, u64)>> {
         let sql = "SELECT name, version FROM policies_unloaded ORDER BY name, version";
         let rows: Vec<(String, i64)> = sqlx::query_as(sql).fetch_all(&self.read).await?;

@@ -1,20 +1,20 @@
-//! Snapshots: everything a job needs to go on exactly where it was. They are large (replay is in them), so they are kept in
-//! chunks and become visible, in place of the former one, only when complete.
+//! Snapshots: everything needed to resume the training of a job exactly. They contain the replay and are large, so they are
+//! stored in chunks. A snapshot replaces the previous one of its job when it is complete.
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 
-use super::attempts::live;
+use super::attempts::is_active;
 use super::{JobId, Lease, Result, Store};
 
 /// A complete snapshot, without its bytes.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Snapshot {
-    /// Key of its chunks.
+    /// Key of the chunks.
     pub id: i64,
-    /// Environment steps done.
+    /// Environment steps of training before it.
     pub step: u64,
-    /// Bytes.
+    /// Size in bytes.
     pub size: u64,
     /// SHA-256, lower-case hexadecimal.
     pub sha256: String,
@@ -22,15 +22,15 @@ pub struct Snapshot {
 
 /// A snapshot that is being uploaded.
 #[derive(Debug)]
-pub struct OpenSnapshot {
+pub struct PartialSnapshot {
     lease: Lease,
     id: i64,
     chunks: u32,
     size: u64,
 }
 
-impl OpenSnapshot {
-    /// Bytes received.
+impl PartialSnapshot {
+    /// Bytes stored so far.
     pub fn size(&self) -> u64 {
         self.size
     }
@@ -42,13 +42,14 @@ async fn discard_incomplete(db: &mut SqliteConnection, job: i64) -> Result<()> {
 }
 
 impl Store {
-    /// Begins a snapshot taken at `step`; what an interrupted upload left is dropped. `None` when the lease lasts no longer.
+    /// Begins a snapshot taken at `step` and deletes the rest of an interrupted upload. Returns `None` if the attempt has
+    /// ended.
     ///
     /// # Errors
-    /// The database.
-    pub async fn open_snapshot(&self, lease: Lease, step: u64, now: Timestamp) -> Result<Option<OpenSnapshot>> {
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn begin_snapshot(&self, lease: Lease, step: u64, now: Timestamp) -> Result<Option<PartialSnapshot>> {
         let mut tx = self.begin().await?;
-        if !live(&mut tx, lease).await? {
+        if !is_active(&mut tx, lease).await? {
             return Ok(None);
         }
         discard_incomplete(&mut tx, lease.job).await?;
@@ -62,39 +63,39 @@ impl Store {
             .await?
             .last_insert_rowid();
         tx.commit().await?;
-        Ok(Some(OpenSnapshot { lease, id, chunks: 0, size: 0 }))
+        Ok(Some(PartialSnapshot { lease, id, chunks: 0, size: 0 }))
     }
 
-    /// Adds the next chunk; false when the lease lasts no longer.
+    /// Appends a chunk. Returns false if the attempt has ended.
     ///
     /// # Errors
-    /// The database.
-    pub async fn extend_snapshot(&self, open: &mut OpenSnapshot, bytes: &[u8]) -> Result<bool> {
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn append_snapshot(&self, partial: &mut PartialSnapshot, bytes: &[u8]) -> Result<bool> {
         let mut tx = self.begin().await?;
-        if !live(&mut tx, open.lease).await? {
+        if !is_active(&mut tx, partial.lease).await? {
             return Ok(false);
         }
         let sql = "INSERT INTO snapshot_chunks (snapshot, number, bytes) VALUES (?, ?, ?)";
-        sqlx::query(sql).bind(open.id).bind(open.chunks).bind(bytes).execute(&mut *tx).await?;
+        sqlx::query(sql).bind(partial.id).bind(partial.chunks).bind(bytes).execute(&mut *tx).await?;
         tx.commit().await?;
-        open.chunks += 1;
-        open.size += bytes.len() as u64;
+        partial.chunks += 1;
+        partial.size += bytes.len() as u64;
         Ok(true)
     }
 
-    /// Makes the snapshot the job's newest and drops the former one; false when the lease lasts no longer.
+    /// Makes the snapshot the job's newest and deletes the previous one. Returns false if the attempt has ended.
     ///
     /// # Errors
-    /// The database.
-    pub async fn complete_snapshot(&self, open: OpenSnapshot, sha256: &str) -> Result<bool> {
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn complete_snapshot(&self, partial: PartialSnapshot, sha256: &str) -> Result<bool> {
         let mut tx = self.begin().await?;
-        if !live(&mut tx, open.lease).await? {
+        if !is_active(&mut tx, partial.lease).await? {
             return Ok(false);
         }
         let sql = "UPDATE snapshots SET size = ?, sha256 = ? WHERE id = ?";
-        sqlx::query(sql).bind(open.size as i64).bind(sha256).bind(open.id).execute(&mut *tx).await?;
+        sqlx::query(sql).bind(partial.size as i64).bind(sha256).bind(partial.id).execute(&mut *tx).await?;
         let sql = "DELETE FROM snapshots WHERE job = ? AND id <> ?";
-        sqlx::query(sql).bind(open.lease.job).bind(open.id).execute(&mut *tx).await?;
+        sqlx::query(sql).bind(partial.lease.job).bind(partial.id).execute(&mut *tx).await?;
         tx.commit().await?;
         Ok(true)
     }
@@ -102,7 +103,7 @@ impl Store {
     /// The newest complete snapshot of a job.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn snapshot(&self, job: JobId) -> Result<Option<Snapshot>> {
         let sql = "SELECT s.id, s.step, s.size, s.sha256 FROM snapshots s JOIN jobs j ON j.number = s.job
                    WHERE j.id = ? AND s.sha256 IS NOT NULL ORDER BY s.id DESC LIMIT 1";
@@ -110,10 +111,10 @@ impl Store {
         Ok(row.map(|(id, step, size, sha256)| Snapshot { id, step: step as u64, size: size as u64, sha256 }))
     }
 
-    /// Chunk `number` of a snapshot, `None` behind the last.
+    /// Chunk `number` of a snapshot; `None` after the last.
     ///
     /// # Errors
-    /// The database.
+    /// [`Error`](super::Error) when the database fails.
     pub async fn snapshot_chunk(&self, snapshot: i64, number: u32) -> Result<Option<Vec<u8>>> {
         let sql = "SELECT bytes FROM snapshot_chunks WHERE snapshot = ? AND number = ?";
         Ok(sqlx::query_scalar(sql).bind(snapshot).bind(number).fetch_optional(&self.read).await?)

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use qedgix::store::{Happened, JobState, Store};
+use qedgix::store::{JobEventKind, JobState, Store};
 use qedgix::wire::v1;
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
@@ -426,10 +426,10 @@ async fn jobs_of_an_older_database_have_their_events_in_order() {
     let store = Store::open(dir.path()).await.unwrap();
     let brief = |events: Vec<qedgix::store::JobEvent>| -> Vec<(u64, String)> {
         let of = |what| match what {
-            Happened::State { state, .. } => state.to_string(),
-            Happened::Metrics(rows) => rows.iter().map(|r| format!("{}@{}", r.name, r.step)).collect::<Vec<_>>().join(" "),
+            JobEventKind::State { state, .. } => state.to_string(),
+            JobEventKind::Metrics(rows) => rows.iter().map(|r| format!("{}@{}", r.name, r.step)).collect::<Vec<_>>().join(" "),
         };
-        events.into_iter().map(|event| (event.id, of(event.what))).collect()
+        events.into_iter().map(|event| (event.id, of(event.kind))).collect()
     };
     let told = brief(store.events(1, 0).await.unwrap());
     let expected = ["queued", "running", "loss@1", "epsilon@2 loss@2", "loss@3", "succeeded"];

@@ -9,12 +9,14 @@ use std::time::Duration;
 
 use futures::FutureExt;
 use futures::future::BoxFuture;
+use qedgix::clock::Clock;
 use qedgix::config::Config;
-use qedgix::jobs::{Executor, Exit, Jobs, Launch, Settings};
+use qedgix::draining::Draining;
+use qedgix::jobs::{Executor, Launch, Scheduler, SchedulerConfig, WorkerExit};
 use qedgix::server::{self, DataDir, Listeners};
 use qedgix::service::keys::Keyring;
-use qedgix::service::{App, Draining, Watchers};
-use qedgix::serving::{Clock, Engine, EngineConfig, Environments, EnvironmentsConfig, Limits, Sessions};
+use qedgix::service::{App, Watchers};
+use qedgix::serving::{Engine, EngineConfig, Environments, EnvironmentsConfig, Limits, Sessions};
 use qedgix::store::Store;
 use qedgix::wire::v1::job_service_client::JobServiceClient;
 use qedgix::wire::v1::worker_service_client::WorkerServiceClient;
@@ -34,13 +36,13 @@ pub const WATCHERS: usize = 4;
 /// A worker that the scheduler has started, played by the test.
 pub struct Worker {
     pub launch: Launch,
-    exit: oneshot::Sender<Exit>,
+    exit: oneshot::Sender<WorkerExit>,
 }
 
 impl Worker {
     /// The process ends by itself.
     pub fn exit(self, how: &str) {
-        self.exit.send(Exit(how.into())).expect("the scheduler waits for the exit");
+        self.exit.send(WorkerExit(how.into())).expect("the scheduler waits for the exit");
     }
 
     /// The process lasts until the scheduler kills it.
@@ -58,10 +60,10 @@ impl Worker {
 struct Manual(mpsc::UnboundedSender<Worker>);
 
 impl Executor for Manual {
-    fn start(&self, launch: Launch) -> BoxFuture<'_, std::io::Result<BoxFuture<'static, Exit>>> {
+    fn start(&self, launch: Launch) -> BoxFuture<'_, std::io::Result<BoxFuture<'static, WorkerExit>>> {
         let (exit, ended) = oneshot::channel();
         self.0.send(Worker { launch, exit }).expect("the test receives workers");
-        async move { Ok(async move { ended.await.unwrap_or(Exit("forgotten".into())) }.boxed()) }.boxed()
+        async move { Ok(async move { ended.await.unwrap_or(WorkerExit("forgotten".into())) }.boxed()) }.boxed()
     }
 }
 
@@ -134,7 +136,7 @@ impl Server {
         Self::start_with(data_dir, cpu_budget, |_| {}).await
     }
 
-    pub async fn start_with(data_dir: &Path, cpu_budget: usize, adjust: impl FnOnce(&mut Settings)) -> Self {
+    pub async fn start_with(data_dir: &Path, cpu_budget: usize, adjust: impl FnOnce(&mut SchedulerConfig)) -> Self {
         Self::start_on(data_dir, cpu_budget, adjust, None).await
     }
 
@@ -142,7 +144,7 @@ impl Server {
     pub async fn start_on(
         data_dir: &Path,
         cpu_budget: usize,
-        adjust: impl FnOnce(&mut Settings),
+        adjust: impl FnOnce(&mut SchedulerConfig),
         executor: Option<Arc<dyn Executor>>,
     ) -> Self {
         let free = SocketAddr::from(([127, 0, 0, 1], 0));
@@ -154,12 +156,12 @@ impl Server {
         let (sender, workers) = mpsc::unbounded_channel();
         let executor = executor.unwrap_or_else(|| Arc::new(Manual(sender)));
         let store = Store::open(data_dir).await.unwrap();
-        let mut settings = Settings::new(cpu_budget);
-        adjust(&mut settings);
-        let clock = Clock::system();
+        let mut scheduler = SchedulerConfig::new(cpu_budget);
+        adjust(&mut scheduler);
+        let (clock, draining) = (Clock::system(), Draining::default());
         let limits = Limits { ttl: config.session_ttl, max: 1 };
         let app = Arc::new(App {
-            jobs: Jobs::open(store.clone(), settings, executor).await.unwrap(),
+            scheduler: Scheduler::open(store.clone(), scheduler, executor, clock.clone(), draining.clone()).await.unwrap(),
             store,
             registry: Arc::default(),
             sessions: Sessions::new(limits, clock.clone()),
@@ -168,7 +170,7 @@ impl Server {
             keys: Keyring::new(None),
             watchers: Watchers::new(config.max_watchers, config.event_heartbeat),
             clock,
-            draining: Draining::default(),
+            draining,
         });
         let serving = Arc::clone(&app);
         let running = tokio::spawn(async move {

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use qedgix::jobs::Settings;
+use qedgix::jobs::SchedulerConfig;
 use qedgix::wire::v1;
 use reqwest::{Method, StatusCode};
 use serde_json::json;
@@ -16,7 +16,7 @@ async fn finish(server: &Server, worker: &Worker, outcome: v1::Outcome) {
     server.worker_client().await.finish(request).await.unwrap();
 }
 
-fn impatient(settings: &mut Settings) {
+fn impatient(settings: &mut SchedulerConfig) {
     settings.cancel_grace = Duration::ZERO;
     settings.pause_grace = Duration::ZERO;
 }
@@ -127,14 +127,14 @@ async fn a_cancel_that_was_acknowledged_beats_a_worker_that_finishes() {
 #[tokio::test]
 async fn a_silent_worker_is_killed_and_its_job_tried_again() {
     let dir = tempfile::tempdir().unwrap();
-    let mut server = Server::start_with(dir.path(), 1, |s| s.silence = Duration::from_millis(50)).await;
+    let mut server = Server::start_with(dir.path(), 1, |s| s.heartbeat_timeout = Duration::from_millis(50)).await;
     let id = server.submit(&tiny()).await;
     server.worker().await.killed().await;
     let second = server.worker().await;
     assert_eq!(second.launch.lease.attempt, 2);
     let logs = server.get(&format!("/v1/jobs/{id}/logs")).await;
     assert_eq!(logs["attempts"][0]["outcome"], "failed");
-    assert!(logs["attempts"][0]["reason"].as_str().unwrap().starts_with("nothing was heard"), "{logs}");
+    assert!(logs["attempts"][0]["reason"].as_str().unwrap().starts_with("nothing was last_heartbeat"), "{logs}");
 }
 
 #[tokio::test]
@@ -219,10 +219,10 @@ async fn draining_pauses_workers_and_queues_their_jobs() {
     let deaf = server.submit(&named("deaf")).await;
     let (first, second) = (server.worker().await, server.worker().await);
     server.app.draining.begin();
-    let jobs = server.app.jobs.clone();
-    let drain = tokio::spawn(async move { jobs.drain(PATIENCE).await });
+    let scheduler = server.app.scheduler.clone();
+    let drain = tokio::spawn(async move { scheduler.drain(PATIENCE).await });
     within(async {
-        while !server.app.jobs.draining() {
+        while !server.app.draining.begun() {
             tokio::task::yield_now().await;
         }
     })

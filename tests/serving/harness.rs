@@ -6,13 +6,14 @@ use std::sync::{Arc, Condvar, Mutex};
 use std::time::Duration;
 
 use jiff::Timestamp;
+use qedgix::clock::ManualClock;
 use qedgix::config::Config;
 use qedgix::env::Point;
 use qedgix::invalid::Invalid;
 use qedgix::policy::{FleetStep, Policy, RequiredInput};
 use qedgix::server::{self, DataDir, Endpoints, Listeners};
 use qedgix::service::App;
-use qedgix::serving::{Clock, LoadedPolicy, PolicyRef};
+use qedgix::serving::{LoadedPolicy, PolicyRef};
 use qedgix::wire::v1;
 use qedgix::wire::v1::policy_service_client::PolicyServiceClient;
 use rand::RngExt;
@@ -25,7 +26,7 @@ pub struct Server {
     pub app: Arc<App>,
     pub endpoints: Endpoints,
     pub dir: tempfile::TempDir,
-    time: Arc<Mutex<Timestamp>>,
+    time: ManualClock,
     stop: Option<oneshot::Sender<()>>,
     running: JoinHandle<Result<(), server::Error>>,
 }
@@ -52,13 +53,11 @@ impl Server {
         config.grpc_addr.set_port(0);
         config.http_addr.set_port(0);
         change(&mut config);
-        let time = Arc::new(Mutex::new(Timestamp::UNIX_EPOCH));
-        let told = time.clone();
-        let clock = Clock::new(move || *told.lock().unwrap());
+        let time = ManualClock::new(Timestamp::UNIX_EPOCH);
         let data = DataDir::lock(dir.path()).unwrap();
         let listeners = Listeners::bind(&config).await.unwrap();
         let endpoints = listeners.endpoints().unwrap();
-        let app = server::open(&config, &data, clock).await.unwrap();
+        let app = server::open(&config, &data, time.clock()).await.unwrap();
         let (stop, stopped) = oneshot::channel();
         let shared = app.clone();
         let running = tokio::spawn(async move {
@@ -71,8 +70,7 @@ impl Server {
     }
 
     pub fn pass(&self, seconds: u64) {
-        let mut time = self.time.lock().unwrap();
-        *time = time.checked_add(Duration::from_secs(seconds)).unwrap();
+        self.time.advance(Duration::from_secs(seconds));
     }
 
     pub async fn channel(&self) -> Channel {

@@ -77,7 +77,7 @@ async fn jobs_are_not_served_while_their_queue_cannot_be_read() {
     let file = server.dir.path().join(qedgix::store::FILE);
     let mut database = SqliteConnection::connect_with(&SqliteConnectOptions::new().filename(file)).await.unwrap();
     sqlx::query("ALTER TABLE jobs RENAME TO elsewhere").execute(&mut database).await.unwrap();
-    server.app.jobs.changed(0);
+    server.app.scheduler.job_changed(0);
     assert_eq!(next(&mut states).await, Some(ServingStatus::NotServing));
     // Who asks a policy is not concerned.
     assert_eq!(status(&mut health, "qedgix.v1.PolicyService").await, ServingStatus::Serving);

@@ -7,7 +7,9 @@ use jiff::Timestamp;
 use qedgix::checkpoint::{Checkpoint, digest};
 use qedgix::recipe::{Algorithm, Preset};
 use qedgix::service::policies::{IndexEntry, index};
-use qedgix::store::{CheckpointKind, Ending, JobId, JobKind, JobSpec, NewCheckpoint, NewJob, Store, Submitted};
+use qedgix::store::{
+    AttemptResult, CheckpointKind, EndedAttempt, JobId, JobKind, JobSpec, NewCheckpoint, NewJob, Store, SubmitResult,
+};
 use qedgix::wire::v1;
 use reqwest::{Client, Method, Response, StatusCode};
 use serde_json::{Value, json};
@@ -107,12 +109,13 @@ async fn a_checkpoint_of_a_job_is_published_by_its_id() {
     let config = mine.config().clone();
     let spec = JobSpec { kind: JobKind::Train, name: None, labels: BTreeMap::new(), threads: 1, priority: 0, config };
     let new = NewJob { id: JobId(uuid::Uuid::from_u128(7)), spec, now, idempotency: None };
-    let Submitted::New(job) = store.submit_job(new).await.unwrap() else { panic!("a new job") };
+    let SubmitResult::Created(job) = store.submit_job(new).await.unwrap() else { panic!("a new job") };
     let lease = store.begin_attempt(job.id, [0; 32], now).await.unwrap().unwrap();
     let bytes = mine.to_bytes();
     let new = NewCheckpoint { kind: CheckpointKind::Best, step: 1234, sha256: digest(&bytes), metrics: BTreeMap::new(), bytes };
     let id = store.keep_checkpoint(lease, new, now).await.unwrap().unwrap();
-    store.end_attempt(lease, &Ending::Succeeded(None), now).await.unwrap().unwrap();
+    let ended = EndedAttempt { lease, result: &AttemptResult::Succeeded, policy: None, max_attempts: 1, now };
+    store.end_attempt(ended).await.unwrap().unwrap();
     drop(store);
 
     let server = Server::on(dir, |_| {}).await;

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use qedgix::policy::FleetStep;
-use qedgix::service::policies::{self, Target};
+use qedgix::service::policies::{self, AliasChange};
 use qedgix::service::{App, PageRequest};
 use qedgix::serving::Observation;
 use qedgix::store::{Promotion, PromotionFilter};
@@ -22,8 +22,8 @@ use super::policies::numbered;
 use super::published::publish;
 use super::rest::Rest;
 
-fn live(name: &str, expected: Option<u64>) -> Target {
-    Target { name: name.into(), alias: "live".into(), expected, by: None }
+fn live(name: &str, expected: Option<u64>) -> AliasChange {
+    AliasChange { name: name.into(), alias: "live".into(), expected, by: None }
 }
 
 #[tokio::test]
@@ -105,7 +105,7 @@ async fn aliases_of_a_policy_are_bounded() {
     let server = Server::start().await;
     publish(&server, "mine", &numbered(1)).await;
     let set = async |alias: usize| {
-        let target = Target { name: "mine".into(), alias: format!("a{alias}"), expected: None, by: Some("somebody".into()) };
+        let target = AliasChange { name: "mine".into(), alias: format!("a{alias}"), expected: None, by: Some("somebody".into()) };
         policies::set_alias(&server.app, target, 1).await
     };
     for alias in 0..100 {
@@ -258,7 +258,7 @@ async fn changes_by_many_who_may_leave_keep_the_registry_and_the_database_alike(
                 let (kind, version): (u32, u64) = (rng.random_range(0..6), rng.random_range(1..4));
                 let patience: u64 = rng.random_range(0..12);
                 let alias = if version == 3 { "live" } else { "old" };
-                let target = || Target { alias: alias.into(), ..live("mine", None) };
+                let target = || AliasChange { alias: alias.into(), ..live("mine", None) };
                 let spec = format!("mine:{version}");
                 let change = async {
                     // Refusals are as good as changes here.

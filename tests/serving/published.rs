@@ -48,7 +48,7 @@ async fn what_was_published_is_served_after_a_restart() {
     let mut server = Server::start().await;
     let mine = checkpoint(Algorithm::Qedgix, Preset::Practical, 1);
     let reference = publish(&server, "mine", &mine).await;
-    let target = policies::Target { name: "mine".into(), alias: "prod".into(), expected: None, by: None };
+    let target = policies::AliasChange { name: "mine".into(), alias: "prod".into(), expected: None, by: None };
     policies::set_alias(&server.app, target, 1).await.unwrap();
     let mut client = server.grpc().await;
     let before = client.act(held("mine", Bytes::new(), scene(3, 5, 0))).await.unwrap().into_inner();

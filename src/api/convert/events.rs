@@ -5,7 +5,7 @@ use serde::Serialize;
 
 use super::jobs::MetricView;
 use super::response::timestamp;
-use crate::store::{Happened, JobEvent, JobState};
+use crate::store::{JobEvent, JobEventKind, JobState};
 use crate::wire::v1;
 
 /// The data of an event as REST sends it.
@@ -40,11 +40,11 @@ impl EventView {
     }
 }
 
-impl From<Happened> for EventView {
-    fn from(happened: Happened) -> Self {
+impl From<JobEventKind> for EventView {
+    fn from(happened: JobEventKind) -> Self {
         match happened {
-            Happened::State { state, attempt, reason, at } => Self::State { state, attempt, reason, at },
-            Happened::Metrics(rows) => Self::Metrics { metrics: rows.into_iter().map(Into::into).collect() },
+            JobEventKind::State { state, attempt, reason, at } => Self::State { state, attempt, reason, at },
+            JobEventKind::Metrics(rows) => Self::Metrics { metrics: rows.into_iter().map(Into::into).collect() },
         }
     }
 }
@@ -52,14 +52,14 @@ impl From<Happened> for EventView {
 impl From<JobEvent> for v1::JobEvent {
     fn from(event: JobEvent) -> Self {
         use v1::job_event::What;
-        let what = match event.what {
-            Happened::State { state, attempt, reason, at } => What::State(v1::JobStateChange {
+        let what = match event.kind {
+            JobEventKind::State { state, attempt, reason, at } => What::State(v1::JobStateChange {
                 state: v1::JobState::from(state).into(),
                 attempt,
                 reason: reason.unwrap_or_default(),
                 at: Some(timestamp(at)),
             }),
-            Happened::Metrics(rows) => What::Metrics(v1::JobMetrics { rows: rows.into_iter().map(Into::into).collect() }),
+            JobEventKind::Metrics(rows) => What::Metrics(v1::JobMetrics { rows: rows.into_iter().map(Into::into).collect() }),
         };
         Self { id: event.id, what: Some(what) }
     }

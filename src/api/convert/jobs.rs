@@ -16,10 +16,9 @@ use crate::env::EnvConfig;
 use crate::invalid::Invalid;
 use crate::jobs::Directive;
 use crate::recipe::{Algorithm, Preset, TrainConfig, Training};
-use crate::service::worker::Finish;
 use crate::store::{
-    Attempt, Checkpoint, CheckpointKind, Job, JobId, JobKind, JobState, JobSummary, Metric, MetricRow, NewCheckpoint, Outcome,
-    SpecSummary, Wanted,
+    Attempt, AttemptOutcome, AttemptResult, Checkpoint, CheckpointKind, Job, JobId, JobKind, JobState, JobSummary, Metric,
+    MetricRow, NewCheckpoint, PendingAction, SpecSummary,
 };
 use crate::wire::v1;
 
@@ -95,7 +94,7 @@ pub struct SummaryView {
     state: JobState,
     /// What a running job was asked to do and has not done yet.
     #[schema(required = true)]
-    wanted: Option<Wanted>,
+    wanted: Option<PendingAction>,
     /// Why the job failed, or why its last attempt ended.
     #[schema(required = true)]
     reason: Option<String>,
@@ -149,7 +148,7 @@ impl From<JobSummary> for SummaryView {
         Self {
             id: job.id,
             state: job.state,
-            wanted: job.wanted,
+            wanted: job.pending_action,
             reason: job.reason,
             progress: Progress { step: job.step, steps },
             attempts: job.attempts,
@@ -237,7 +236,7 @@ pub struct AttemptView {
     #[schema(required = true)]
     ended_at: Option<Timestamp>,
     #[schema(required = true)]
-    outcome: Option<Outcome>,
+    outcome: Option<AttemptOutcome>,
     #[schema(required = true)]
     reason: Option<String>,
     /// Last output of its worker.
@@ -304,7 +303,7 @@ impl From<JobSummary> for v1::Job {
             steps: job.spec.steps,
             attempts: job.attempts,
             failures: job.failures,
-            wanted: job.wanted.map(|w| w.to_string()).unwrap_or_default(),
+            wanted: job.pending_action.map(|w| w.to_string()).unwrap_or_default(),
             policy: job.policy.unwrap_or_default(),
             created_at: Some(timestamp(job.created_at)),
             started_at: job.started_at.map(timestamp),
@@ -346,7 +345,7 @@ impl From<Directive> for v1::Directive {
     }
 }
 
-impl TryFrom<v1::FinishRequest> for Finish {
+impl TryFrom<v1::FinishRequest> for AttemptResult {
     type Error = Invalid;
 
     fn try_from(request: v1::FinishRequest) -> Result<Self, Invalid> {

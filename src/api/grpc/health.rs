@@ -16,6 +16,7 @@ use tonic_health::pb::health_server::{Health as HealthService, HealthServer};
 use tonic_health::pb::{HealthCheckRequest, HealthCheckResponse};
 
 use super::SERVICES;
+use crate::draining::Draining;
 use crate::service::operations::{Vitals, vitals, vitals_changed};
 use crate::service::{App, Error};
 use crate::wire::v1;
@@ -23,37 +24,31 @@ use crate::wire::v1;
 /// Statuses by service; cheap to clone.
 #[derive(Clone, Debug)]
 pub struct Health {
-    statuses: Arc<watch::Sender<Statuses>>,
+    /// Whether each service answers, unless the server drains.
+    serving: Arc<watch::Sender<BTreeMap<String, bool>>>,
+    draining: Draining,
     closing: CancellationToken,
 }
 
-#[derive(Clone, Debug, Default)]
-struct Statuses {
-    serving: BTreeMap<String, bool>,
-    draining: bool,
-}
-
-impl Statuses {
-    fn of(&self, service: &str) -> Option<ServingStatus> {
-        let serving = *self.serving.get(service)?;
-        Some(if serving && !self.draining { ServingStatus::Serving } else { ServingStatus::NotServing })
-    }
+fn status(serving: &BTreeMap<String, bool>, service: &str, draining: bool) -> Option<ServingStatus> {
+    let serving = *serving.get(service)?;
+    Some(if serving && !draining { ServingStatus::Serving } else { ServingStatus::NotServing })
 }
 
 impl Health {
-    /// Knows no service yet. Watches end when `closing` is cancelled.
-    pub fn new(closing: CancellationToken) -> Self {
-        Self { statuses: Arc::new(watch::Sender::default()), closing }
+    /// Knows no service yet. Once `draining` has begun, every service is `NOT_SERVING`. Watches end when `closing` is
+    /// cancelled.
+    pub fn new(draining: Draining, closing: CancellationToken) -> Self {
+        Self { serving: Arc::default(), draining, closing }
     }
 
-    /// Says whether `service` answers; the server as a whole is `""`.
+    /// Sets whether `service` answers; the server as a whole is `""`.
     pub fn set(&self, service: &str, serving: bool) {
-        self.statuses.send_if_modified(|statuses| statuses.serving.insert(service.to_owned(), serving) != Some(serving));
+        self.serving.send_if_modified(|services| services.insert(service.to_owned(), serving) != Some(serving));
     }
 
-    /// From now on nothing is served, whatever [`Health::set`] says.
-    pub fn drain(&self) {
-        self.statuses.send_modify(|statuses| statuses.draining = true);
+    fn status(&self, service: &str) -> Option<ServingStatus> {
+        status(&self.serving.borrow(), service, self.draining.begun())
     }
 
     /// Says which services answer while the server is in this state.
@@ -94,7 +89,7 @@ fn response(status: ServingStatus) -> HealthCheckResponse {
 impl HealthService for Health {
     async fn check(&self, request: Request<HealthCheckRequest>) -> Result<Response<HealthCheckResponse>, Status> {
         let service = request.into_inner().service;
-        let status = self.statuses.borrow().of(&service);
+        let status = self.status(&service);
         Ok(Response::new(response(status.ok_or_else(|| Error::not_found("service", service))?)))
     }
 
@@ -102,19 +97,22 @@ impl HealthService for Health {
 
     async fn watch(&self, request: Request<HealthCheckRequest>) -> Result<Response<Self::WatchStream>, Status> {
         let service = request.into_inner().service;
-        let (statuses, closing) = (self.statuses.subscribe(), self.closing.clone());
-        let states = futures::stream::unfold((statuses, None), move |(mut statuses, told)| {
-            let (service, closing) = (service.clone(), closing.clone());
+        let (serving, draining, closing) = (self.serving.subscribe(), self.draining.clone(), self.closing.clone());
+        let states = futures::stream::unfold((serving, None), move |(mut serving, sent)| {
+            let (service, draining, closing) = (service.clone(), draining.clone(), closing.clone());
             async move {
                 loop {
-                    let status = statuses.borrow_and_update().of(&service).unwrap_or(ServingStatus::ServiceUnknown);
-                    if told != Some(status) {
-                        return Some((Ok(response(status)), (statuses, Some(status))));
+                    let drained = draining.begun();
+                    let status = status(&serving.borrow_and_update(), &service, drained);
+                    let status = status.unwrap_or(ServingStatus::ServiceUnknown);
+                    if sent != Some(status) {
+                        return Some((Ok(response(status)), (serving, Some(status))));
                     }
-                    // The last word comes before the end.
+                    // The last status is sent before the stream ends.
                     tokio::select! {
                         biased;
-                        changed = statuses.changed() => changed.ok()?,
+                        changed = serving.changed() => changed.ok()?,
+                        () = draining.wait(), if !drained => {}
                         () = closing.cancelled() => return None,
                     }
                 }
@@ -140,7 +138,7 @@ mod tests {
     #[tokio::test]
     async fn a_watch_tells_what_changes_and_nothing_twice() {
         let closing = CancellationToken::new();
-        let health = Health::new(closing.clone());
+        let health = Health::new(Draining::default(), closing.clone());
         let mut states = watch(&health, "a.Later").await;
         assert_eq!(next(&mut states).await, Some(ServingStatus::ServiceUnknown));
         for _ in 0..3 {
@@ -162,12 +160,13 @@ mod tests {
     #[tokio::test]
     async fn a_server_that_drains_says_so_before_watches_end() {
         let closing = CancellationToken::new();
-        let health = Health::new(closing.clone());
+        let draining = Draining::default();
+        let health = Health::new(draining.clone(), closing.clone());
         health.set("", true);
         let (mut known, mut unknown) = (watch(&health, "").await, watch(&health, "nobody").await);
         assert_eq!(next(&mut known).await, Some(ServingStatus::Serving));
         assert_eq!(next(&mut unknown).await, Some(ServingStatus::ServiceUnknown));
-        health.drain();
+        draining.begin();
         closing.cancel();
         health.set("", true);
         assert_eq!(next(&mut known).await, Some(ServingStatus::NotServing));
@@ -177,8 +176,8 @@ mod tests {
 
     #[test]
     fn a_service_depends_on_what_it_needs() {
-        let health = Health::new(CancellationToken::new());
-        let of = |service: &str| health.statuses.borrow().of(service).map(|status| status == ServingStatus::Serving);
+        let health = Health::new(Draining::default(), CancellationToken::new());
+        let of = |service: &str| health.status(service).map(|status| status == ServingStatus::Serving);
         let all = Vitals { database: true, policies: true, scheduler: true };
         let cases = [
             (all, [true; 5]),

@@ -11,7 +11,7 @@ use crate::api::convert::structs::from_struct;
 use crate::api::errors::in_stream;
 use crate::api::gate::Opener;
 use crate::service::{App, Error, PageRequest, events, jobs};
-use crate::store::Verb;
+use crate::store::JobAction;
 use crate::wire::v1;
 use crate::wire::v1::job_service_server::{JobService, JobServiceServer};
 
@@ -25,7 +25,7 @@ struct Service(Arc<App>);
 type Answer<T> = Result<Response<T>, Status>;
 
 impl Service {
-    async fn change(&self, id: &str, verb: Verb) -> Answer<v1::Job> {
+    async fn change(&self, id: &str, verb: JobAction) -> Answer<v1::Job> {
         Ok(Response::new(jobs::change(&self.0, id, verb).await?.into()))
     }
 }
@@ -57,15 +57,15 @@ impl JobService for Service {
     }
 
     async fn cancel_job(&self, request: Request<v1::CancelJobRequest>) -> Answer<v1::Job> {
-        self.change(&request.into_inner().id, Verb::Cancel).await
+        self.change(&request.into_inner().id, JobAction::Cancel).await
     }
 
     async fn pause_job(&self, request: Request<v1::PauseJobRequest>) -> Answer<v1::Job> {
-        self.change(&request.into_inner().id, Verb::Pause).await
+        self.change(&request.into_inner().id, JobAction::Pause).await
     }
 
     async fn resume_job(&self, request: Request<v1::ResumeJobRequest>) -> Answer<v1::Job> {
-        self.change(&request.into_inner().id, Verb::Resume).await
+        self.change(&request.into_inner().id, JobAction::Resume).await
     }
 
     async fn get_job_metrics(&self, request: Request<v1::GetJobMetricsRequest>) -> Answer<v1::GetJobMetricsResponse> {

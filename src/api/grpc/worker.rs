@@ -9,7 +9,7 @@ use tonic::{Request, Response, Status, Streaming};
 
 use crate::api::errors::in_stream;
 use crate::invalid::Invalid;
-use crate::service::worker::{self, Announced, CheckpointUpload, Credentials, SnapshotUpload};
+use crate::service::worker::{self, CheckpointUpload, Credentials, SnapshotUpload, UploadHeader};
 use crate::service::{App, Error};
 use crate::store::{Lease, Metric};
 use crate::wire::v1;
@@ -86,7 +86,7 @@ impl WorkerService for Service {
         let lease = self.lease(request.metadata()).await?;
         let mut parts = request.into_inner();
         let Some(Part::Header(header)) = parts.message().await?.and_then(|m| m.part) else { return Err(headless().into()) };
-        let announced = Announced { size: header.size, sha256: header.sha256 };
+        let announced = UploadHeader { size: header.size, sha256: header.sha256 };
         let mut upload = SnapshotUpload::begin(&self.0, lease, header.step, announced).await?;
         while let Some(message) = parts.message().await? {
             let Some(Part::Data(data)) = message.part else { return Err(headless().into()) };

@@ -100,7 +100,7 @@ async fn follow(
             .ok_or_else(|| Invalid::new("last-event-id", format!("{value:?}"), "the id of an event of this job"))?,
     };
     let watch = events::watch(&app, &id, after).await?;
-    if watch.is_over() {
+    if watch.has_ended() {
         return Ok(StatusCode::NO_CONTENT.into_response());
     }
     // Why a stream ends before its job is told to who comes back.
@@ -113,6 +113,6 @@ async fn follow(
 }
 
 fn event_of(event: JobEvent) -> Result<Event, Error> {
-    let (id, view) = (event.id, EventView::from(event.what));
+    let (id, view) = (event.id, EventView::from(event.kind));
     Event::default().id(id.to_string()).event(view.name()).json_data(&view).map_err(Error::internal)
 }

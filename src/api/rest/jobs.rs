@@ -18,7 +18,7 @@ use super::schemas;
 use crate::api::convert::jobs::{AttemptView, CheckpointView, JobRequest, JobView, MetricView, SummaryView, to_csv};
 use crate::invalid::Invalid;
 use crate::service::{App, Error, PageRequest, jobs};
-use crate::store::{Job, JobState, Verb};
+use crate::store::{Job, JobAction, JobState};
 
 type Shared = State<Arc<App>>;
 
@@ -151,7 +151,7 @@ async fn one(State(app): Shared, Path(id): Path<String>) -> Result<Response, Err
     responses((status = 204, description = "It is forgotten."), BadRequest, NotFound, Conflict)
 )]
 async fn delete(State(app): Shared, Path(id): Path<String>) -> Result<StatusCode, Error> {
-    jobs::change(&app, &id, Verb::Delete).await?;
+    jobs::change(&app, &id, JobAction::Delete).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 
@@ -165,7 +165,7 @@ async fn delete(State(app): Shared, Path(id): Path<String>) -> Result<StatusCode
     responses((status = 200, description = "As it stands now.", body = JobView), BadRequest, NotFound, Conflict)
 )]
 async fn cancel(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    Ok(shown(jobs::change(&app, &id, Verb::Cancel).await?))
+    Ok(shown(jobs::change(&app, &id, JobAction::Cancel).await?))
 }
 
 /// Take a job off the machine; a running one is snapshotted first
@@ -178,7 +178,7 @@ async fn cancel(State(app): Shared, Path(id): Path<String>) -> Result<Response, 
     responses((status = 200, description = "As it stands now.", body = JobView), BadRequest, NotFound, Conflict)
 )]
 async fn pause(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    Ok(shown(jobs::change(&app, &id, Verb::Pause).await?))
+    Ok(shown(jobs::change(&app, &id, JobAction::Pause).await?))
 }
 
 /// Put a paused job back into the queue, to go on where it was
@@ -191,7 +191,7 @@ async fn pause(State(app): Shared, Path(id): Path<String>) -> Result<Response, E
     responses((status = 200, description = "As it stands now.", body = JobView), BadRequest, NotFound, Conflict, Draining)
 )]
 async fn resume(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    Ok(shown(jobs::change(&app, &id, Verb::Resume).await?))
+    Ok(shown(jobs::change(&app, &id, JobAction::Resume).await?))
 }
 
 #[derive(Clone, Copy, Default, Deserialize, ToSchema)]

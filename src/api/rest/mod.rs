@@ -42,7 +42,7 @@ pub fn router(app: Arc<App>, metrics: fn() -> String, max_body: usize) -> Router
         .merge(jobs::router())
         .merge(events::router())
         .split_for_parts();
-    let description = openapi::Description::new(&document, app.jobs.settings().cpu_budget);
+    let description = openapi::Description::new(&document, app.scheduler.config().cpu_budget);
     router
         // The Open Inference Protocol has a document of its own.
         .merge(v2::router())

@@ -204,15 +204,15 @@ async fn upload(
     let source = match extract::media_type(request.headers()) {
         Some(kind) if kind == "application/octet-stream" => {
             let _room = room.try_acquire().map_err(busy)?;
-            policies::Source::Bytes(extract::read(request, LARGEST.max(limit)).await?.into())
+            policies::CheckpointSource::Bytes(extract::read(request, LARGEST.max(limit)).await?.into())
         }
         Some(kind) if kind == "application/json" => {
             let OfJob { checkpoint_id } = extract::parse(&extract::read(request, limit).await?)?;
-            policies::Source::Checkpoint(checkpoint_id)
+            policies::CheckpointSource::Job(checkpoint_id)
         }
         kind => return Err(extract::unsupported(kind, "application/octet-stream, or application/json with a checkpoint_id")),
     };
-    let (described, new) = policies::upload(&app, policies::Upload { name, source, alias, by: by(caller) }).await?;
+    let (described, new) = policies::upload(&app, policies::PolicyUpload { name, source, alias, by: by(caller) }).await?;
     let location = [(header::LOCATION, format!("/v1/policies/{}", described.about.reference))];
     Ok((if new { StatusCode::CREATED } else { StatusCode::OK }, location, Json(shown(described))))
 }
@@ -342,7 +342,7 @@ async fn set_alias(
     caller: Option<Extension<Caller>>,
     extract::Json(SetAlias { version, expected }): extract::Json<SetAlias>,
 ) -> Result<impl IntoResponse, Error> {
-    let target = policies::Target { name, alias: alias.clone(), expected, by: by(caller) };
+    let target = policies::AliasChange { name, alias: alias.clone(), expected, by: by(caller) };
     let previous = policies::set_alias(&app, target, version).await?;
     let status = if previous.is_none() { StatusCode::CREATED } else { StatusCode::OK };
     Ok((status, Json(Moved { alias, version, previous })))
@@ -372,7 +372,7 @@ async fn delete_alias(
     Query(Expected { expected }): Query<Expected>,
     caller: Option<Extension<Caller>>,
 ) -> Result<StatusCode, Error> {
-    policies::delete_alias(&app, policies::Target { name, alias, expected, by: by(caller) }).await?;
+    policies::delete_alias(&app, policies::AliasChange { name, alias, expected, by: by(caller) }).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 

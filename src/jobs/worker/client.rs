@@ -1,4 +1,4 @@
-//! The worker's side of `WorkerService`: every call signed, and repeated while the server may only be busy.
+//! The worker's client of `WorkerService`. It adds the credentials to every call, and retries calls that may succeed later.
 
 use std::future::Future;
 use std::time::Duration;
@@ -16,47 +16,47 @@ use crate::jobs::Directive;
 use crate::wire::v1;
 use crate::wire::v1::worker_service_client::WorkerServiceClient;
 
-/// A server that does not answer for this long is gone: another attempt begins elsewhere.
-const PATIENCE: Duration = Duration::from_secs(10);
-/// Time one call may take.
-const CALL: Duration = Duration::from_secs(8);
-/// Time one upload or download may take.
-const TRANSFER: Duration = Duration::from_secs(600);
-/// Pause before a call is repeated.
-const PAUSE: Duration = Duration::from_millis(200);
+/// Time for which a failing call is retried. Then the worker gives up, and the server starts another attempt.
+const RETRY_TIMEOUT: Duration = Duration::from_secs(10);
+/// Time limit of one call.
+const CALL_TIMEOUT: Duration = Duration::from_secs(8);
+/// Time limit of one upload or download.
+const TRANSFER_TIMEOUT: Duration = Duration::from_secs(600);
+/// Time between two tries of a call.
+const RETRY_DELAY: Duration = Duration::from_millis(200);
 /// Bytes per message of an upload.
-pub(super) const CHUNK: usize = 1 << 20;
+pub(super) const CHUNK_SIZE: usize = 1 << 20;
 
-/// Why a worker cannot go on.
+/// Why a call of the worker failed for good.
 #[derive(Debug, thiserror::Error)]
-pub enum Lost {
-    /// The address or the credentials cannot be used at all.
-    #[error("the assignment cannot be used: {0}")]
+pub enum ClientError {
+    /// The server's address or the credentials are malformed.
+    #[error("invalid assignment: {0}")]
     Assignment(String),
-    /// The attempt is over, or was never this worker's.
-    #[error("this attempt is over: {0}")]
-    Over(String),
-    /// The server does not accept what it was sent.
-    #[error("the server refuses: {0}")]
-    Refused(String),
+    /// The attempt has ended, or the credentials are not those of an attempt.
+    #[error("this attempt has ended: {0}")]
+    AttemptEnded(String),
+    /// The server rejected the request.
+    #[error("the server rejected the request: {0}")]
+    Rejected(String),
     /// The server does not answer.
-    #[error("the server is gone: {0}")]
-    Gone(String),
+    #[error("the server does not answer: {0}")]
+    Unavailable(String),
 }
 
 /// A connection to the server; cheap to clone.
 #[derive(Clone)]
-pub(super) struct Client(WorkerServiceClient<InterceptedService<Channel, Signature>>);
+pub(super) struct Client(WorkerServiceClient<InterceptedService<Channel, Credentials>>);
 
-/// What every call carries.
+/// The metadata of every call.
 #[derive(Clone)]
-struct Signature {
+struct Credentials {
     job: MetadataValue<Ascii>,
     attempt: MetadataValue<Ascii>,
     authorization: MetadataValue<Ascii>,
 }
 
-impl Interceptor for Signature {
+impl Interceptor for Credentials {
     fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {
         let metadata = request.metadata_mut();
         metadata.insert("qedgix-job", self.job.clone());
@@ -67,27 +67,28 @@ impl Interceptor for Signature {
 }
 
 impl Client {
-    pub(super) fn new(assignment: &Assignment) -> Result<Self, Lost> {
-        let unusable = |what: &str| Lost::Assignment(format!("{what} is malformed"));
-        let value = |what, text: &str| text.parse().map_err(|_| unusable(what));
+    pub(super) fn new(assignment: &Assignment) -> Result<Self, ClientError> {
+        let malformed = |what: &str| ClientError::Assignment(format!("{what} is malformed"));
+        let value = |what, text: &str| text.parse().map_err(|_| malformed(what));
         let mut authorization: MetadataValue<_> = value("the token", &format!("Bearer {}", assignment.token))?;
         authorization.set_sensitive(true);
-        let signature = Signature {
+        let credentials = Credentials {
             job: value("the job", &assignment.job)?,
             attempt: value("the attempt", &assignment.attempt)?,
             authorization,
         };
-        let endpoint = Endpoint::from_shared(assignment.server.clone()).map_err(|_| unusable("the server's address"))?;
+        let endpoint = Endpoint::from_shared(assignment.server.clone()).map_err(|_| malformed("the server's address"))?;
         let channel = endpoint.connect_timeout(Duration::from_secs(3)).tcp_nodelay(true).connect_lazy();
-        Ok(Self(WorkerServiceClient::with_interceptor(channel, signature)))
+        Ok(Self(WorkerServiceClient::with_interceptor(channel, credentials)))
     }
 
-    pub(super) async fn fetch(&self) -> Result<v1::FetchResponse, Lost> {
-        repeat(CALL, || async { Ok(self.0.clone().fetch(v1::FetchRequest {}).await?.into_inner()) }).await
+    pub(super) async fn fetch(&self) -> Result<v1::FetchResponse, ClientError> {
+        retry(CALL_TIMEOUT, || async { Ok(self.0.clone().fetch(v1::FetchRequest {}).await?.into_inner()) }).await
     }
 
-    pub(super) async fn heartbeat(&self) -> Result<Directive, Lost> {
-        let answer = repeat(CALL, || async { Ok(self.0.clone().heartbeat(v1::HeartbeatRequest {}).await?.into_inner()) }).await?;
+    pub(super) async fn heartbeat(&self) -> Result<Directive, ClientError> {
+        let answer =
+            retry(CALL_TIMEOUT, || async { Ok(self.0.clone().heartbeat(v1::HeartbeatRequest {}).await?.into_inner()) }).await?;
         Ok(match answer.directive() {
             v1::Directive::Cancel => Directive::Cancel,
             v1::Directive::Pause => Directive::Pause,
@@ -95,21 +96,21 @@ impl Client {
         })
     }
 
-    pub(super) async fn report(&self, report: &v1::ReportRequest) -> Result<(), Lost> {
-        repeat(CALL, || async { self.0.clone().report(report.clone()).await.map(drop) }).await
+    pub(super) async fn report(&self, report: &v1::ReportRequest) -> Result<(), ClientError> {
+        retry(CALL_TIMEOUT, || async { self.0.clone().report(report.clone()).await.map(drop) }).await
     }
 
-    pub(super) async fn finish(&self, finish: v1::FinishRequest) -> Result<(), Lost> {
-        let finished = repeat(CALL, || async { self.0.clone().finish(finish.clone()).await.map(drop) }).await;
+    pub(super) async fn finish(&self, finish: v1::FinishRequest) -> Result<(), ClientError> {
+        let finished = retry(CALL_TIMEOUT, || async { self.0.clone().finish(finish.clone()).await.map(drop) }).await;
         match finished {
-            // The first answer was lost, or somebody ended the attempt meanwhile: over is what it is.
-            Err(Lost::Over(_)) => Ok(()),
+            // The response to the first try was lost, or the attempt ended otherwise. Nothing is left to do.
+            Err(ClientError::AttemptEnded(_)) => Ok(()),
             other => other,
         }
     }
 
-    pub(super) async fn download_snapshot(&self) -> Result<Vec<u8>, Lost> {
-        repeat(TRANSFER, || async {
+    pub(super) async fn download_snapshot(&self) -> Result<Vec<u8>, ClientError> {
+        retry(TRANSFER_TIMEOUT, || async {
             let mut chunks = self.0.clone().download_snapshot(v1::DownloadSnapshotRequest {}).await?.into_inner();
             let mut bytes = Vec::new();
             while let Some(chunk) = chunks.message().await? {
@@ -120,35 +121,35 @@ impl Client {
         .await
     }
 
-    pub(super) async fn upload_snapshot(&self, header: &v1::SnapshotHeader, bytes: &bytes::Bytes) -> Result<(), Lost> {
+    pub(super) async fn upload_snapshot(&self, header: &v1::SnapshotHeader, bytes: &bytes::Bytes) -> Result<(), ClientError> {
         use v1::upload_snapshot_request::Part;
         let parts =
             || parts(Part::Header(header.clone()), bytes, Part::Data, |part| v1::UploadSnapshotRequest { part: Some(part) });
-        repeat(TRANSFER, || async { self.0.clone().upload_snapshot(parts()).await.map(drop) }).await
+        retry(TRANSFER_TIMEOUT, || async { self.0.clone().upload_snapshot(parts()).await.map(drop) }).await
     }
 
-    pub(super) async fn upload_checkpoint(&self, header: &v1::CheckpointHeader, bytes: &bytes::Bytes) -> Result<(), Lost> {
+    pub(super) async fn upload_checkpoint(&self, header: &v1::CheckpointHeader, bytes: &bytes::Bytes) -> Result<(), ClientError> {
         use v1::upload_checkpoint_request::Part;
         let parts =
             || parts(Part::Header(header.clone()), bytes, Part::Data, |part| v1::UploadCheckpointRequest { part: Some(part) });
-        repeat(TRANSFER, || async { self.0.clone().upload_checkpoint(parts()).await.map(drop) }).await
+        retry(TRANSFER_TIMEOUT, || async { self.0.clone().upload_checkpoint(parts()).await.map(drop) }).await
     }
 }
 
-/// The messages of an upload: a header, then the data piece by piece.
+/// The messages of an upload: a header, then the data in chunks.
 fn parts<P, M>(
     header: P,
     bytes: &bytes::Bytes,
     data: fn(bytes::Bytes) -> P,
     message: fn(P) -> M,
 ) -> impl Stream<Item = M> + use<P, M> {
-    let pieces = (0..bytes.len()).step_by(CHUNK).map(|at| data(bytes.slice(at..bytes.len().min(at + CHUNK))));
+    let pieces = (0..bytes.len()).step_by(CHUNK_SIZE).map(|at| data(bytes.slice(at..bytes.len().min(at + CHUNK_SIZE))));
     let messages: Vec<M> = std::iter::once(header).chain(pieces).map(message).collect();
     futures::stream::iter(messages)
 }
 
-/// Calls until there is an answer, a refusal, or the server has been silent for too long.
-async fn repeat<T, F>(limit: Duration, call: impl Fn() -> F) -> Result<T, Lost>
+/// Retries a call until it succeeds, is rejected, or has failed for [`RETRY_TIMEOUT`].
+async fn retry<T, F>(limit: Duration, call: impl Fn() -> F) -> Result<T, ClientError>
 where
     F: Future<Output = Result<T, Status>>,
 {
@@ -157,20 +158,20 @@ where
         let status = match tokio::time::timeout(limit, call()).await {
             Ok(Ok(answer)) => return Ok(answer),
             Ok(Err(status)) => status,
-            Err(_) => Status::deadline_exceeded(format!("no answer within {} s", limit.as_secs())),
+            Err(_) => Status::deadline_exceeded(format!("no response within {} s", limit.as_secs())),
         };
         let text = format!("{:?}: {}", status.code(), status.message());
         match status.code() {
             Code::Unauthenticated | Code::PermissionDenied | Code::FailedPrecondition | Code::NotFound => {
-                return Err(Lost::Over(text));
+                return Err(ClientError::AttemptEnded(text));
             }
-            Code::InvalidArgument | Code::OutOfRange | Code::Unimplemented => return Err(Lost::Refused(text)),
+            Code::InvalidArgument | Code::OutOfRange | Code::Unimplemented => return Err(ClientError::Rejected(text)),
             _ => {}
         }
-        // From the first failure on: a long transfer that breaks off had a server until then.
-        if failing_since.get_or_insert_with(Instant::now).elapsed() > PATIENCE {
-            return Err(Lost::Gone(text));
+        // Measured from the first failure, because a transfer may take longer than this.
+        if failing_since.get_or_insert_with(Instant::now).elapsed() > RETRY_TIMEOUT {
+            return Err(ClientError::Unavailable(text));
         }
-        tokio::time::sleep(PAUSE).await;
+        tokio::time::sleep(RETRY_DELAY).await;
     }
 }

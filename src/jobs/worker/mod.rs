@@ -1,7 +1,8 @@
-//! The worker process: one attempt at one job. It reaches the server only through `WorkerService`, so it can run anywhere.
+//! The worker process, which works on one attempt of a job. It reaches the server only through `WorkerService`, so it can run
+//! on any machine.
 //!
-//! Training has a thread of its own and never waits for the network: what it tells goes through a queue to the reporter,
-//! which sends it in order, so that a snapshot on the server never lacks a row that came before it.
+//! Training runs on its own thread and never waits for the network. It puts reports into a queue, and a task sends them in
+//! order, so the server has all metrics that come before a snapshot.
 
 mod client;
 mod report;
@@ -16,12 +17,13 @@ use std::time::Duration;
 
 use tokio::sync::{mpsc, oneshot};
 
-use self::client::{Client, Lost};
-use self::training::{End, Outbox, Task};
+use self::client::{Client, ClientError};
+use self::training::{ReportQueue, TrainingTask};
 use super::Directive;
+use crate::store::AttemptResult;
 use crate::wire::v1;
 
-/// Environment variable that says where the server's gRPC is.
+/// Environment variable with the address of the server's gRPC.
 pub const ENV_SERVER: &str = "QEDGIX_SERVER";
 /// Environment variable with the id of the job.
 pub const ENV_JOB: &str = "QEDGIX_JOB";
@@ -30,64 +32,59 @@ pub const ENV_ATTEMPT: &str = "QEDGIX_ATTEMPT";
 /// Environment variable with the attempt's secret.
 pub const ENV_TOKEN: &str = "QEDGIX_TOKEN";
 
-/// Time between two heartbeats: how long a cancel takes to arrive.
-const HEARTBEAT: Duration = Duration::from_millis(400);
+/// Time between two heartbeats, and so the longest time until a cancel arrives.
+const HEARTBEAT_INTERVAL: Duration = Duration::from_millis(400);
 
-/// Which attempt this process is, and where its server is.
+/// The attempt to work on, and the server to report to.
 #[derive(Clone)]
 pub struct Assignment {
-    /// The server's gRPC, as `http://127.0.0.1:50051`.
+    /// Address of the server's gRPC, as `http://127.0.0.1:50051`.
     pub server: String,
-    /// The job.
+    /// Id of the job.
     pub job: String,
-    /// The attempt.
+    /// Number of the attempt.
     pub attempt: String,
     /// The attempt's secret.
     pub token: String,
 }
 
-/// Why a worker could not do its work.
+/// Why a worker failed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The server refuses it or is gone.
+    /// A call to the server failed.
     #[error(transparent)]
-    Lost(#[from] Lost),
-    /// What the server sent makes no sense to this version.
-    #[error("the server sent {what} that cannot be used: {reason}")]
-    Work {
-        /// Which part.
-        what: &'static str,
-        /// What is wrong with it.
-        reason: String,
-    },
-    /// The system refuses a thread or a signal handler.
+    Client(#[from] ClientError),
+    /// The configuration from the server cannot be parsed.
+    #[error("the server sent an invalid configuration: {0}")]
+    Configuration(serde_json::Error),
+    /// The system refused a thread or a signal handler.
     #[error("starting: {0}")]
     Start(#[from] std::io::Error),
-    /// Training failed, and the server knows.
+    /// Training failed, and the failure was reported to the server.
     #[error("{0}")]
     Training(String),
 }
 
-/// What training is to do: go on, until somebody says otherwise.
+/// The directive for training, shared between threads: continue, until it is set to another.
 #[derive(Debug, Default)]
-pub(crate) struct Orders(AtomicU8);
+pub(crate) struct StopSignal(AtomicU8);
 
-impl Orders {
+impl StopSignal {
     const CONTINUE: u8 = 0;
     const PAUSE: u8 = 1;
     const CANCEL: u8 = 2;
 
-    fn give(&self, directive: Directive) {
-        let order = match directive {
+    fn set(&self, directive: Directive) {
+        let value = match directive {
             Directive::Continue => Self::CONTINUE,
             Directive::Pause => Self::PAUSE,
             Directive::Cancel => Self::CANCEL,
         };
-        // A cancel is final, and a pause is only overruled by a cancel.
-        self.0.fetch_max(order, Ordering::Relaxed);
+        // A cancel is final. A pause can only be replaced by a cancel.
+        self.0.fetch_max(value, Ordering::Relaxed);
     }
 
-    fn read(&self) -> Directive {
+    fn directive(&self) -> Directive {
         match self.0.load(Ordering::Relaxed) {
             Self::CONTINUE => Directive::Continue,
             Self::PAUSE => Directive::Pause,
@@ -96,99 +93,101 @@ impl Orders {
     }
 }
 
-/// Steps behind whatever serves people on this machine: lower priority, and first to go when memory runs out. To be called
-/// before there are threads, which inherit it.
-pub fn step_back() {
-    // Training works without either; it is only less polite.
+/// Lowers the priority of this process below that of servers on this machine, and lets the system end it first when memory
+/// runs out. Call it before starting threads, which inherit the priority.
+pub fn lower_priority() {
+    // Errors are ignored: training works without either.
     let _ = rustix::process::nice(10);
     let _ = std::fs::write("/proc/self/oom_score_adj", "500");
 }
 
-/// Ends this process when standard input does: whoever started it holds the other end and is gone.
+/// Ends this process when standard input is closed. The process that started this one holds the other end, so it has ended.
 ///
 /// # Errors
-/// The system refuses a thread.
-pub fn tether() -> std::io::Result<()> {
+/// [`std::io::Error`] when the system refuses a thread.
+pub fn exit_with_stdin() -> std::io::Result<()> {
     let watch = || {
         let mut input = std::io::stdin().lock();
         while let Ok(1..) = input.read(&mut [0; 64]) {}
-        eprintln!("the server is gone");
+        eprintln!("the server has ended");
         std::process::exit(3);
     };
-    std::thread::Builder::new().name("tether".into()).spawn(watch).map(drop)
+    std::thread::Builder::new().name("stdin".into()).spawn(watch).map(drop)
 }
 
 /// Runs the attempt to its end.
 ///
 /// # Errors
-/// The attempt is over, the server is gone, or training failed.
+/// [`Error::Client`] when the attempt has ended or the server does not answer, [`Error::Training`] when training failed.
 pub async fn run(assignment: Assignment) -> Result<(), Error> {
     let client = Client::new(&assignment)?;
-    let orders = Arc::new(Orders::default());
+    let stop = Arc::new(StopSignal::default());
     let mut terminate = tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate())?;
     let pause = async {
         terminate.recv().await;
-        orders.give(Directive::Pause);
-        std::future::pending::<Lost>().await
+        stop.set(Directive::Pause);
+        std::future::pending::<ClientError>().await
     };
-    // No heartbeat goes with the last call: it would find the attempt over.
-    let end = tokio::select! {
-        end = work(&client, Arc::clone(&orders)) => end?,
-        lost = beat(&client, &orders) => return Err(lost.into()),
-        lost = pause => return Err(lost.into()),
+    // No heartbeat is sent beside the last call, because it would find that the attempt has ended.
+    let result = tokio::select! {
+        result = train(&client, Arc::clone(&stop)) => result?,
+        error = send_heartbeats(&client, &stop) => return Err(error.into()),
+        error = pause => return Err(error.into()),
     };
-    let (outcome, reason, permanent) = match end {
-        End::Finished => (v1::Outcome::Succeeded, String::new(), false),
-        End::Stopped => (v1::Outcome::Stopped, String::new(), false),
-        End::Failed { reason, permanent } => (v1::Outcome::Failed, reason, permanent),
+    let (outcome, reason, permanent) = match result {
+        AttemptResult::Succeeded => (v1::Outcome::Succeeded, String::new(), false),
+        AttemptResult::Stopped => (v1::Outcome::Stopped, String::new(), false),
+        AttemptResult::Failed { reason, permanent } => (v1::Outcome::Failed, reason, permanent),
     };
-    tracing::info!(?outcome, reason, "done");
+    tracing::info!(?outcome, reason, "training ended");
     client.finish(v1::FinishRequest { outcome: outcome.into(), reason: reason.clone(), permanent }).await?;
     if outcome == v1::Outcome::Failed { Err(Error::Training(reason)) } else { Ok(()) }
 }
 
-/// Says that this worker lives, again and again, and passes on what the server wants.
-async fn beat(client: &Client, orders: &Orders) -> Lost {
+/// Sends heartbeats and passes on the directives of the server, until a call fails.
+async fn send_heartbeats(client: &Client, stop: &StopSignal) -> ClientError {
     loop {
         match client.heartbeat().await {
-            Ok(directive) => orders.give(directive),
-            Err(lost) => return lost,
+            Ok(directive) => stop.set(directive),
+            Err(error) => return error,
         }
-        tokio::time::sleep(HEARTBEAT).await;
+        tokio::time::sleep(HEARTBEAT_INTERVAL).await;
     }
 }
 
-async fn work(client: &Client, orders: Arc<Orders>) -> Result<End, Error> {
-    let work = client.fetch().await?;
-    let config =
-        serde_json::from_str(&work.config).map_err(|e| Error::Work { what: "a configuration", reason: e.to_string() })?;
-    let snapshot = match work.snapshot_step {
+async fn train(client: &Client, stop: Arc<StopSignal>) -> Result<AttemptResult, Error> {
+    let task = client.fetch().await?;
+    let config = serde_json::from_str(&task.config).map_err(Error::Configuration)?;
+    let snapshot = match task.snapshot_step {
         Some(_) => Some(client.download_snapshot().await?),
         None => None,
     };
-    tracing::info!(threads = work.threads, from_step = work.snapshot_step, "training");
-    let snapshot_every = Duration::from_millis(work.snapshot_every_ms);
-    let task = Task { config, threads: work.threads as usize, snapshot, snapshot_every };
+    tracing::info!(threads = task.threads, from_step = task.snapshot_step, "training");
+    let snapshot_every = Duration::from_millis(task.snapshot_every_ms);
+    let task = TrainingTask { config, threads: task.threads as usize, snapshot, snapshot_every };
 
-    let (items, inbox) = mpsc::unbounded_channel();
-    let outbox = Outbox::new(items);
-    let pending = outbox.snapshot_pending();
-    let (ended, end) = oneshot::channel();
+    let (sender, receiver) = mpsc::unbounded_channel();
+    let reports = ReportQueue::new(sender);
+    let snapshot_pending = reports.snapshot_pending();
+    let (result_sender, result) = oneshot::channel();
     let train = move || {
-        let end = std::panic::catch_unwind(AssertUnwindSafe(|| training::train(task, &outbox, &orders)));
-        let end = end.unwrap_or_else(|panic| End::Failed { reason: format!("panic: {}", words(&*panic)), permanent: false });
-        // Closed before the end is known, so that the reporter ends when it has sent all.
-        drop(outbox);
-        // Nobody waits where the process is ending.
-        let _ = ended.send(end);
+        let result = std::panic::catch_unwind(AssertUnwindSafe(|| training::train(task, &reports, &stop)));
+        let result = result.unwrap_or_else(|panic| {
+            let reason = format!("panic: {}", panic_message(&*panic));
+            AttemptResult::Failed { reason, permanent: false }
+        });
+        // Closes the queue, so that sending ends after the last report.
+        drop(reports);
+        // The receiver is dropped when the process is ending.
+        let _ = result_sender.send(result);
     };
     std::thread::Builder::new().name("training".into()).spawn(train)?;
-    report::forward(client, inbox, &pending).await?;
-    Ok(end.await.expect("training sends its end whatever happens"))
+    report::send_all(client, receiver, &snapshot_pending).await?;
+    Ok(result.await.expect("the training thread sends its result even if it panics"))
 }
 
-/// What a panic said.
-fn words(panic: &(dyn Any + Send)) -> &str {
+/// The message of a panic.
+fn panic_message(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<String>().map(String::as_str);
     text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no message")
 }

@@ -1,4 +1,4 @@
-//! Sends what training tells, in order: metrics in batches, a snapshot only when all rows before it have arrived.
+//! Sends the reports of training in order: metrics in batches, and a snapshot only after all metrics before it.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -7,48 +7,48 @@ use bytes::Bytes;
 use sha2::{Digest, Sha256};
 use tokio::sync::mpsc::UnboundedReceiver;
 
-use super::client::{Client, Lost};
-use super::training::Item;
+use super::client::{Client, ClientError};
+use super::training::Report;
 use crate::wire::v1;
 
-/// Pause in which rows gather into a batch.
-const GATHER: Duration = Duration::from_millis(100);
-/// Most rows in a batch.
-const BATCH: usize = 2000;
+/// Time in which metrics are collected for a batch.
+const BATCH_DELAY: Duration = Duration::from_millis(100);
+/// Most metrics in a batch.
+const BATCH_SIZE: usize = 2000;
 
-/// Sends everything until training has dropped its end of the queue. `snapshot_pending` is cleared when a snapshot is sent.
-pub(super) async fn forward(
+/// Sends all reports until training has closed the queue. Clears `snapshot_pending` after each snapshot.
+pub(super) async fn send_all(
     client: &Client,
-    mut inbox: UnboundedReceiver<Item>,
+    mut reports: UnboundedReceiver<Report>,
     snapshot_pending: &AtomicBool,
-) -> Result<(), Lost> {
-    let mut items = Vec::new();
-    let mut report = v1::ReportRequest::default();
-    while inbox.recv_many(&mut items, BATCH).await > 0 {
-        for item in items.drain(..) {
-            match item {
-                Item::Metrics { step, rows } => {
-                    report.step = step;
+) -> Result<(), ClientError> {
+    let mut received = Vec::new();
+    let mut batch = v1::ReportRequest::default();
+    while reports.recv_many(&mut received, BATCH_SIZE).await > 0 {
+        for report in received.drain(..) {
+            match report {
+                Report::Metrics { step, rows } => {
+                    batch.step = step;
                     let rows = rows.into_iter();
-                    report.metrics.extend(rows.map(|(step, name, value)| v1::ReportedMetric { name: name.into(), step, value }));
-                    if report.metrics.len() >= BATCH {
-                        flush(client, &mut report).await?;
+                    batch.metrics.extend(rows.map(|(step, name, value)| v1::ReportedMetric { name: name.into(), step, value }));
+                    if batch.metrics.len() >= BATCH_SIZE {
+                        flush(client, &mut batch).await?;
                     }
                 }
-                Item::Snapshot { step, bytes } => {
-                    flush(client, &mut report).await?;
+                Report::Snapshot { step, bytes } => {
+                    flush(client, &mut batch).await?;
                     let (sha256, bytes) = digest(bytes).await;
                     let header = v1::SnapshotHeader { step, size: bytes.len() as u64, sha256 };
                     match client.upload_snapshot(&header, &bytes).await {
-                        Ok(()) => tracing::debug!(step, size = bytes.len(), "snapshot sent"),
-                        Err(over @ Lost::Over(_)) => return Err(over),
-                        // The former one still stands; more is repeated after a crash, and nothing is lost.
-                        Err(e) => tracing::warn!(error = %e, step, "a snapshot could not be sent"),
+                        Ok(()) => tracing::debug!(step, size = bytes.len(), "snapshot uploaded"),
+                        Err(ended @ ClientError::AttemptEnded(_)) => return Err(ended),
+                        // The server keeps the previous snapshot. A crash would repeat more steps, but lose none.
+                        Err(e) => tracing::warn!(error = %e, step, "a snapshot could not be uploaded"),
                     }
                     snapshot_pending.store(false, Ordering::Release);
                 }
-                Item::Checkpoint { kind, step, bytes, metrics } => {
-                    flush(client, &mut report).await?;
+                Report::Checkpoint { kind, step, bytes, metrics } => {
+                    flush(client, &mut batch).await?;
                     let (sha256, bytes) = digest(bytes).await;
                     let size = bytes.len() as u64;
                     let metrics = metrics.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
@@ -57,23 +57,23 @@ pub(super) async fn forward(
                 }
             }
         }
-        flush(client, &mut report).await?;
-        if !inbox.is_closed() {
-            tokio::time::sleep(GATHER).await;
+        flush(client, &mut batch).await?;
+        if !reports.is_closed() {
+            tokio::time::sleep(BATCH_DELAY).await;
         }
     }
     Ok(())
 }
 
-async fn flush(client: &Client, report: &mut v1::ReportRequest) -> Result<(), Lost> {
-    if !report.metrics.is_empty() {
-        client.report(report).await?;
-        report.metrics.clear();
+async fn flush(client: &Client, batch: &mut v1::ReportRequest) -> Result<(), ClientError> {
+    if !batch.metrics.is_empty() {
+        client.report(batch).await?;
+        batch.metrics.clear();
     }
     Ok(())
 }
 
-/// The SHA-256 of what is sent, computed aside: heartbeats go on meanwhile.
+/// Computes the SHA-256 of an upload on another thread, so that heartbeats continue.
 async fn digest(bytes: Vec<u8>) -> (String, Bytes) {
     let hash = move || (hex::encode(Sha256::digest(&bytes)), Bytes::from(bytes));
     tokio::task::spawn_blocking(hash).await.expect("hashing does not panic")

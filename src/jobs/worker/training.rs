@@ -1,4 +1,4 @@
-//! Training as an attempt does it: the trainer's events become rows, snapshots and checkpoints. No network here.
+//! Training within an attempt: turns the events of the trainer into metrics, snapshots and checkpoints. It uses no network.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -6,77 +6,67 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::mpsc::UnboundedSender;
 
-use super::Orders;
+use super::StopSignal;
 use crate::checkpoint::Checkpoint;
 use crate::env::EpisodeMetrics;
 use crate::jobs::Directive;
 use crate::learner::{Event, TrainConfig, Trainer, evaluate, layouts};
+use crate::store::AttemptResult;
 use crate::wire::v1::CheckpointKind;
 
-/// The layouts that a job's first and published policies are compared on; training never sees them.
+/// The layouts on which a job's initial and published policies are evaluated. Training never uses them.
 const REFERENCE: &str = "eval-v1";
-/// The row that says so.
+/// The metric of that evaluation.
 const REFERENCE_ROW: &str = "eval-v1/mean_aoi";
-/// Most points of a curve: a longer run leaves out iterations in between, always the same ones.
-const POINTS: u64 = 4000;
+/// Most points of a curve. Longer runs skip iterations, the same ones in every run.
+const MAX_POINTS: u64 = 4000;
 
-/// A row: step, name, value.
+/// A metric: step, name, value.
 pub(super) type Row = (u64, &'static str, f64);
 
-/// What training tells the server.
+/// A report of training to the server.
 #[derive(Debug)]
-pub(super) enum Item {
-    /// Figures, and the step training is at.
+pub(super) enum Report {
+    /// Metrics, and the current step of training.
     Metrics { step: u64, rows: Vec<Row> },
-    /// Everything needed to go on from `step`.
+    /// Everything needed to resume at `step`.
     Snapshot { step: u64, bytes: Vec<u8> },
     /// A policy.
     Checkpoint { kind: CheckpointKind, step: u64, bytes: Vec<u8>, metrics: Vec<(&'static str, f64)> },
 }
 
-/// How training ended.
-#[derive(Debug)]
-pub(super) enum End {
-    /// All steps are done and everything is told.
-    Finished,
-    /// Stopped as ordered.
-    Stopped,
-    /// It cannot go on.
-    Failed { reason: String, permanent: bool },
-}
-
-/// What to do.
-pub(super) struct Task {
+/// A training run.
+pub(super) struct TrainingTask {
     pub config: TrainConfig,
     pub threads: usize,
     pub snapshot: Option<Vec<u8>>,
     pub snapshot_every: Duration,
 }
 
-/// Where training puts what it tells; it never waits for anybody.
-pub(super) struct Outbox {
-    items: UnboundedSender<Item>,
+/// The queue of reports. Adding a report never waits.
+pub(super) struct ReportQueue {
+    reports: UnboundedSender<Report>,
     snapshot_pending: Arc<AtomicBool>,
 }
 
-impl Outbox {
-    pub(super) fn new(items: UnboundedSender<Item>) -> Self {
-        Self { items, snapshot_pending: Arc::default() }
+impl ReportQueue {
+    pub(super) fn new(reports: UnboundedSender<Report>) -> Self {
+        Self { reports, snapshot_pending: Arc::default() }
     }
 
-    /// Whether a snapshot is on its way; whoever sends it clears this.
+    /// Whether a snapshot is queued. The sender of the queue clears it when it has uploaded the snapshot.
     pub(super) fn snapshot_pending(&self) -> Arc<AtomicBool> {
         Arc::clone(&self.snapshot_pending)
     }
 
-    fn put(&self, item: Item) {
-        // Nobody listens any more where the process is about to end.
-        let _ = self.items.send(item);
+    fn push(&self, report: Report) {
+        // The receiver is dropped when the process is about to end.
+        let _ = self.reports.send(report);
     }
 
     fn snapshot(&self, trainer: &Trainer) {
         self.snapshot_pending.store(true, Ordering::Release);
-        self.put(Item::Snapshot { step: trainer.step(), bytes: trainer.snapshot() });
+        self.push(Report::Snapshot { step: trainer.step(), bytes: trainer.snapshot() });
     }
 
     fn checkpoint(&self, kind: CheckpointKind, checkpoint: &Checkpoint) {
@@ -84,21 +74,21 @@ impl Outbox {
             let rows = Event::Evaluation { step: checkpoint.step(), metrics: *metrics }.rows();
             rows.into_iter().map(|(_, name, value)| (name, value)).collect()
         });
-        self.put(Item::Checkpoint { kind, step: checkpoint.step(), bytes: checkpoint.to_bytes(), metrics });
+        self.push(Report::Checkpoint { kind, step: checkpoint.step(), bytes: checkpoint.to_bytes(), metrics });
     }
 }
 
-/// Trains until the end or an order to stop.
-pub(super) fn train(task: Task, outbox: &Outbox, orders: &Orders) -> End {
-    match try_train(task, outbox, orders) {
+/// Trains until the end, or until `stop` is set.
+pub(super) fn train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> AttemptResult {
+    match try_train(task, reports, stop) {
         Ok(end) => end,
-        // The same configuration, snapshot or weights would be refused again.
-        Err(e) => End::Failed { reason: e.to_string(), permanent: true },
+        // Another attempt would fail with the same configuration, snapshot or weights.
+        Err(e) => AttemptResult::Failed { reason: e.to_string(), permanent: true },
     }
 }
 
-fn try_train(task: Task, outbox: &Outbox, orders: &Orders) -> Result<End, Box<dyn std::error::Error>> {
-    let Task { config, threads, snapshot, snapshot_every } = task;
+fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Result<AttemptResult, Box<dyn std::error::Error>> {
+    let TrainingTask { config, threads, snapshot, snapshot_every } = task;
     let mut trainer = match &snapshot {
         Some(bytes) => Trainer::restore(bytes, threads)?,
         None => Trainer::new(config, threads)?,
@@ -106,46 +96,46 @@ fn try_train(task: Task, outbox: &Outbox, orders: &Orders) -> Result<End, Box<dy
     drop(snapshot);
     if trainer.step() == 0 {
         let untrained = reference(&trainer.checkpoint()?, threads)?;
-        outbox.put(Item::Metrics { step: 0, rows: vec![(0, REFERENCE_ROW, untrained)] });
+        reports.push(Report::Metrics { step: 0, rows: vec![(0, REFERENCE_ROW, untrained)] });
     }
     let mut curve = Curve::new(trainer.config(), trainer.step());
-    let mut saved = Instant::now();
-    while orders.read() == Directive::Continue
+    let mut last_snapshot = Instant::now();
+    while stop.directive() == Directive::Continue
         && let Some(event) = trainer.next()
     {
         let rows = curve.rows(&event);
         if !rows.is_empty() {
-            outbox.put(Item::Metrics { step: trainer.step(), rows });
+            reports.push(Report::Metrics { step: trainer.step(), rows });
         }
         match event {
             Event::Evaluation { step, .. } if trainer.best_evaluation().is_some_and(|best| best.step == step) => {
                 if let Some(best) = trainer.best()? {
-                    outbox.checkpoint(CheckpointKind::Best, &best);
+                    reports.checkpoint(CheckpointKind::Best, &best);
                 }
             }
             Event::Diverged { step } => {
-                let reason = format!("training diverged at step {step}: a weight left the range of sensible numbers");
-                return Ok(End::Failed { reason, permanent: true });
+                let reason = format!("training diverged at step {step}: a weight is not finite or too large");
+                return Ok(AttemptResult::Failed { reason, permanent: true });
             }
             Event::Iteration(_) | Event::Evaluation { .. } | Event::Finished { .. } => {}
         }
-        if saved.elapsed() >= snapshot_every && !outbox.snapshot_pending.load(Ordering::Acquire) {
-            outbox.snapshot(&trainer);
-            saved = Instant::now();
+        if last_snapshot.elapsed() >= snapshot_every && !reports.snapshot_pending.load(Ordering::Acquire) {
+            reports.snapshot(&trainer);
+            last_snapshot = Instant::now();
         }
     }
-    match orders.read() {
-        Directive::Cancel => Ok(End::Stopped),
+    match stop.directive() {
+        Directive::Cancel => Ok(AttemptResult::Stopped),
         Directive::Pause if !trainer.finished() => {
-            outbox.snapshot(&trainer);
-            Ok(End::Stopped)
+            reports.snapshot(&trainer);
+            Ok(AttemptResult::Stopped)
         }
         Directive::Pause | Directive::Continue => {
-            outbox.checkpoint(CheckpointKind::Last, &trainer.checkpoint()?);
+            reports.checkpoint(CheckpointKind::Last, &trainer.checkpoint()?);
             let best = trainer.best()?.ok_or("no policy was ever evaluated")?;
             let step = trainer.step();
-            outbox.put(Item::Metrics { step, rows: vec![(step, REFERENCE_ROW, reference(&best, threads)?)] });
-            Ok(End::Finished)
+            reports.push(Report::Metrics { step, rows: vec![(step, REFERENCE_ROW, reference(&best, threads)?)] });
+            Ok(AttemptResult::Succeeded)
         }
     }
 }
@@ -157,15 +147,15 @@ fn reference(checkpoint: &Checkpoint, threads: usize) -> Result<f64, Box<dyn std
     Ok(EpisodeMetrics::mean(&flown).mean_aoi)
 }
 
-/// Which iterations become points of a curve, and how fast they went.
+/// Selects the iterations that become points of a curve, and measures their speed.
 struct Curve {
-    /// Environment steps of an iteration.
+    /// Environment steps per iteration.
     iteration: u64,
-    /// Of so many iterations, one becomes a point.
+    /// Every so many iterations one becomes a point.
     stride: u64,
     /// Environment steps of the run.
     steps: u64,
-    /// The last point.
+    /// Step and time of the last point.
     point: (u64, Instant),
 }
 
@@ -173,7 +163,7 @@ impl Curve {
     fn new(config: &TrainConfig, step: u64) -> Self {
         let iteration = (config.training.envs * config.environment.slots) as u64;
         let steps = config.training.steps;
-        let stride = steps.div_ceil(iteration).div_ceil(POINTS).max(1);
+        let stride = steps.div_ceil(iteration).div_ceil(MAX_POINTS).max(1);
         Self { iteration, stride, steps, point: (step, Instant::now()) }
     }
 
@@ -223,11 +213,11 @@ mod tests {
     }
 
     #[test]
-    fn a_long_run_has_few_points_and_always_its_last() {
+    fn long_run_has_at_most_max_points_and_always_the_last() {
         let short = curve_of(640 * 100);
         assert_eq!(short.len(), 100);
         let long = curve_of(640 * 9999);
-        assert!(long.len() <= POINTS as usize && long.len() > 3000, "{}", long.len());
+        assert!(long.len() <= MAX_POINTS as usize && long.len() > 3000, "{}", long.len());
         assert_eq!(long.last(), Some(&(640 * 9999)));
     }
 }

@@ -6,12 +6,14 @@
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::sync::{Arc, PoisonError, RwLock};
+use std::time::Duration;
 
 use jiff::Timestamp;
 
 use super::bucket::{Rate, TokenBucket};
 use super::scope::{Scope, Scopes};
 use super::secret;
+use crate::clock::Clock;
 use crate::service::Error;
 use crate::store::{KeyRecord, Store};
 
@@ -187,19 +189,19 @@ impl Caller {
         Err(Error::PermissionDenied(format!("this operation requires the scope {scope}; the API key {id} has {scopes}")))
     }
 
-    /// Counts one request at `now` against the rate of the key.
+    /// Counts one request against the rate of the key.
     ///
     /// # Errors
     /// [`Error::Busy`] when the key is over its rate.
-    pub fn acquire(&self, now: Timestamp) -> Result<(), Error> {
+    pub fn acquire(&self, clock: &Clock) -> Result<(), Error> {
         let key = &self.0;
-        let ms = now.as_millisecond();
+        let ms = clock.now().as_millisecond();
         // One second of precision is enough, and most requests write nothing.
         if ms.saturating_sub(key.last_used_at.load(Ordering::Relaxed)) >= 1000 {
             key.last_used_at.store(ms, Ordering::Relaxed);
         }
         let Some((rate, bucket)) = &key.limit else { return Ok(()) };
-        bucket.take(nanoseconds(now)).map_err(|retry_after| {
+        bucket.take(nanoseconds(clock.monotonic())).map_err(|retry_after| {
             let message = format!("the API key {} is limited to {} requests per second", key.id, rate.per_second);
             Error::Busy { message, retry_after }
         })
@@ -207,9 +209,9 @@ impl Caller {
 
     /// Counts `requests` more after an accepted request turned out to contain them (the slots of a batch). The request is not
     /// refused; later requests of the key wait.
-    pub fn charge(&self, requests: u32, now: Timestamp) {
+    pub fn charge(&self, requests: u32, clock: &Clock) {
         if let Some((_, bucket)) = &self.0.limit {
-            bucket.charge(requests, nanoseconds(now));
+            bucket.charge(requests, nanoseconds(clock.monotonic()));
         }
     }
 
@@ -217,12 +219,12 @@ impl Caller {
     ///
     /// # Errors
     /// [`Error::Unauthenticated`] when the key is revoked or expired, [`Error::Busy`] when it is over its rate.
-    pub fn check_and_acquire(&self, now: Timestamp) -> Result<(), Error> {
-        self.check(now)?;
-        self.acquire(now)
+    pub fn check_and_acquire(&self, clock: &Clock) -> Result<(), Error> {
+        self.check(clock.now())?;
+        self.acquire(clock)
     }
 }
 
-fn nanoseconds(time: Timestamp) -> i64 {
-    i64::try_from(time.as_nanosecond()).unwrap_or(i64::MAX)
+fn nanoseconds(time: Duration) -> i64 {
+    i64::try_from(time.as_nanos()).unwrap_or(i64::MAX)
 }

@@ -88,6 +88,15 @@ pub async fn open_store(data_dir: &Path, create: bool) -> Result<Store, Error> {
 /// # Errors
 /// [`Error::Invalid`] when the name, rate, burst or lifetime is out of range.
 pub async fn create(store: &Store, new: NewKey, now: Timestamp) -> Result<CreatedKey, Error> {
+    let (record, key) = generate(new, now)?;
+    if !store.insert_key(&record).await? {
+        return Err(Error::internal("two API keys have the same id"));
+    }
+    Ok(CreatedKey { info: info(record, now), key })
+}
+
+/// Generates a key. Returns its record and the whole key.
+fn generate(new: NewKey, now: Timestamp) -> Result<(KeyRecord, String), Error> {
     let printable = new.name.chars().all(|c| !c.is_control());
     if new.name.is_empty() || new.name.len() > 128 || !printable {
         return Err(Invalid::new("name", format!("{:?}", new.name), "1 to 128 bytes of printable text").into());
@@ -112,10 +121,7 @@ pub async fn create(store: &Store, new: NewKey, now: Timestamp) -> Result<Create
         revoked_at: None,
         last_used_at: None,
     };
-    if !store.insert_key(&record).await? {
-        return Err(Error::internal("two API keys have the same id"));
-    }
-    Ok(CreatedKey { info: info(record, now), key: plain.to_text() })
+    Ok((record, plain.to_text()))
 }
 
 /// All keys, oldest first.
@@ -136,24 +142,31 @@ pub async fn revoke(store: &Store, id: &str, now: Timestamp) -> Result<(), Error
 }
 
 /// Replaces a key, given as its id or in full: creates a key with the same properties and lifetime, and lets the old key expire after
-/// `grace`.
+/// `grace`, in one transaction.
 ///
 /// # Errors
 /// [`Error::NotFound`] when there is no such key, [`Error::Precondition`] when it is revoked or expired.
 pub async fn rotate(store: &Store, id: &str, grace: Duration, now: Timestamp) -> Result<CreatedKey, Error> {
     let id = secret::id_of(id);
     let old = store.keys().await?.into_iter().find(|key| key.id == id).ok_or_else(|| Error::not_found("API key", id))?;
+    let not_active = |state| {
+        let message = format!("the API key {id} is {state}; create a new one");
+        Error::Precondition { code: "wrong_state", message }
+    };
     let state = state(&old, now);
     if state != "active" {
-        let message = format!("the API key {id} is {state}; make a new one");
-        return Err(Error::Precondition { code: "wrong_state", message });
+        return Err(not_active(state));
     }
     let end = after(now, grace, "grace")?;
     let lifetime = old.expires_at.and_then(|at| Duration::try_from(at.duration_since(old.created_at)).ok());
     let scopes = Scopes::from_stored(&old.scopes);
-    let created = create(store, NewKey { name: old.name, scopes, lifetime, rate: old.rate, burst: old.burst }, now).await?;
-    store.end_key(id, end).await?;
-    Ok(created)
+    let new = NewKey { name: old.name, scopes, lifetime, rate: old.rate, burst: old.burst };
+    let (record, key) = generate(new, now)?;
+    if !store.rotate_key(id, &record, end).await? {
+        // The key was active when it was read.
+        return Err(not_active("revoked"));
+    }
+    Ok(CreatedKey { info: info(record, now), key })
 }
 
 fn after(now: Timestamp, time: Duration, field: &str) -> Result<Timestamp, Invalid> {

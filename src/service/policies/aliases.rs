@@ -1,8 +1,8 @@
-//! Aliases: names for versions that move, and where they have been.
+//! Aliases: movable names of versions, and the history of their moves.
 
 use std::collections::BTreeMap;
 
-use super::{Shelf, in_turn};
+use super::{PolicyStores, serialized};
 use crate::invalid::Invalid;
 use crate::service::paging::number;
 use crate::service::{App, Error, Page, PageRequest};
@@ -10,47 +10,48 @@ use crate::serving::{Kind, PolicyRef, PolicySpec, Registry, Which, check_name};
 use crate::store::{AliasMove, Promotion, PromotionFilter};
 
 /// Most aliases of one policy.
-const MOST: usize = 100;
+const MAX_ALIASES: usize = 100;
 
-/// An alias, and what is to become of it.
+/// An alias to set or delete.
 #[derive(Clone, Debug)]
-pub struct Target {
+pub struct AliasChange {
     /// Name of the policy.
     pub name: String,
     /// The alias.
     pub alias: String,
-    /// What it must mean now for anything to happen: a version, or 0 for nothing.
+    /// The version that the alias must point to before the change; 0 if it must not exist, `None` for any.
     pub expected: Option<u64>,
-    /// Who does it, where that is known.
+    /// Id of the caller's API key.
     pub by: Option<String>,
 }
 
-/// Aliases of the policy `name` and the versions that they mean.
+/// Aliases of the policy `name`, and the versions that they point to.
 ///
 /// # Errors
-/// There is no such policy.
+/// [`Error::NotFound`], or [`Error::Invalid`] for a malformed name.
 pub fn aliases(app: &App, name: &str) -> Result<BTreeMap<String, u64>, Error> {
     check_name("policy", name)?;
     Ok(app.registry.aliases(name)?)
 }
 
-/// Lets an alias mean `version`, for every request that comes afterwards, and returns what it meant before. It may mean
-/// that version already: then nothing happens, and nothing is added to its history.
+/// Points an alias to `version` for all later requests, and returns the version that it pointed to before. If that is the same
+/// version, nothing is added to the history.
 ///
 /// # Errors
-/// There is no such version, it is unloaded, it is a baseline's, or the alias means something else than expected.
-pub async fn set_alias(app: &App, target: Target, version: u64) -> Result<Option<u64>, Error> {
-    check(&target)?;
+/// [`Error::NotFound`] when there is no such version; [`Error::Precondition`] when it is unloaded, the policy is a baseline, or
+/// the alias does not point to the expected version; [`Error::Invalid`] for malformed names or too many aliases.
+pub async fn set_alias(app: &App, change: AliasChange, version: u64) -> Result<Option<u64>, Error> {
+    check_names(&change)?;
     let at = app.clock.now();
-    in_turn(app, async move |Shelf { store, registry }| {
-        let Target { name, alias, by, .. } = &target;
+    serialized(app, async move |PolicyStores { store, registry }| {
+        let AliasChange { name, alias, by, .. } = &change;
         let spec = PolicySpec { name: name.clone(), which: Which::Version(version) };
         let found = registry.describe(&spec)?;
         if found.about.kind == Kind::Baseline {
-            let message = format!("{name} is a baseline: it has one version and needs no alias");
+            let message = format!("{name} is a baseline, which has one version and no aliases");
             return Err(Error::Precondition { code: "no_checkpoint", message });
         }
-        check_expected(&registry, &target)?;
+        check_expected(&registry, &change)?;
         check_alias(&registry, name, alias)?;
         if !found.loaded {
             return Err(unloaded(&found.about.reference));
@@ -67,16 +68,16 @@ pub async fn set_alias(app: &App, target: Target, version: u64) -> Result<Option
 /// Deletes an alias.
 ///
 /// # Errors
-/// There is none, or it means something else than expected.
-pub async fn delete_alias(app: &App, target: Target) -> Result<(), Error> {
-    check(&target)?;
+/// [`Error::NotFound`], or [`Error::Precondition`] when the alias does not point to the expected version.
+pub async fn delete_alias(app: &App, change: AliasChange) -> Result<(), Error> {
+    check_names(&change)?;
     let at = app.clock.now();
-    in_turn(app, async move |Shelf { store, registry }| {
-        let Target { name, alias, by, .. } = &target;
+    serialized(app, async move |PolicyStores { store, registry }| {
+        let AliasChange { name, alias, by, .. } = &change;
         let Some(version) = registry.aliases(name)?.remove(alias) else {
             return Err(Error::not_found("alias", format!("{name}@{alias}")));
         };
-        check_expected(&registry, &target)?;
+        check_expected(&registry, &change)?;
         let m = AliasMove { name, alias, to: None, at, by: by.as_deref() };
         store.move_policy_alias(m).await?;
         registry.remove_alias(name, alias);
@@ -104,31 +105,31 @@ pub async fn history(app: &App, name: &str, alias: Option<&str>, page: &PageRequ
     Ok(Page::new(moves, more, |last| last.id.to_string()))
 }
 
-fn check(target: &Target) -> Result<(), Invalid> {
-    check_name("policy", &target.name)?;
-    check_name("alias", &target.alias)
+fn check_names(change: &AliasChange) -> Result<(), Invalid> {
+    check_name("policy", &change.name)?;
+    check_name("alias", &change.alias)
 }
 
-/// Checks that `alias` is one of `name`, or that there is room for it.
+/// Checks that policy `name` has this alias, or may have another.
 pub(super) fn check_alias(registry: &Registry, name: &str, alias: &str) -> Result<(), Error> {
     let known = registry.aliases(name).unwrap_or_default();
-    if known.len() < MOST || known.contains_key(alias) {
+    if known.len() < MAX_ALIASES || known.contains_key(alias) {
         return Ok(());
     }
-    Err(Invalid::new("alias", format!("{alias:?}, one more"), format!("at most {MOST} aliases of a policy")).into())
+    Err(Invalid::new("alias", format!("{alias:?}"), format!("at most {MAX_ALIASES} aliases per policy")).into())
 }
 
-fn check_expected(registry: &Registry, target: &Target) -> Result<(), Error> {
-    let Target { name, alias, expected, .. } = target;
+fn check_expected(registry: &Registry, change: &AliasChange) -> Result<(), Error> {
+    let AliasChange { name, alias, expected, .. } = change;
     let now = registry.aliases(name)?.remove(alias).unwrap_or(0);
     let Some(expected) = expected.filter(|&expected| expected != now) else { return Ok(()) };
-    let means = |version| if version == 0 { "nothing".to_owned() } else { format!("version {version}") };
-    let message = format!("{name}@{alias} means {}, not {} as expected", means(now), means(expected));
+    let target = |version| if version == 0 { "nothing".to_owned() } else { format!("version {version}") };
+    let message = format!("{name}@{alias} points to {}; expected {}", target(now), target(expected));
     Err(Error::Precondition { code: "alias_moved", message })
 }
 
-/// An alias of such a version would make callers fail.
+/// The error for an alias to an unloaded version, which would make its callers fail.
 pub(super) fn unloaded(reference: &PolicyRef) -> Error {
-    let message = format!("policy {reference} is unloaded; load it before an alias means it");
+    let message = format!("policy {reference} is unloaded; load it before an alias points to it");
     Error::Precondition { code: "policy_unloaded", message }
 }

@@ -1,19 +1,19 @@
-//! Which versions can be asked: at start, and as people load and unload them.
+//! Loads policy versions into the registry: all at start, and single ones when callers load and unload them.
 
 use std::error::Error as _;
 use std::sync::Arc;
 
 use sha2::{Digest, Sha256};
 
-use super::publish::{Stored, publish};
-use super::{Shelf, in_turn};
+use super::publish::{StoredVersion, publish};
+use super::{PolicyStores, serialized};
 use crate::invalid::Invalid;
 use crate::policy::baselines::{self, EnvParams};
 use crate::service::{App, Error};
 use crate::serving::bundled::BUNDLED;
 use crate::serving::{About, Kind, LoadedPolicy, PolicyRef, PolicySpec, Registry, Which};
 
-/// A version and whether it can be asked.
+/// A version and whether it is loaded.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct IndexEntry {
     /// Name of the policy.
@@ -22,11 +22,11 @@ pub struct IndexEntry {
     pub version: u64,
     /// Whether it is loaded.
     pub ready: bool,
-    /// Why it is not; empty if it is.
+    /// Why the version is not loaded; empty if it is.
     pub reason: String,
 }
 
-/// Every version in order of names and numbers.
+/// All versions by name and number.
 pub fn index(app: &App) -> Vec<IndexEntry> {
     let entry = |reference: &PolicyRef, ready| IndexEntry {
         name: reference.name.clone(),
@@ -37,14 +37,14 @@ pub fn index(app: &App) -> Vec<IndexEntry> {
     app.registry.versions().iter().map(|(about, ready)| entry(&about.reference, *ready)).collect()
 }
 
-/// Loads every version of a policy (`NAME`) or one (`NAME:VERSION`). Those that are loaded stay as they are.
+/// Loads every version of a policy (`NAME`) or one (`NAME:VERSION`). Loaded versions stay as they are.
 ///
 /// # Errors
-/// There is no such version, or its checkpoint cannot be read any more; then nothing changes.
+/// [`Error::NotFound`] when there is no such version, [`Error::Internal`] when a checkpoint is damaged. Nothing changes then.
 pub async fn load_policy(app: &App, name: &str) -> Result<(), Error> {
     let spec = spec_of(name)?;
     let now = app.clock.now();
-    in_turn(app, async move |Shelf { store, registry }| {
+    serialized(app, async move |PolicyStores { store, registry }| {
         let mut loaded = Vec::new();
         for (about, ready) in versions(&registry, &spec)? {
             loaded.push(match (ready, about.kind) {
@@ -54,13 +54,15 @@ pub async fn load_policy(app: &App, name: &str) -> Result<(), Error> {
                     let policy = baselines::by_name(&spec.name, EnvParams::default()).ok_or_else(missing)?;
                     LoadedPolicy { about, policy }
                 }
-                (false, Kind::Checkpoint) => Stored::new(&store, &spec.name, about.reference.version).await?.load().await?,
+                (false, Kind::Checkpoint) => {
+                    StoredVersion::read(&store, &spec.name, about.reference.version).await?.load().await?
+                }
             });
         }
         let numbers: Vec<u64> = loaded.iter().map(|policy| policy.reference.version).collect();
-        store.serve_policy_versions(&spec.name, &numbers, true, now).await?;
+        store.set_policy_versions_loaded(&spec.name, &numbers, true, now).await?;
         for policy in loaded {
-            tracing::info!(policy = %policy.reference, "loaded");
+            tracing::info!(policy = %policy.reference, "policy loaded");
             registry.insert(policy);
         }
         Ok(())
@@ -68,21 +70,21 @@ pub async fn load_policy(app: &App, name: &str) -> Result<(), Error> {
     .await
 }
 
-/// Unloads every version of a policy (`NAME`) or one (`NAME:VERSION`). Sessions that fly one go on; whoever asks for it
-/// otherwise, by an alias too, is told that it is unloaded. That lasts until it is loaded, restarts included.
+/// Unloads every version of a policy (`NAME`) or one (`NAME:VERSION`) until it is loaded again, also across restarts. Open
+/// sessions continue; all other requests for the version, also by an alias, are refused.
 ///
 /// # Errors
-/// There is no such version.
+/// [`Error::NotFound`] when there is no such version.
 pub async fn unload_policy(app: &App, name: &str) -> Result<(), Error> {
     let spec = spec_of(name)?;
     let now = app.clock.now();
-    in_turn(app, async move |Shelf { store, registry }| {
+    serialized(app, async move |PolicyStores { store, registry }| {
         let all = versions(&registry, &spec)?;
         let numbers: Vec<u64> = all.iter().filter(|(_, ready)| *ready).map(|(about, _)| about.reference.version).collect();
-        store.serve_policy_versions(&spec.name, &numbers, false, now).await?;
+        store.set_policy_versions_loaded(&spec.name, &numbers, false, now).await?;
         for version in numbers {
             registry.unload(&spec.name, version);
-            tracing::info!(policy = spec.name, version, "unloaded");
+            tracing::info!(policy = spec.name, version, "policy unloaded");
         }
         Ok(())
     })
@@ -97,7 +99,7 @@ fn spec_of(name: &str) -> Result<PolicySpec, Invalid> {
     Ok(spec)
 }
 
-/// The versions that `spec` means, of all of its name.
+/// The versions that `spec` names, and whether each is loaded.
 fn versions(registry: &Registry, spec: &PolicySpec) -> Result<Vec<(Arc<About>, bool)>, Error> {
     let mut found = registry.versions_of(&spec.name);
     if let Which::Version(version) = spec.which {
@@ -106,26 +108,26 @@ fn versions(registry: &Registry, spec: &PolicySpec) -> Result<Vec<(Arc<About>, b
     if found.is_empty() { Err(Error::not_found("policy", spec.to_string())) } else { Ok(found) }
 }
 
-/// Fills the registry: baselines, bundled policies, what was published before, aliases; what was unloaded stays unloaded.
+/// Fills the registry with baselines, published versions, bundled policies and aliases. Unloaded versions stay unloaded. A
+/// damaged version is logged and left out.
 ///
 /// # Errors
-/// The store cannot be read, or a bundled policy is no checkpoint. A published version that cannot be read any more is left
-/// out and logged: the others are served.
+/// [`Error::Internal`] when the database fails, [`Error::Invalid`] when a bundled policy is not a checkpoint.
 pub async fn load(app: &App) -> Result<(), Error> {
     let world = EnvParams::default();
     for baseline in &baselines::LIST {
         let Some(policy) = baselines::by_name(baseline.name, world) else { continue };
-        // The digest says what a checkpoint's does: equal digests, equal answers.
+        // Equal digests mean equal headings, as for checkpoints.
         let digest = Sha256::digest(format!("baseline {} {world:?}", baseline.name)).into();
         let reference = PolicyRef { name: baseline.name.to_owned(), version: 1, digest };
         app.registry.insert(LoadedPolicy::baseline(reference, baseline.description, policy, app.clock.now()));
     }
     for (name, version) in app.store.policy_versions().await? {
-        match Stored::new(&app.store, &name, version).await?.load().await {
+        match StoredVersion::read(&app.store, &name, version).await?.load().await {
             Ok(policy) => drop(app.registry.insert(policy)),
             Err(e) => {
                 let reason = e.source().map_or_else(|| e.to_string(), ToString::to_string);
-                tracing::error!(policy = name, version, reason, "its checkpoint cannot be read");
+                tracing::error!(policy = name, version, reason, "a checkpoint cannot be read");
             }
         }
     }

@@ -1,7 +1,7 @@
-//! Policies: which there are, publishing checkpoints as versions, aliases that move, versions loaded and unloaded.
+//! The use cases of policies: list, get and export; publish checkpoints as versions; move aliases; load and unload versions.
 //!
-//! What these functions change is committed first and served afterwards. Changes take turns, so the registry goes through
-//! the states of the database in their order, and each runs to its end even if whoever asked for it has left.
+//! A change is committed to the database first and applied to the registry afterwards. Changes are serialized, so the registry
+//! passes through the states of the database in order. A change runs to its end even if the caller disconnects.
 
 mod aliases;
 mod loading;
@@ -9,9 +9,9 @@ mod publish;
 
 use std::sync::Arc;
 
-pub use aliases::{Target, aliases, delete_alias, history, set_alias};
+pub use aliases::{AliasChange, aliases, delete_alias, history, set_alias};
 pub use loading::{IndexEntry, index, load, load_policy, unload_policy};
-pub use publish::{Source, Upload, check_publishable, publish, upload};
+pub use publish::{CheckpointSource, PolicyUpload, check_publishable, publish, upload};
 
 use super::paging::json_bytes;
 use super::{App, Error, Page, PageRequest};
@@ -31,7 +31,7 @@ pub fn list(app: &App, page: &PageRequest) -> Result<Page<Described>, Error> {
 /// The version that `spec` names, loaded or not.
 ///
 /// # Errors
-/// There is none.
+/// [`Error::NotFound`].
 pub fn get(app: &App, spec: &PolicySpec) -> Result<Described, Error> {
     Ok(app.registry.describe(spec)?)
 }
@@ -39,31 +39,31 @@ pub fn get(app: &App, spec: &PolicySpec) -> Result<Described, Error> {
 /// The checkpoint of the version that `spec` names, loaded or not, as safetensors.
 ///
 /// # Errors
-/// There is no such version, or it is a baseline, which has no checkpoint.
+/// [`Error::NotFound`], or [`Error::Precondition`] for a baseline, which has no checkpoint.
 pub async fn export(app: &App, spec: &PolicySpec) -> Result<(PolicyRef, Vec<u8>), Error> {
     let about = app.registry.describe(spec)?.about;
     let PolicyRef { name, version, .. } = &about.reference;
     if about.kind == Kind::Baseline {
-        let message = format!("{name} is a baseline: it flies by rule and has no checkpoint to export");
+        let message = format!("{name} is a baseline, which has no checkpoint to export");
         return Err(Error::Precondition { code: "no_checkpoint", message });
     }
-    publish::Stored::new(&app.store, name, *version).await?.checkpoint()
+    publish::StoredVersion::read(&app.store, name, *version).await?.checkpoint()
 }
 
-/// What a change of policies works with.
-struct Shelf {
+/// What a change of policies changes: the database, then the registry.
+struct PolicyStores {
     store: Store,
     registry: Arc<Registry>,
 }
 
-/// Runs `change` when it is its turn, to its end.
-async fn in_turn<T, F>(app: &App, change: impl FnOnce(Shelf) -> F) -> Result<T, Error>
+/// Runs `change` after all changes before it, to its end.
+async fn serialized<T, F>(app: &App, change: impl FnOnce(PolicyStores) -> F) -> Result<T, Error>
 where
     T: Send + 'static,
     F: Future<Output = Result<T, Error>> + Send + 'static,
 {
     let registry = app.registry.clone();
-    let change = change(Shelf { store: app.store.clone(), registry: registry.clone() });
+    let change = change(PolicyStores { store: app.store.clone(), registry: registry.clone() });
     let task = tokio::spawn(async move {
         let _turn = registry.turn().await;
         change.await

@@ -1,4 +1,4 @@
-//! Checkpoints become versions.
+//! Publishes checkpoints as versions of policies.
 
 use std::sync::Arc;
 
@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
 use super::aliases::{check_alias, unloaded};
-use super::{Shelf, in_turn};
+use super::{PolicyStores, serialized};
 use crate::checkpoint::Checkpoint;
 use crate::invalid::Invalid;
 use crate::policy::baselines;
@@ -16,32 +16,32 @@ use crate::service::{App, Error, jobs};
 use crate::serving::{About, Described, Kind, LoadedPolicy, PolicyRef, PolicySpec, Which, check_name};
 use crate::store::{NewPolicyVersion, PolicyVersion, Store};
 
-/// Where a checkpoint comes from.
+/// The checkpoint to publish.
 #[derive(Clone, Debug)]
-pub enum Source {
-    /// Here it is, as safetensors.
+pub enum CheckpointSource {
+    /// A checkpoint as safetensors.
     Bytes(Vec<u8>),
-    /// A job made it; its id.
-    Checkpoint(String),
+    /// The id of a job's checkpoint.
+    Job(String),
 }
 
-/// A checkpoint to publish.
+/// A request to publish a checkpoint.
 #[derive(Clone, Debug)]
-pub struct Upload {
-    /// Name of the policy, new or known.
+pub struct PolicyUpload {
+    /// Name of the policy; it may be new.
     pub name: String,
     /// The checkpoint.
-    pub source: Source,
-    /// An alias that shall mean it.
+    pub source: CheckpointSource,
+    /// An alias to point to the version.
     pub alias: Option<String>,
-    /// Who publishes it, where that is known.
+    /// Id of the caller's API key.
     pub by: Option<String>,
 }
 
-/// Checks that policies may be published as `name`.
+/// Checks that a policy may be published as `name`.
 ///
 /// # Errors
-/// A name that no policy can have, or a baseline's.
+/// [`Invalid`] for a malformed name or the name of a baseline.
 pub fn check_publishable(name: &str) -> Result<(), Invalid> {
     check_name("name", name)?;
     if baselines::LIST.iter().any(|baseline| baseline.name == name) {
@@ -50,37 +50,38 @@ pub fn check_publishable(name: &str) -> Result<(), Invalid> {
     Ok(())
 }
 
-/// Stores a checkpoint (safetensors) as the next version of policy `name` and serves it. Equal bytes under the same name are
-/// the version that they already are, loaded or not.
+/// Publishes a checkpoint (safetensors) as the next version of policy `name` and loads it. Publishing identical bytes returns
+/// the existing version, loaded or not.
 ///
 /// # Errors
-/// A name that cannot be used, bytes that are no checkpoint, a database that fails.
+/// [`Error::Invalid`] for a name or bytes that cannot be published, [`Error::Internal`] when the database fails.
 pub async fn publish(app: &App, name: &str, bytes: Vec<u8>) -> Result<PolicyRef, Error> {
-    let (reference, _) = keep(app, name, bytes, None, None).await?;
+    let (reference, _) = store_version(app, name, bytes, None, None).await?;
     Ok(reference)
 }
 
-/// Publishes what somebody sends, and tells whether it is a new version.
+/// Publishes the checkpoint of a caller. Returns the version, and whether it is new.
 ///
 /// # Errors
-/// As [`publish`]; an unknown checkpoint, an alias that cannot be used, an alias for a version that is unloaded, draining.
-pub async fn upload(app: &App, upload: Upload) -> Result<(Described, bool), Error> {
+/// As [`publish`]; [`Error::NotFound`] for an unknown checkpoint, [`Error::Precondition`] for an alias to an unloaded version,
+/// [`Error::Draining`].
+pub async fn upload(app: &App, upload: PolicyUpload) -> Result<(Described, bool), Error> {
     app.admit()?;
-    let Upload { name, source, alias, by } = upload;
+    let PolicyUpload { name, source, alias, by } = upload;
     check_publishable(&name)?;
     if let Some(alias) = &alias {
         check_name("alias", alias)?;
     }
     let bytes = match source {
-        Source::Bytes(bytes) => bytes,
-        Source::Checkpoint(id) => jobs::checkpoint(app, &id).await?.1,
+        CheckpointSource::Bytes(bytes) => bytes,
+        CheckpointSource::Job(id) => jobs::checkpoint(app, &id).await?.1,
     };
-    let (reference, new) = keep(app, &name, bytes, alias, by).await?;
+    let (reference, new) = store_version(app, &name, bytes, alias, by).await?;
     let spec = PolicySpec { name, which: Which::Version(reference.version) };
     Ok((app.registry.describe(&spec)?, new))
 }
 
-async fn keep(
+async fn store_version(
     app: &App,
     name: &str,
     bytes: Vec<u8>,
@@ -88,10 +89,10 @@ async fn keep(
     by: Option<String>,
 ) -> Result<(PolicyRef, bool), Error> {
     check_publishable(name)?;
-    let read = Read::new(bytes).await?;
-    let mut reference = PolicyRef { name: name.to_owned(), version: 0, digest: read.digest };
+    let parsed = ParsedCheckpoint::parse(bytes).await?;
+    let mut reference = PolicyRef { name: name.to_owned(), version: 0, digest: parsed.digest };
     let now = app.clock.now();
-    in_turn(app, async move |Shelf { store, registry }| {
+    serialized(app, async move |PolicyStores { store, registry }| {
         let of_name = registry.versions_of(&reference.name);
         let known = of_name.into_iter().find(|(about, _)| about.reference.digest == reference.digest);
         if let Some(alias) = &alias {
@@ -103,59 +104,59 @@ async fn keep(
         let new = NewPolicyVersion {
             name: &reference.name,
             digest: &reference.digest_hex(),
-            checkpoint: &read.bytes,
+            checkpoint: &parsed.bytes,
             now,
             alias: alias.as_deref(),
             by: by.as_deref(),
         };
         let published = store.publish_policy(new).await?;
         reference.version = published.version;
-        // One that is known stays as it is: what was unloaded comes back when somebody loads it.
+        // A known version stays as it is: loaded or unloaded.
         if known.is_none() {
-            registry.insert(read.learned(reference.clone(), published.created_at));
+            registry.insert(parsed.into_policy(reference.clone(), published.created_at));
         }
         if let Some(alias) = &alias {
             registry.set_alias(&reference.name, alias, reference.version);
         }
         if published.new {
-            tracing::info!(policy = %reference, digest = reference.digest_hex(), alias, "published");
+            tracing::info!(policy = %reference, digest = reference.digest_hex(), alias, "policy published");
         }
         Ok((reference, published.new))
     })
     .await
 }
 
-/// A checkpoint that was read, and what flies it.
-struct Read {
+/// A parsed checkpoint and its policy.
+struct ParsedCheckpoint {
     checkpoint: Checkpoint,
     policy: Arc<dyn Policy>,
     bytes: Vec<u8>,
     digest: [u8; 32],
 }
 
-impl Read {
-    /// Reads a checkpoint away from the threads that serve connections.
-    async fn new(bytes: Vec<u8>) -> Result<Self, Error> {
-        let read = tokio::task::spawn_blocking(move || {
+impl ParsedCheckpoint {
+    /// Parses a checkpoint on a thread that does not serve connections.
+    async fn parse(bytes: Vec<u8>) -> Result<Self, Error> {
+        let parsed = tokio::task::spawn_blocking(move || {
             let size = bytes.len();
             let refused = |e| Invalid::new("checkpoint", format!("{size} bytes"), format!("a checkpoint of this program ({e})"));
             let checkpoint = Checkpoint::from_bytes(&bytes).map_err(refused)?;
             let (policy, digest) = (Arc::new(checkpoint.policy()), Sha256::digest(&bytes).into());
             Ok(Self { checkpoint, policy, bytes, digest })
         });
-        read.await.map_err(Error::internal)?
+        parsed.await.map_err(Error::internal)?
     }
 
     /// The policy, published as `reference`.
-    fn learned(self, reference: PolicyRef, created_at: i64) -> LoadedPolicy {
+    fn into_policy(self, reference: PolicyRef, created_at: i64) -> LoadedPolicy {
         let (config, step) = (self.checkpoint.config(), self.checkpoint.step());
         let (environment, training) = (&config.environment, &config.training);
         let flat = training.observation == ObservationKind::Flat;
         let object = |value: serde_json::Result<Value>| value.unwrap_or_default();
         let mut metrics = json!({"step": step});
-        let figures = object(serde_json::to_value(self.checkpoint.metrics()));
-        if let (Some(all), Value::Object(figures)) = (metrics.as_object_mut(), figures) {
-            all.extend(figures);
+        let evaluated = object(serde_json::to_value(self.checkpoint.metrics()));
+        if let (Some(all), Value::Object(evaluated)) = (metrics.as_object_mut(), evaluated) {
+            all.extend(evaluated);
         }
         let (uavs, users) = (environment.uavs, environment.users);
         let about = About {
@@ -175,14 +176,14 @@ impl Read {
     }
 }
 
-/// A published version out of the store.
-pub(super) struct Stored {
+/// A published version as stored.
+pub(super) struct StoredVersion {
     reference: PolicyRef,
     version: PolicyVersion,
 }
 
-impl Stored {
-    pub(super) async fn new(store: &Store, name: &str, version: u64) -> Result<Self, Error> {
+impl StoredVersion {
+    pub(super) async fn read(store: &Store, name: &str, version: u64) -> Result<Self, Error> {
         let found = store.policy_version(name, version).await?;
         let found = found.ok_or_else(|| Error::not_found("checkpoint", format!("{name}:{version}")))?;
         let hash = move || (Sha256::digest(&found.checkpoint).into(), found);
@@ -190,20 +191,20 @@ impl Stored {
         Ok(Self { reference: PolicyRef { name: name.to_owned(), version: version.version, digest }, version })
     }
 
-    /// The checkpoint, if its bytes are those that were published.
+    /// The checkpoint, after a check that it has not changed since it was published.
     pub(super) fn checkpoint(self) -> Result<(PolicyRef, Vec<u8>), Error> {
         let Self { reference, version } = self;
         if reference.digest_hex() != version.digest {
-            let reason = format!("the checkpoint of {reference} is damaged: another digest than when it was published");
+            let reason = format!("the checkpoint of {reference} is damaged: its digest has changed");
             return Err(Error::internal(reason));
         }
         Ok((reference, version.checkpoint))
     }
 
-    /// What flies it.
+    /// The policy, ready to be added to the registry.
     pub(super) async fn load(self) -> Result<LoadedPolicy, Error> {
         let created_at = self.version.created_at;
         let (reference, bytes) = self.checkpoint()?;
-        Ok(Read::new(bytes).await?.learned(reference, created_at))
+        Ok(ParsedCheckpoint::parse(bytes).await?.into_policy(reference, created_at))
     }
 }

@@ -9,10 +9,11 @@ use tokio::sync::{Mutex, OwnedMutexGuard, OwnedSemaphorePermit};
 
 use super::blueprint::{Blueprint, check_seed, episode_seed};
 use super::state::{CopyState, Finished, Sight, State};
+use crate::clock::Clock;
 use crate::env::{BatchEnv, EpisodeMetrics};
 use crate::invalid::Invalid;
+use crate::serving::Error;
 use crate::serving::table::{Entry, LastUse};
-use crate::serving::{Clock, Error};
 
 /// Environments with more work per step are stepped away from the threads that serve connections.
 pub(super) const LARGE: usize = 16_384;
@@ -194,8 +195,8 @@ impl Environment {
             id,
             blueprint,
             created_at,
+            used: LastUse::at(clock.monotonic()),
             clock,
-            used: LastUse::at(created_at),
             progress: Lock::new(world.progress),
             world: Arc::new(Mutex::new(world)),
             _share: share,
@@ -222,7 +223,7 @@ impl Environment {
             _ if self.blueprint != *blueprint => "and was created differently",
             world if !world.untouched => "and has flown or been reset",
             _ => {
-                self.used.touch(self.clock.now());
+                self.used.touch(self.clock.monotonic());
                 return Ok(());
             }
         };
@@ -290,7 +291,7 @@ impl Environment {
     /// Shows what is the case now.
     fn leave(&self, world: &World, graph: bool) -> State {
         *self.progress() = world.progress;
-        self.used.touch(self.clock.now());
+        self.used.touch(self.clock.monotonic());
         world.state(graph)
     }
 

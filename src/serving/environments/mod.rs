@@ -14,7 +14,8 @@ use std::sync::Arc;
 use tokio::sync::Semaphore;
 
 use super::table::{Found, Table, fresh_name};
-use super::{Clock, Error, Limits};
+use super::{Error, Limits};
+use crate::clock::Clock;
 use environment::World;
 
 /// Bytes that are accounted for together.

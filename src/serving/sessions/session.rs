@@ -11,8 +11,9 @@ use jiff::Timestamp;
 use tokio::sync::{Mutex, MutexGuard};
 
 use super::{Opened, SessionInfo};
+use crate::clock::Clock;
 use crate::serving::table::{Entry, LastUse};
-use crate::serving::{Clock, Error, Fleet, LoadedPolicy, Outcome, Room, Timings};
+use crate::serving::{Error, Fleet, LoadedPolicy, Outcome, Room, Timings};
 
 /// Former runs that a session remembers, to refuse them.
 const FORMER_RUNS: usize = 64;
@@ -106,7 +107,7 @@ impl Session {
             used_memory: Vec::new(),
             used: Room::default(),
         };
-        let used = LastUse::at(opened_at);
+        let used = LastUse::at(clock.monotonic());
         let (steps, over) = (AtomicU64::new(0), AtomicBool::new(false));
         Self { id, policy, opened_at, clock, used, steps, over, state: Mutex::new(state) }
     }
@@ -187,7 +188,7 @@ impl Session {
             None => {}
         }
         self.steps.store(state.steps, Ordering::Relaxed);
-        self.used.touch(self.clock.now());
+        self.used.touch(self.clock.monotonic());
         Ok(())
     }
 
@@ -275,7 +276,7 @@ impl NextTurn<'_> {
             state.used = Room { headings, q_values };
         }
         self.session.steps.store(state.steps, Ordering::Relaxed);
-        self.session.used.touch(self.session.clock.now());
+        self.session.used.touch(self.session.clock.monotonic());
         answered
     }
 }

@@ -1,9 +1,8 @@
-use std::sync::Mutex;
-
 use super::*;
+use crate::clock::ManualClock;
 use crate::invalid::Invalid;
 use crate::policy::{Policy, RequiredInput};
-use crate::serving::{Clock, Fleet, Limits, Outcome, Timings};
+use crate::serving::{Fleet, Limits, Outcome, Timings};
 
 struct Nothing;
 
@@ -35,14 +34,9 @@ fn policy(name: &str) -> Arc<LoadedPolicy> {
 }
 
 fn sessions(max: usize) -> (Sessions, impl Fn(u64)) {
-    let now = Arc::new(Mutex::new(Timestamp::UNIX_EPOCH));
-    let told = now.clone();
-    let clock = Clock::new(move || *told.lock().unwrap());
-    let pass = move |seconds| {
-        let mut now = now.lock().unwrap();
-        *now = now.checked_add(Duration::from_secs(seconds)).unwrap();
-    };
-    (Sessions::new(Limits { ttl: Duration::from_secs(600), max }, clock), pass)
+    let time = ManualClock::new(Timestamp::UNIX_EPOCH);
+    let sessions = Sessions::new(Limits { ttl: Duration::from_secs(600), max }, time.clock());
+    (sessions, move |seconds| time.advance(Duration::from_secs(seconds)))
 }
 
 fn named(id: &str) -> Opened {

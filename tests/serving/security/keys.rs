@@ -133,6 +133,27 @@ async fn rotation_keeps_what_a_key_is_and_ends_the_old_one() {
 }
 
 #[tokio::test]
+async fn a_rotation_that_fails_leaves_no_new_key() {
+    let server = Server::start().await;
+    let old = make(&server, "read", |_| {}).await;
+    let (store, now) = (&server.app.store, server.app.clock.now());
+    let database = format!("sqlite://{}", server.dir.path().join("qedgix.sqlite").display());
+    let mut other = <sqlx::SqliteConnection as sqlx::Connection>::connect(&database).await.unwrap();
+    let full = "CREATE TRIGGER full BEFORE UPDATE OF expires_at ON api_keys BEGIN SELECT RAISE(ABORT, 'disk full'); END";
+    sqlx::query(full).execute(&mut other).await.unwrap();
+    assert_eq!(keys::rotate(store, &old.key, Duration::ZERO, now).await.err().unwrap().code(), "internal");
+    let list = keys::list(store, now).await.unwrap();
+    assert_eq!(list.iter().map(|key| (&key.id, key.state)).collect::<Vec<_>>(), [(&old.info.id, "active")]);
+    // A key that was revoked after it was read is not replaced either.
+    sqlx::query("DROP TRIGGER full").execute(&mut other).await.unwrap();
+    let record = store.keys().await.unwrap().remove(0);
+    keys::revoke(store, &old.key, now).await.unwrap();
+    let new = qedgix::store::KeyRecord { id: "another".into(), ..record };
+    assert!(!store.rotate_key(&old.info.id, &new, now).await.unwrap());
+    assert_eq!(store.keys().await.unwrap().len(), 1);
+}
+
+#[tokio::test]
 async fn names_and_numbers_of_keys_are_checked() {
     let server = Server::start().await;
     let refused = async |change: fn(&mut keys::NewKey)| {
