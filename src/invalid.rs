@@ -1,39 +1,90 @@
-//! One way to say that an input is wrong: which field, which value, what is allowed.
-//!
-//! Every layer that checks input returns [`Invalid`]; the transports turn it into `INVALID_ARGUMENT` / 400.
+//! [`Invalid`]: the error of every layer that checks input. It holds the field, the value received and what is accepted.
 
-use std::fmt::Display;
+use std::fmt::{self, Display};
 
-/// An input that cannot be used, named so that the person who sent it can mend it.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{field}: {value} is not valid; expected {expected}")]
+/// An input that is not accepted.
+///
+/// The message is a sentence about the field: `uavs: got 5000, expected a number from 1 to 4096`,
+/// `scene.users: missing, expected at least one user`.
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Invalid {
-    /// Path of the field, as the sender wrote it: `environment.uavs`, `graph.nodes[2].id`.
+    /// Path of the field as the caller wrote it: `environment.uavs`, `graph.nodes[2].id`.
     pub field: String,
-    /// What was received, shortened to something that fits a line.
-    pub value: String,
-    /// What would have been accepted.
+    /// The value received, cut to [`Invalid::LONGEST_VALUE`] characters; none where the field is missing.
+    pub value: Option<String>,
+    /// What is accepted: `a number from 1 to 4096`, `one of qmix, vdn`.
     pub expected: String,
-    /// Whether the document does not even parse into its schema: an unknown field, a wrong type.
-    pub schema: bool,
+    /// What is wrong with the field.
+    pub kind: InvalidKind,
+}
+
+/// What is wrong with a field.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum InvalidKind {
+    /// The value has the right type but is not accepted, or a required value is missing.
+    Value,
+    /// The value does not match the schema: it has another type, or a required field is missing.
+    Schema,
+    /// The schema has no field of this name.
+    UnknownField,
 }
 
 impl Invalid {
-    /// Longest value repeated back to the sender, in characters.
-    const SHOWN: usize = 120;
+    /// Most characters of a value that an error repeats.
+    pub const LONGEST_VALUE: usize = 120;
 
-    /// Builds the error; a long `value` is cut.
+    /// `field` has a `value` that is not accepted.
     pub fn new(field: impl Into<String>, value: impl Display, expected: impl Into<String>) -> Self {
-        let mut value = value.to_string();
-        if value.chars().count() > Self::SHOWN {
-            value = value.chars().take(Self::SHOWN).chain("...".chars()).collect();
-        }
-        Self { field: field.into(), value, expected: expected.into(), schema: false }
+        let value = Some(cut(value.to_string()));
+        Self { field: field.into(), value, expected: expected.into(), kind: InvalidKind::Value }
     }
 
-    /// The same for what does not parse into the schema.
+    /// `field` is required and missing.
+    pub fn missing(field: impl Into<String>, expected: impl Into<String>) -> Self {
+        Self { field: field.into(), value: None, expected: expected.into(), kind: InvalidKind::Value }
+    }
+
+    /// `field` has a `value` of the wrong type.
     pub fn schema(field: impl Into<String>, value: impl Display, expected: impl Into<String>) -> Self {
-        Self { schema: true, ..Self::new(field, value, expected) }
+        Self { kind: InvalidKind::Schema, ..Self::new(field, value, expected) }
+    }
+
+    /// The schema requires `field`.
+    pub fn missing_field(field: impl Into<String>, expected: impl Into<String>) -> Self {
+        Self { kind: InvalidKind::Schema, ..Self::missing(field, expected) }
+    }
+
+    /// The schema has no `field`; `expected` lists the fields that exist.
+    pub fn unknown_field(field: impl Into<String>, expected: impl Into<String>) -> Self {
+        Self { kind: InvalidKind::UnknownField, ..Self::missing(field, expected) }
+    }
+
+    /// The error of a serde `parser` that failed at `path` (empty: the document itself).
+    pub fn from_parser(path: &str, error: &impl Display) -> Self {
+        let message = error.to_string();
+        let message = message.split(" at line ").next().unwrap_or_default();
+        let quoted = || message.split('`').nth(1).unwrap_or_default();
+        if message.starts_with("unknown field") {
+            let path = if path.is_empty() { quoted() } else { path };
+            return Self::unknown_field(path, expectation(&message));
+        }
+        if message.starts_with("missing field") {
+            let dot = if path.is_empty() { "" } else { "." };
+            return Self::missing_field(format!("{path}{dot}{}", quoted()), "a value");
+        }
+        let path = if path.is_empty() { "body" } else { path };
+        if message.starts_with("duplicate field") {
+            return Self::schema(path, format!("{:?} twice", quoted()), "each field once");
+        }
+        match message.split_once(", expected ") {
+            Some((received, _)) => Self::schema(path, received_value(received), expectation(&message)),
+            None => Self::schema(path, message, "a value of the documented type"),
+        }
+    }
+
+    /// Whether the input does not match its schema.
+    pub fn is_schema(&self) -> bool {
+        self.kind != InvalidKind::Value
     }
 
     /// The same error with `prefix.` in front of the field.
@@ -44,23 +95,58 @@ impl Invalid {
     }
 }
 
-/// What would have been accepted, from the message of a parser that says `..., expected WHAT`.
+impl Display for Invalid {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { field, value, expected, kind } = self;
+        match (kind, value) {
+            (InvalidKind::UnknownField, _) => write!(f, "{field}: unknown field, expected {expected}"),
+            (_, Some(value)) => write!(f, "{field}: got {value}, expected {expected}"),
+            (_, None) => write!(f, "{field}: missing, expected {expected}"),
+        }
+    }
+}
+
+impl std::error::Error for Invalid {}
+
+fn cut(value: String) -> String {
+    if value.chars().count() <= Invalid::LONGEST_VALUE {
+        return value;
+    }
+    value.chars().take(Invalid::LONGEST_VALUE).chain("...".chars()).collect()
+}
+
+/// The value in a serde message such as ``invalid type: integer `3` ``.
+fn received_value(message: &str) -> String {
+    let received = message.split_once(": ").map_or(message, |(_, received)| received);
+    match received {
+        "map" => "an object".to_owned(),
+        "sequence" => "an array".to_owned(),
+        _ if message.starts_with("unknown variant") => format!("{:?}", message.split('`').nth(1).unwrap_or_default()),
+        _ if received.contains('`') => received.split('`').nth(1).unwrap_or(received).to_owned(),
+        _ => received.strip_prefix("string ").unwrap_or(received).to_owned(),
+    }
+}
+
+/// What a serde parser expected, from its message (`..., expected WHAT`).
 pub fn expectation(error: &impl Display) -> String {
     let message = error.to_string();
     let expected = message.split_once("expected ").map_or(message.as_str(), |(_, expected)| expected);
     match expected {
         "usize" | "u64" | "u32" => "a whole number, 0 or more".to_owned(),
         "i64" | "i32" => "a whole number".to_owned(),
-        "f64" => "a number".to_owned(),
+        "f64" | "f32" => "a number".to_owned(),
         "a boolean" => "true or false".to_owned(),
-        other => other.to_owned(),
+        "a sequence" => "an array".to_owned(),
+        "a map" => "an object".to_owned(),
+        other if other.starts_with("struct ") => "an object".to_owned(),
+        other => other.replace('`', ""),
     }
 }
 
-/// Checks that `value` lies in `range` (NaN never does).
+/// Checks that `value` lies in `range`. NaN lies in no range.
 ///
 /// # Errors
-/// [`Invalid`] naming the field, the value and the range.
+/// [`Invalid`] where `value` lies outside of `range`.
 pub fn in_range<T>(field: &str, value: T, range: std::ops::RangeInclusive<T>) -> Result<(), Invalid>
 where
     T: PartialOrd + Display,
@@ -76,17 +162,56 @@ mod tests {
     use super::*;
 
     #[test]
-    fn expectations_read_as_sentences() {
-        let of = |message: &str| expectation(&message);
-        assert_eq!(of("invalid type: string \"3\", expected usize"), "a whole number, 0 or more");
-        assert_eq!(of("unknown variant `ppo`, expected one of `qmix`, `vdn`"), "one of `qmix`, `vdn`");
-        assert_eq!(of("something else"), "something else");
+    fn messages_are_sentences() {
+        let message = |invalid: Invalid| invalid.to_string();
+        assert_eq!(message(Invalid::new("uavs", 5000, "at most 4096")), "uavs: got 5000, expected at most 4096");
+        assert_eq!(message(Invalid::missing("scene", "a scene")), "scene: missing, expected a scene");
+        assert_eq!(message(Invalid::unknown_field("job.x", "one of a, b")), "job.x: unknown field, expected one of a, b");
     }
 
     #[test]
-    fn long_values_are_cut_and_nan_is_in_no_range() {
-        assert!(Invalid::new("f", "x".repeat(1000), "less").value.len() < 130);
+    fn parser_messages_become_fields_values_and_expectations() {
+        let parse = |path: &str, message: &str| {
+            let Invalid { field, value, expected, kind } = Invalid::from_parser(path, &message);
+            (field, value.unwrap_or_default(), expected, kind)
+        };
+        let owned = |field: &str, value: &str, expected: &str, kind| (field.into(), value.into(), expected.into(), kind);
+        for (path, message, expected) in [
+            (
+                "a[1].b",
+                "invalid type: string \"3\", expected usize at line 1 column 5",
+                owned("a[1].b", "\"3\"", "a whole number, 0 or more", InvalidKind::Schema),
+            ),
+            (
+                "n",
+                "invalid value: integer `-1`, expected u32",
+                owned("n", "-1", "a whole number, 0 or more", InvalidKind::Schema),
+            ),
+            ("", "invalid type: sequence, expected struct Act", owned("body", "an array", "an object", InvalidKind::Schema)),
+            (
+                "algorithm",
+                "unknown variant `ppo`, expected one of `qmix`, `vdn`",
+                owned("algorithm", "\"ppo\"", "one of qmix, vdn", InvalidKind::Schema),
+            ),
+            ("a", "missing field `x`", owned("a.x", "", "a value", InvalidKind::Schema)),
+            ("", "missing field `x`", owned("x", "", "a value", InvalidKind::Schema)),
+            ("a.y", "unknown field `y`, expected `x`", owned("a.y", "", "x", InvalidKind::UnknownField)),
+            ("a", "duplicate field `x`", owned("a", "\"x\" twice", "each field once", InvalidKind::Schema)),
+        ] {
+            assert_eq!(parse(path, message), expected, "{message}");
+        }
+    }
+
+    #[test]
+    fn long_values_are_cut() {
+        let value = Invalid::new("f", "x".repeat(1000), "less").value.unwrap();
+        assert_eq!(value.len(), Invalid::LONGEST_VALUE + 3);
+    }
+
+    #[test]
+    fn ranges_include_their_ends_and_exclude_nan() {
         assert!(in_range("f", f64::NAN, 0.0..=1.0).is_err());
         assert!(in_range("f", 1.0, 0.0..=1.0).is_ok());
+        assert!(in_range("f", 1.1, 0.0..=1.0).is_err());
     }
 }

@@ -18,7 +18,7 @@
 //! | [`figure`] | data to SVG |
 //! | [`nn`], [`env`] | mathematics; physics |
 //! | [`clock`], [`draining`] | wall and monotonic time; the flag of shutdown |
-//! | [`invalid`], [`rng`] | errors of input; random streams |
+//! | [`invalid`], [`error_code`], [`rng`] | errors of input; codes of errors; random streams |
 //!
 //! Read `env`, then `policy`, then `learner`; then `service` and what it calls.
 
@@ -29,6 +29,7 @@ pub mod clock;
 pub mod config;
 pub mod draining;
 pub mod env;
+pub mod error_code;
 pub mod experiment;
 pub mod figure;
 pub mod invalid;

@@ -292,7 +292,7 @@ impl TrainConfig {
         self.training.validate().map_err(|e| e.within("training"))?;
         let mixes = self.training.mixer != MixerKind::None;
         if mixes == (self.algorithm == Algorithm::Iql) {
-            let expected = if mixes { "none for iql, which mixes nothing" } else { "qmix, invariant or vdn" };
+            let expected = if mixes { "none, because iql has no mixer" } else { "qmix, invariant or vdn" };
             return Err(Invalid::new("training.mixer", if mixes { "a mixer" } else { "none" }, expected));
         }
         let (env, t) = (&self.environment, &self.training);
@@ -300,14 +300,14 @@ impl TrainConfig {
             return Err(Invalid::new(
                 "training.hops",
                 t.hops,
-                "1 for an algorithm with a graph network, whose layers are its hops",
+                "1, because the number of layers of a graph network sets its hops",
             ));
         }
         let episode = (env.slots + 1) * (env.uavs * 8 + env.users * 10) + env.slots * (env.uavs + 4);
         let replay = episode.saturating_mul(t.buffer);
         if replay > LIMIT {
-            let value = format!("{} (a replay of {} MiB at this size)", t.buffer, replay >> 20);
-            return Err(Invalid::new("training.buffer", value, format!("a replay of at most {} MiB", LIMIT >> 20)));
+            let value = format!("{} episodes of {} MiB in total", t.buffer, replay >> 20);
+            return Err(Invalid::new("training.buffer", value, format!("at most {} MiB in total", LIMIT >> 20)));
         }
         Ok(())
     }
@@ -336,7 +336,7 @@ impl Training {
         in_range("eval_every", self.eval_every, 1..=1_000_000_000_000)?;
         in_range("eval_episodes", self.eval_episodes, 1..=4096)?;
         if self.shaping && self.gamma > 0.9999 {
-            return Err(Invalid::new("gamma", self.gamma, "at most 0.9999 with shaping, which sums ages to come"));
+            return Err(Invalid::new("gamma", self.gamma, "at most 0.9999 with shaping"));
         }
         if self.buffer < self.batch {
             return Err(Invalid::new("buffer", self.buffer, format!("at least batch ({})", self.batch)));
@@ -406,10 +406,10 @@ fn overridden<T: Serialize + DeserializeOwned>(section: &str, base: &T, patch: &
     for (key, value) in patch {
         let name = LETTERS.iter().find(|(letter, _)| letter == key).map_or(key.as_str(), |(_, name)| name);
         if !known.iter().any(|k| k == name) {
-            return Err(Invalid::schema(format!("{section}.{key}"), "an unknown field", format!("one of {}", known.join(", "))));
+            return Err(Invalid::unknown_field(format!("{section}.{key}"), format!("one of {}", known.join(", "))));
         }
         if name != key && patch.contains_key(name) {
-            return Err(Invalid::new(format!("{section}.{key}"), "a second value", format!("either {key} or {name}, not both")));
+            return Err(Invalid::new(format!("{section}.{key}"), value, format!("no value, because {name} is set, too")));
         }
         fields[name] = value.clone();
         if let Err(e) = T::deserialize(&fields) {

@@ -8,6 +8,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("clock", &[]),
     ("draining", &[]),
     ("invalid", &[]),
+    ("error_code", &[]),
     ("rng", &[]),
     ("wire", &[]),
     ("nn", &["invalid", "rng"]),
@@ -20,10 +21,24 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("experiment", &["learner", "checkpoint", "recipe", "figure", "policy", "env", "invalid", "rng"]),
     ("store", &["recipe", "invalid"]),
     ("jobs", &["clock", "draining", "store", "checkpoint", "recipe", "learner", "policy", "env", "invalid", "rng", "wire"]),
-    ("serving", &["clock", "checkpoint", "recipe", "learner", "policy", "env", "invalid", "rng"]),
+    ("serving", &["clock", "checkpoint", "recipe", "learner", "policy", "env", "invalid", "error_code", "rng"]),
     (
         "service",
-        &["clock", "draining", "jobs", "serving", "store", "checkpoint", "recipe", "learner", "policy", "env", "invalid", "rng"],
+        &[
+            "clock",
+            "draining",
+            "jobs",
+            "serving",
+            "store",
+            "checkpoint",
+            "recipe",
+            "learner",
+            "policy",
+            "env",
+            "invalid",
+            "error_code",
+            "rng",
+        ],
     ),
     (
         "api",
@@ -40,6 +55,7 @@ const LAYERS: &[(&str, &[&str])] = &[
             "policy",
             "env",
             "invalid",
+            "error_code",
             "wire",
         ],
     ),
@@ -65,6 +81,7 @@ const LAYERS: &[(&str, &[&str])] = &[
             "env",
             "nn",
             "invalid",
+            "error_code",
             "rng",
             "wire",
         ],
@@ -74,7 +91,7 @@ const LAYERS: &[(&str, &[&str])] = &[
 /// What the pure layers never touch.
 const IMPURE: &[&str] =
     &["tokio", "tonic", "axum", "sqlx", "std::fs", "std::net", "std::process", "std::time", "SystemTime", "rand::rng("];
-const PURE: &[&str] = &["invalid", "rng", "nn", "env", "policy", "learner", "checkpoint", "figure", "experiment"];
+const PURE: &[&str] = &["invalid", "error_code", "rng", "nn", "env", "policy", "learner", "checkpoint", "figure", "experiment"];
 
 fn sources(dir: &Path) -> Vec<PathBuf> {
     let mut found = Vec::new();

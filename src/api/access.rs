@@ -1,4 +1,4 @@
-//! Who may do what: one table for both transports. What is not in it needs `admin`.
+//! What each gRPC method and REST route requires of a caller. What is not listed requires the scope `admin`.
 
 use std::collections::HashMap;
 use std::sync::LazyLock;
@@ -7,25 +7,25 @@ use axum::http::Method;
 
 use crate::service::keys::Scope;
 
-/// What a caller has to show.
+/// What a request requires.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Need {
-    /// Nothing: probes, documentation, and workers, who have tokens of their own.
-    Nothing,
-    /// Any key: there is no such thing, and only who belongs here is told.
-    Key,
+pub enum Requirement {
+    /// No key: probes, documentation, and workers, which authenticate with the token of their attempt.
+    NoKey,
+    /// Any key: the route is unknown. A caller with a valid key gets 404, any other 401.
+    AnyKey,
     /// A key with this scope.
     Scope(Scope),
 }
 
-const OPEN: Need = Need::Nothing;
-const READ: Need = Need::Scope(Scope::Read);
-const ACT: Need = Need::Scope(Scope::Act);
-const JOBS: Need = Need::Scope(Scope::Jobs);
-const ADMIN: Need = Need::Scope(Scope::Admin);
+const OPEN: Requirement = Requirement::NoKey;
+const READ: Requirement = Requirement::Scope(Scope::Read);
+const ACT: Requirement = Requirement::Scope(Scope::Act);
+const JOBS: Requirement = Requirement::Scope(Scope::Jobs);
+const ADMIN: Requirement = Requirement::Scope(Scope::Admin);
 
-/// Service, methods (`*`: all), what they need.
-const GRPC: &[(&str, &str, Need)] = &[
+/// Service, methods (`*`: all) and their requirement.
+const GRPC: &[(&str, &str, Requirement)] = &[
     ("qedgix.v1.PolicyService", "Act ActBatch ActStream OpenSession CloseSession", ACT),
     ("qedgix.v1.PolicyService", "GetSession ListSessions GetPolicy ListPolicies", READ),
     ("qedgix.v1.EnvironmentService", "CreateEnvironment Reset Step DeleteEnvironment", ACT),
@@ -43,8 +43,8 @@ const GRPC: &[(&str, &str, Need)] = &[
     ("grpc.reflection.v1alpha.ServerReflection", "*", READ),
 ];
 
-/// Verb, routes as they are registered, what they need. `HEAD` is `GET`.
-const REST: &[(&str, &str, Need)] = &[
+/// HTTP method, routes as they are registered and their requirement. `HEAD` counts as `GET`.
+const REST: &[(&str, &str, Requirement)] = &[
     ("GET", "/livez /readyz /openapi.json /docs /docs/{file} /v2/health/live", OPEN),
     ("GET", "/ /metrics", READ),
     ("POST", "/v1/act /v1/sessions", ACT),
@@ -70,40 +70,41 @@ const REST: &[(&str, &str, Need)] = &[
     ("POST", "/v2/repository/models/{model}/load /v2/repository/models/{model}/unload", ADMIN),
 ];
 
-/// What nobody listed.
-const UNLISTED: Need = ADMIN;
+/// What is not listed.
+const UNLISTED: Requirement = ADMIN;
 
-/// What the gRPC method at `/SERVICE/METHOD` needs.
-pub fn grpc(path: &str) -> Need {
+/// The requirement of the gRPC method at `/SERVICE/METHOD`.
+pub fn grpc_requirement(path: &str) -> Requirement {
     grpc_rule(path).unwrap_or(UNLISTED)
 }
 
-/// What a verb needs on a route, as it was registered; without a route there is nothing at this path.
-pub fn rest(verb: &Method, route: Option<&str>) -> Need {
-    route.map_or(Need::Key, |route| rest_rule(verb, route).unwrap_or(UNLISTED))
+/// The requirement of an HTTP method on a registered route; no route: the path is unknown.
+pub fn rest_requirement(method: &Method, route: Option<&str>) -> Requirement {
+    route.map_or(Requirement::AnyKey, |route| rest_rule(method, route).unwrap_or(UNLISTED))
 }
 
-/// The rule of a gRPC method, if it is in the table.
-pub fn grpc_rule(path: &str) -> Option<Need> {
-    static RULES: LazyLock<HashMap<String, Need>> = LazyLock::new(|| {
-        let rules = GRPC.iter().flat_map(|(service, methods, need)| methods.split(' ').map(move |m| (service, m, need)));
-        // A whole service goes by its name alone.
-        rules.map(|(s, m, need)| (if m == "*" { format!("/{s}") } else { format!("/{s}/{m}") }, *need)).collect()
+/// The requirement of a gRPC method, if it is listed.
+pub fn grpc_rule(path: &str) -> Option<Requirement> {
+    static RULES: LazyLock<HashMap<String, Requirement>> = LazyLock::new(|| {
+        let rules =
+            GRPC.iter().flat_map(|(service, methods, requirement)| methods.split(' ').map(move |m| (service, m, requirement)));
+        // `*` becomes a rule for the name of the service.
+        rules.map(|(s, m, requirement)| (if m == "*" { format!("/{s}") } else { format!("/{s}/{m}") }, *requirement)).collect()
     });
     RULES.get(path).or_else(|| RULES.get(path.rsplit_once('/')?.0)).copied()
 }
 
-/// The rule of a verb on a route, if it is in the table.
-pub fn rest_rule(verb: &Method, route: &str) -> Option<Need> {
-    static RULES: LazyLock<HashMap<&str, Vec<(&str, Need)>>> = LazyLock::new(|| {
+/// The requirement of an HTTP method on a route, if it is listed.
+pub fn rest_rule(method: &Method, route: &str) -> Option<Requirement> {
+    static RULES: LazyLock<HashMap<&str, Vec<(&str, Requirement)>>> = LazyLock::new(|| {
         let mut rules = HashMap::<_, Vec<_>>::new();
-        for (verb, routes, need) in REST {
-            routes.split(' ').for_each(|route| rules.entry(route).or_default().push((*verb, *need)));
+        for (method, routes, requirement) in REST {
+            routes.split(' ').for_each(|route| rules.entry(route).or_default().push((*method, *requirement)));
         }
         rules
     });
-    let verb = if *verb == Method::HEAD { "GET" } else { verb.as_str() };
-    RULES.get(route)?.iter().find(|rule| rule.0 == verb).map(|rule| rule.1)
+    let method = if *method == Method::HEAD { "GET" } else { method.as_str() };
+    RULES.get(route)?.iter().find(|rule| rule.0 == method).map(|rule| rule.1)
 }
 
 #[cfg(test)]
@@ -111,20 +112,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_nobody_thought_of_needs_admin() {
-        assert_eq!(grpc("/qedgix.v1.PolicyService/Act"), ACT);
-        assert_eq!(grpc("/qedgix.v1.WorkerService/Fetch"), OPEN);
-        assert_eq!(rest(&Method::HEAD, Some("/v1/jobs/{id}")), READ);
-        assert_eq!(rest(&Method::GET, None), Need::Key);
+    fn unlisted_methods_and_routes_require_admin() {
+        assert_eq!(grpc_requirement("/qedgix.v1.PolicyService/Act"), ACT);
+        assert_eq!(grpc_requirement("/qedgix.v1.WorkerService/Fetch"), OPEN);
+        assert_eq!(rest_requirement(&Method::HEAD, Some("/v1/jobs/{id}")), READ);
+        assert_eq!(rest_requirement(&Method::GET, None), Requirement::AnyKey);
         for path in ["/qedgix.v1.PolicyService/Forget", "/qedgix.v1.PolicyService/", "/qedgix.v1.PolicyService", "/", "", "Act"] {
-            assert_eq!(grpc(path), ADMIN, "{path}");
+            assert_eq!(grpc_requirement(path), ADMIN, "{path}");
         }
-        assert_eq!(rest(&Method::DELETE, Some("/v1/act")), ADMIN);
-        assert_eq!(rest(&Method::GET, Some("/v1/secrets")), ADMIN);
+        assert_eq!(rest_requirement(&Method::DELETE, Some("/v1/act")), ADMIN);
+        assert_eq!(rest_requirement(&Method::GET, Some("/v1/secrets")), ADMIN);
     }
 
     #[test]
-    fn nothing_is_listed_twice() {
+    fn no_method_or_route_is_listed_twice() {
         for table in [GRPC, REST] {
             let mut all: Vec<_> =
                 table.iter().flat_map(|(first, rest, _)| rest.split(' ').map(move |name| (*first, name))).collect();

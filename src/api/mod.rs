@@ -1,9 +1,9 @@
-//! The outside: gRPC, REST, the Open Inference Protocol over both, conversions between wire and domain, one table of errors.
+//! The transports: gRPC, REST and the Open Inference Protocol over both, with their authorization, logging and errors.
 
 pub mod access;
+mod auth;
 pub mod convert;
 mod errors;
-mod gate;
 pub mod grpc;
 mod observe;
 mod oip;

@@ -57,7 +57,9 @@ impl Checkpoint {
         config.validate()?;
         let layout = layout(&config);
         if parameters.len() != layout.len() {
-            return Err(Invalid::new("parameters", parameters.len(), layout.len().to_string()).into());
+            return Err(
+                Invalid::new("parameters", format!("{} numbers", parameters.len()), format!("{} numbers", layout.len())).into()
+            );
         }
         for p in layout.parameters() {
             let values = &parameters[p.range.clone()];

@@ -152,12 +152,12 @@ fn check(args: &EvaluateArgs) -> anyhow::Result<(Layouts, Vec<u64>, EnvConfig)> 
     };
     env.validate()?;
     args.disturbance().validate(&env)?;
-    ensure!(args.episodes > 0, "--episodes: 0 is not valid; expected at least 1");
+    ensure!(args.episodes > 0, "--episodes: got 0, expected at least 1");
     let list = layouts(&args.layouts)?;
     let seeds = list.seeds(args.episodes);
     ensure!(
         args.report_layout < seeds.len(),
-        "--report-layout: {} is not valid; expected a number from 0 to {}",
+        "--report-layout: got {}, expected a number from 0 to {}",
         args.report_layout,
         seeds.len() - 1
     );

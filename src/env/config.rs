@@ -167,7 +167,7 @@ impl EnvConfig {
             in_range(&format!("weights[{i}]"), w, 0.0..=1e6)?;
         }
         if weights.iter().sum::<f64>() <= 0.0 {
-            return Err(Invalid::new("weights", "all zero", "at least one positive weight"));
+            return Err(Invalid::new("weights", "only zeros", "at least one positive weight"));
         }
         Ok(())
     }

@@ -32,7 +32,7 @@ impl Curve {
         for (i, line) in csv.lines().enumerate().skip(1) {
             let mut fields = line.splitn(3, ',');
             let row = (|| Some((fields.next()?.parse().ok()?, fields.next()?, fields.next()?.parse().ok()?)))();
-            let (step, name, value) = row.ok_or_else(|| Invalid::new(format!("line {}", i + 1), line, HEADER))?;
+            let (step, name, value) = row.ok_or_else(|| Invalid::new(format!("line {}", i + 1), format!("{line:?}"), HEADER))?;
             curve.push(step, name, value);
         }
         Ok(curve)

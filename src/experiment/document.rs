@@ -36,7 +36,7 @@ impl Table {
         };
         let table = Self { path: path.to_owned(), fields };
         match table.fields.keys().find(|key| !known.contains(&key.as_str())) {
-            Some(key) => Err(Invalid::schema(table.at(key), "an unknown field", format!("one of {}", known.join(", ")))),
+            Some(key) => Err(Invalid::unknown_field(table.at(key), format!("one of {}", known.join(", ")))),
             None => Ok(table),
         }
     }
@@ -52,7 +52,7 @@ impl Table {
     }
 
     pub fn required<T: DeserializeOwned>(&mut self, field: &str, expected: &str) -> Result<T, Invalid> {
-        self.optional(field)?.ok_or_else(|| Invalid::schema(self.at(field), "an absent field", expected))
+        self.optional(field)?.ok_or_else(|| Invalid::missing_field(self.at(field), expected))
     }
 
     /// A name that is not empty and fits a line.

@@ -100,7 +100,7 @@ impl Experiment {
         for (i, name) in baselines.iter().enumerate() {
             if !baselines::LIST.iter().any(|b| b.name == name) {
                 let known: Vec<_> = baselines::LIST.iter().map(|b| b.name).collect();
-                return Err(Invalid::new(format!("baselines[{i}]"), name, format!("one of {}", known.join(", "))));
+                return Err(Invalid::new(format!("baselines[{i}]"), format!("{name:?}"), format!("one of {}", known.join(", "))));
             }
         }
         let run = top
@@ -108,7 +108,7 @@ impl Experiment {
             .map_or(Ok(Section::default()), |value| Section::read(&mut Table::new("run", value, &Section::FIELDS)?))?;
         let series = only("series", rows(&mut top, "series", &[])?, &overrides.series)?;
         if series.is_empty() {
-            return Err(Invalid::new("series", "no table", "at least one [[series]]"));
+            return Err(Invalid::missing("series", "at least one [[series]] table"));
         }
         let mut points = only("points", rows(&mut top, "points", &["x"])?, &overrides.points)?;
         if points.is_empty() {
@@ -121,11 +121,7 @@ impl Experiment {
         for (i, point) in points.iter().enumerate() {
             let x = match (point.x, figure) {
                 (None, Figure::Parameter) => {
-                    return Err(Invalid::schema(
-                        format!("points[{i}].x"),
-                        "an absent field",
-                        "a number, its place on the x axis",
-                    ));
+                    return Err(Invalid::missing_field(format!("points[{i}].x"), "the value on the x axis"));
                 }
                 (x, _) => x.unwrap_or(i as f64),
             };
@@ -170,7 +166,7 @@ fn rows(top: &mut Table, field: &str, more: &[&str]) -> Result<Vec<Row>, Invalid
         let row = Row { name: table.name("name")?, x: table.optional("x")?, section: Section::read(&mut table)? };
         // Folders and figures are named after it.
         if rows.iter().any(|other| slug(&other.name) == slug(&row.name)) || slug(&row.name).is_empty() {
-            return Err(Invalid::new(table.at("name"), format!("{:?}", row.name), "a name of its own, with letters or digits"));
+            return Err(Invalid::new(table.at("name"), format!("{:?}", row.name), "a distinct name with letters or digits"));
         }
         rows.push(row);
     }
@@ -189,10 +185,10 @@ fn only(field: &str, rows: Vec<Row>, names: &[String]) -> Result<Vec<Row>, Inval
 fn distinct(field: &str, seeds: &[u64]) -> Result<(), Invalid> {
     let mut seen = HashSet::new();
     if seeds.is_empty() {
-        return Err(Invalid::new(field, "no seed", "at least one"));
+        return Err(Invalid::missing(field, "at least one seed"));
     }
     match seeds.iter().find(|seed| !seen.insert(**seed)) {
-        Some(twice) => Err(Invalid::new(field, format!("{twice} twice"), "seeds that differ")),
+        Some(twice) => Err(Invalid::new(field, format!("{twice} twice"), "distinct seeds")),
         None => Ok(()),
     }
 }

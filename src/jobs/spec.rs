@@ -36,11 +36,11 @@ pub fn parse(mut document: Value, cpu_budget: usize) -> Result<JobRequest, Inval
         return Err(Invalid::schema("job", type_name(&document), "an object"));
     };
     if let Some(unknown) = fields.keys().find(|key| !FIELDS.contains(&key.as_str())) {
-        return Err(Invalid::schema(unknown, "an unknown field", format!("one of {}", FIELDS.join(", "))));
+        return Err(Invalid::unknown_field(unknown, format!("one of {}", FIELDS.join(", "))));
     }
     let kind = take(&mut fields, "kind", JobKind::Train)?;
     if kind != JobKind::Train {
-        return Err(Invalid::new("kind", kind, "train, the only kind this version runs"));
+        return Err(Invalid::new("kind", kind, "train, the only kind that this version supports"));
     }
     let algorithm = take(&mut fields, "algorithm", Algorithm::default())?;
     let preset = take(&mut fields, "preset", Preset::default())?;
@@ -89,7 +89,7 @@ fn check_name(field: &str, name: &str) -> Result<(), Invalid> {
     if (1..=63).contains(&name.len()) && name.chars().all(allowed) && name.starts_with(|c: char| c.is_ascii_alphanumeric()) {
         return Ok(());
     }
-    Err(Invalid::new(field, format!("{name:?}"), "1 to 63 letters, digits, '-', '_' and '.', the first a letter or digit"))
+    Err(Invalid::new(field, format!("{name:?}"), "1 to 63 letters, digits, '-', '_' or '.', starting with a letter or digit"))
 }
 
 fn check_labels(labels: &BTreeMap<String, String>) -> Result<(), Invalid> {
@@ -99,7 +99,7 @@ fn check_labels(labels: &BTreeMap<String, String>) -> Result<(), Invalid> {
     for (key, value) in labels {
         check_name("labels", key)?;
         if value.chars().count() > 255 || value.chars().any(char::is_control) {
-            let expected = "at most 255 characters, none of them a control character";
+            let expected = "at most 255 characters without control characters";
             return Err(Invalid::new(format!("labels.{key}"), format!("{value:?}"), expected));
         }
     }
@@ -152,7 +152,7 @@ mod tests {
         ];
         for (document, field, schema) in cases {
             let e = parse_error(document.clone());
-            assert_eq!((e.field.as_str(), e.schema), (field, schema), "{document}: {e}");
+            assert_eq!((e.field.as_str(), e.is_schema()), (field, schema), "{document}: {e}");
         }
     }
 

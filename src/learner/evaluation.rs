@@ -37,7 +37,7 @@ pub const LAYOUTS: [Layouts; 2] =
 /// An unknown name.
 pub fn layouts(name: &str) -> Result<Layouts, Invalid> {
     let known = || LAYOUTS.map(|l| l.name).join(" or ");
-    LAYOUTS.into_iter().find(|l| l.name == name).ok_or_else(|| Invalid::new("layouts", name, known()))
+    LAYOUTS.into_iter().find(|l| l.name == name).ok_or_else(|| Invalid::new("layouts", format!("{name:?}"), known()))
 }
 
 /// A mean with its 95 % bootstrap interval.
@@ -96,7 +96,7 @@ pub fn summarize(episodes: &[EpisodeMetrics]) -> Result<Summary, Invalid> {
 /// There are no episodes, or not equally many.
 pub fn difference(first: &[EpisodeMetrics], second: &[EpisodeMetrics]) -> Result<Difference, Invalid> {
     if first.len() != second.len() {
-        return Err(Invalid::new("episodes", second.len(), format!("{}, as many as the other policy flew", first.len())));
+        return Err(Invalid::new("episodes", second.len(), format!("{}, the number of the other policy", first.len())));
     }
     let aoi: Vec<f64> = first.iter().zip(second).map(|(a, b)| a.mean_aoi - b.mean_aoi).collect();
     let wins = aoi.iter().filter(|&&d| d < 0.0).count() as f64 / aoi.len().max(1) as f64;

@@ -158,7 +158,7 @@ impl Agent {
             if count == fits {
                 Ok(())
             } else {
-                Err(Invalid::new(field, count, format!("{fits}, which this policy was trained for")))
+                Err(Invalid::new(field, count, format!("{fits}, the number that this policy was trained with")))
             }
         };
         if flat || self.config.identity == Identity::Onehot {

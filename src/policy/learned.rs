@@ -46,7 +46,7 @@ impl LearnedPolicy {
             return Err(Invalid::new("parameters", format!("{} numbers", params.len()), format!("{len} numbers")));
         }
         if let Some(bad) = params.iter().find(|x| !x.is_finite()) {
-            return Err(Invalid::new("parameters", bad, "finite numbers"));
+            return Err(Invalid::new("parameters", bad, "only finite numbers"));
         }
         let mut transposed = vec![0.0; len];
         agent.prepare(&params, &mut transposed);

@@ -8,6 +8,7 @@ use tracing::level_filters::LevelFilter;
 
 use super::sequences::{self, Sequence};
 use super::{App, Error};
+use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::policy::Slot;
 use crate::serving::{
@@ -107,7 +108,7 @@ pub(super) async fn in_session(
         check_pinned(session.policy(), spec)?;
     }
     if let Some(seed) = request.seed {
-        return Err(Invalid::new("seed", seed, "nothing: a session is given its seed when it is opened").into());
+        return Err(Invalid::new("seed", seed, "no value, because a session takes its seed when it is opened").into());
     }
     let Observation { fleet, uav_order, seen } = request.observation;
     let slot = slot_of(&fleet, seen, session.policy()).await?;
@@ -141,7 +142,7 @@ pub(super) async fn advance(app: &App, session: &Session, turn: TurnRequest, dea
 
 async fn with_held_state(app: &App, state: &[u8], request: Request, deadline: Option<Instant>) -> Result<Answer, Error> {
     let Some(spec) = &request.policy else {
-        return Err(Invalid::new("policy", "nothing", "NAME, NAME@ALIAS or NAME:VERSION, where there is no session").into());
+        return Err(Invalid::missing("policy", "NAME, NAME@ALIAS or NAME:VERSION, or a session_id").into());
     };
     let held = if state.is_empty() { None } else { Some(HeldState::decode(state)?) };
     let policy = match &held {
@@ -153,7 +154,7 @@ async fn with_held_state(app: &App, state: &[u8], request: Request, deadline: Op
     let step = held.as_ref().map_or(0, |held| held.step);
     if let Some(sent) = request.step.filter(|&sent| sent != step) {
         let message = format!("step {sent} does not go with this recurrent_state, which is of step {step}");
-        return Err(Error::Precondition { code: "wrong_step", message });
+        return Err(Error::Precondition { code: ErrorCode::WrongStep, message });
     }
     let memory = if let Some(held) = held {
         memory_of(held, &fleet, &policy)?
@@ -174,31 +175,31 @@ fn check_pinned(pinned: &LoadedPolicy, spec: &PolicySpec) -> Result<(), Invalid>
     if spec.name == pinned.reference.name && same_version {
         return Ok(());
     }
-    Err(Invalid::new("policy", spec, format!("{}, which the session is pinned to, or nothing", pinned.reference)))
+    Err(Invalid::new("policy", spec, format!("{}, the policy of the session, or no value", pinned.reference)))
 }
 
 /// The version that wrote `held`: an episode stays with its version even if an alias moved or a newer one was published since.
 fn version_of(app: &App, spec: &PolicySpec, held: &HeldState) -> Result<Arc<LoadedPolicy>, Error> {
     app.registry.pinned(spec, &held.digest)?.ok_or_else(|| {
-        let expected = format!("the recurrent_state of an earlier answer of {spec}");
-        Invalid::new("recurrent_state", "the memory of another policy or version", expected).into()
+        let expected = format!("the recurrent_state of an earlier response of {spec}");
+        Invalid::new("recurrent_state", "the state of another policy or version", expected).into()
     })
 }
 
 fn memory_of(held: HeldState, fleet: &Fleet, policy: &LoadedPolicy) -> Result<Vec<f32>, Invalid> {
     let wrong = |value: &str| {
-        let expected = "the recurrent_state of an earlier answer to the same UAVs and users";
+        let expected = "the recurrent_state of an earlier response to the same UAVs and users";
         Invalid::new("recurrent_state", value, expected)
     };
     let (uavs, users) = (fleet.uavs.len(), fleet.users.len());
     if (held.uavs as usize, held.users as usize) != (uavs, users) {
-        return Err(wrong(&format!("the memory of {} UAVs and {} users", held.uavs, held.users)));
+        return Err(wrong(&format!("the state of {} UAVs and {} users", held.uavs, held.users)));
     }
     if held.fleet != fleet.fingerprint() {
-        return Err(wrong("the memory of other ids"));
+        return Err(wrong("the state of UAVs or users with other ids"));
     }
     if held.memory.len() != policy.policy.memory_len(uavs, users) {
-        return Err(wrong("a memory of another length"));
+        return Err(wrong("a state of another length"));
     }
     Ok(held.memory)
 }

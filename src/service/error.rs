@@ -1,103 +1,114 @@
-//! The one error type of all use cases. Transports translate it; nobody else invents codes.
+//! The error type of all use cases. The transports translate it; only this file assigns codes to variants.
 
 use std::time::Duration;
 
+use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 
-/// Why a use case did not do what was asked. Every variant has a stable [`Error::code`].
+/// An error of a use case. [`Error::code`] has the code that clients see.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Malformed or inconsistent input, or a size that does not fit the policy.
+    /// The input does not match its schema, or a value is not accepted.
     #[error(transparent)]
     Invalid(#[from] Invalid),
-    /// A document that does not parse into its schema; the message says where.
-    #[error("{0}")]
-    Schema(String),
-    /// No such thing.
+    /// The resource does not exist.
     #[error("no {what} {id:?}")]
     NotFound {
         /// `policy`, `session`, `job`, ...
         what: &'static str,
-        /// What was asked for.
+        /// The name or id requested.
         id: String,
     },
-    /// It exists but is not in a state in which this can be done: `code` says which, `message` what to do.
+    /// The resource is in a state that does not allow the operation.
     #[error("{message}")]
     Precondition {
-        /// Stable code: `session_expired`, `run_fenced`, `wrong_step`, `wrong_state`, ...
-        code: &'static str,
-        /// What is the case and what would be.
+        /// Names the state.
+        code: ErrorCode,
+        /// The state and what the caller can do.
         message: String,
     },
-    /// It exists already and differs.
+    /// The resource exists and differs from the requested one.
     #[error("{message}")]
     Conflict {
-        /// Stable code: `idempotency_conflict`, `already_exists`.
-        code: &'static str,
-        /// What differs.
+        /// [`ErrorCode::AlreadyExists`] or [`ErrorCode::IdempotencyConflict`].
+        code: ErrorCode,
+        /// The difference.
         message: String,
     },
-    /// Too much at once; try again later.
+    /// A limit is reached; the caller may retry later.
     #[error("{message}")]
     Busy {
-        /// Which limit.
+        /// The limit.
         message: String,
-        /// When to try again.
+        /// Time after which to retry.
         retry_after: Duration,
     },
-    /// A body or message over the limit.
-    #[error("{0}")]
-    TooLarge(String),
-    /// A body of a kind that is not read here.
-    #[error("{0}")]
-    MediaType(String),
+    /// The body or message is larger than the limit.
+    #[error("{message}")]
+    TooLarge {
+        /// The limit, in words.
+        message: String,
+        /// The limit in bytes, where known.
+        limit: Option<u64>,
+    },
+    /// The body has a media type that the server does not read.
+    #[error(transparent)]
+    MediaType(Invalid),
     /// The caller's deadline passed.
     #[error("the deadline passed {0}")]
     Deadline(&'static str),
     /// The server is shutting down.
-    #[error("the server is draining; try again elsewhere or later")]
+    #[error("the server is shutting down; retry later or on another server")]
     Draining,
-    /// No credentials, or wrong ones.
+    /// The API key is missing, unknown, revoked or expired.
     #[error("{0}")]
     Unauthenticated(&'static str),
-    /// Known, but not allowed.
+    /// The API key lacks the required scope.
     #[error("{0}")]
     PermissionDenied(String),
-    /// A fault of ours. The cause is logged, not shown.
+    /// The server failed. Clients do not see the cause; it is logged.
     #[error("internal error")]
     Internal(#[source] Box<dyn std::error::Error + Send + Sync>),
 }
 
 impl Error {
-    /// Stable machine-readable code, the same on every transport.
-    pub fn code(&self) -> &'static str {
+    /// The code that clients see, the same on every transport.
+    pub fn code(&self) -> ErrorCode {
         match self {
-            Self::Invalid(e) if !e.schema => "invalid_argument",
-            Self::Invalid(_) | Self::Schema(_) => "invalid_schema",
-            Self::NotFound { .. } => "not_found",
-            Self::Precondition { code, .. } | Self::Conflict { code, .. } => code,
-            Self::Busy { .. } => "resource_exhausted",
-            Self::TooLarge(_) => "too_large",
-            Self::MediaType(_) => "unsupported_media_type",
-            Self::Deadline(_) => "deadline_exceeded",
-            Self::Draining => "draining",
-            Self::Unauthenticated(_) => "unauthenticated",
-            Self::PermissionDenied(_) => "permission_denied",
-            Self::Internal(_) => "internal",
+            Self::Invalid(invalid) if invalid.is_schema() => ErrorCode::InvalidSchema,
+            Self::Invalid(_) => ErrorCode::InvalidArgument,
+            Self::NotFound { .. } => ErrorCode::NotFound,
+            Self::Precondition { code, .. } | Self::Conflict { code, .. } => *code,
+            Self::Busy { .. } => ErrorCode::ResourceExhausted,
+            Self::TooLarge { .. } => ErrorCode::TooLarge,
+            Self::MediaType(_) => ErrorCode::UnsupportedMediaType,
+            Self::Deadline(_) => ErrorCode::DeadlineExceeded,
+            Self::Draining => ErrorCode::Draining,
+            Self::Unauthenticated(_) => ErrorCode::Unauthenticated,
+            Self::PermissionDenied(_) => ErrorCode::PermissionDenied,
+            Self::Internal(_) => ErrorCode::Internal,
         }
     }
 
-    /// A fault of ours.
+    /// The field that is not accepted, if the error is about one.
+    pub fn invalid(&self) -> Option<&Invalid> {
+        match self {
+            Self::Invalid(invalid) | Self::MediaType(invalid) => Some(invalid),
+            _ => None,
+        }
+    }
+
+    /// The server failed because of `cause`.
     pub fn internal(cause: impl Into<Box<dyn std::error::Error + Send + Sync>>) -> Self {
         Self::Internal(cause.into())
     }
 
-    /// Too much at once, for about a second.
+    /// A limit is reached; the caller may retry after a second.
     pub fn busy(message: impl Into<String>) -> Self {
         Self::Busy { message: message.into(), retry_after: Duration::from_secs(1) }
     }
 
-    /// No `what` called `id`.
+    /// There is no `what` with this `id`.
     pub fn not_found(what: &'static str, id: impl Into<String>) -> Self {
         Self::NotFound { what, id: id.into() }
     }

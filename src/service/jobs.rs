@@ -6,6 +6,7 @@ use uuid::Uuid;
 use super::paging::{self, number};
 use super::worker::is_metric_name;
 use super::{App, Error, Page, PageRequest, policies};
+use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::jobs::spec;
 use crate::store::{
@@ -45,7 +46,7 @@ pub async fn submit(app: &App, document: Value, key: Option<String>) -> Result<(
         SubmitResult::Existing(job) => Ok((job, false)),
         SubmitResult::Conflict => {
             let message = "this idempotency key was used with another job; use a new key for a new job".into();
-            Err(Error::Conflict { code: "idempotency_conflict", message })
+            Err(Error::Conflict { code: ErrorCode::IdempotencyConflict, message })
         }
     }
 }
@@ -100,7 +101,7 @@ pub async fn change(app: &App, id: &str, action: JobAction) -> Result<Job, Error
                 None => "",
             };
             let message = format!("job {id} is {}{pending}; {allowed}", job.state);
-            Err(Error::Precondition { code: "wrong_state", message })
+            Err(Error::Precondition { code: ErrorCode::WrongState, message })
         }
     }
 }

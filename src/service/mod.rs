@@ -21,6 +21,7 @@ pub use paging::{Page, PageRequest};
 
 use crate::clock::Clock;
 use crate::draining::Draining;
+use crate::error_code::ErrorCode;
 use crate::jobs::Scheduler;
 use crate::serving::{Engine, Environments, Registry, Sessions};
 use crate::store::Store;
@@ -66,7 +67,7 @@ impl From<crate::serving::Error> for Error {
             E::Invalid(e) => Self::Invalid(e),
             E::Unknown { what, id } => Self::NotFound { what, id },
             E::Precondition { code, message } => Self::Precondition { code, message },
-            E::Exists(message) => Self::Conflict { code: "already_exists", message },
+            E::Exists(message) => Self::Conflict { code: ErrorCode::AlreadyExists, message },
             E::Busy(message) => Self::busy(message),
             E::Deadline(place) => Self::Deadline(place),
             E::Fault(cause) => Self::internal(cause),

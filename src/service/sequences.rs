@@ -9,6 +9,7 @@ use std::time::Instant;
 
 use super::act::{Answer, Request, TurnRequest, advance, in_session, slot_of};
 use super::{App, Error};
+use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::serving::{Observation, PolicySpec, Session};
 
@@ -53,7 +54,7 @@ impl fmt::Display for SequenceId {
 /// As [`super::act::act`], and a sequence that has not been started.
 pub(super) async fn act(app: &App, sequence: &Sequence, request: Request, deadline: Option<Instant>) -> Result<Answer, Error> {
     let Some(spec) = request.policy.clone() else {
-        return Err(Invalid::new("policy", "nothing", "the policy that the sequence belongs to").into());
+        return Err(Invalid::missing("policy", "the policy of the sequence").into());
     };
     let name = format!("{PREFIX}{}:{}", spec.name, sequence.id);
     let (session, answer) = if sequence.start {
@@ -79,7 +80,7 @@ pub(super) async fn act(app: &App, sequence: &Sequence, request: Request, deadli
 
 fn not_started(id: &SequenceId, policy: &str) -> Error {
     let message = format!("sequence {id} of {policy} is not under way; its first request needs sequence_start");
-    Error::Precondition { code: "sequence_not_started", message }
+    Error::Precondition { code: ErrorCode::SequenceNotStarted, message }
 }
 
 /// The first slot. One that is refused for what it observes leaves a sequence under way as it is.
@@ -92,7 +93,7 @@ async fn start(
 ) -> Result<(Arc<Session>, Answer), Error> {
     if let Some(step) = request.step.filter(|&step| step != 0) {
         let message = format!("step {step} cannot begin a sequence; send step 0, or no sequence_start");
-        return Err(Error::Precondition { code: "wrong_step", message });
+        return Err(Error::Precondition { code: ErrorCode::WrongStep, message });
     }
     let policy = app.registry.resolve(spec)?;
     let Observation { fleet, uav_order, seen } = request.observation;

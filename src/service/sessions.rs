@@ -12,7 +12,7 @@ use crate::serving::{Entry, Opened, PolicySpec, SessionInfo};
 pub async fn open(app: &App, policy: &PolicySpec, how: Opened) -> Result<SessionInfo, Error> {
     app.admit()?;
     if let Some(id) = how.id.as_deref().filter(|id| id.starts_with(PREFIX)) {
-        let expected = format!("another name: those that begin with {PREFIX:?} belong to the Open Inference Protocol");
+        let expected = format!("an id that does not start with {PREFIX:?}, which the Open Inference Protocol reserves");
         return Err(Invalid::new("session_id", format!("{id:?}"), expected).into());
     }
     let policy = app.registry.resolve(policy)?;

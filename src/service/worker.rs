@@ -5,6 +5,7 @@ use sha2::{Digest, Sha256};
 use uuid::Uuid;
 
 use super::{App, Error, policies};
+use crate::error_code::ErrorCode;
 use crate::invalid::{Invalid, in_range};
 use crate::jobs::{Directive, equal_secrets, token_digest};
 use crate::recipe::TrainConfig;
@@ -61,7 +62,7 @@ pub async fn authenticate(app: &App, credentials: &Credentials) -> Result<Lease,
 
 fn fenced(lease: Lease) -> Error {
     let message = format!("attempt {} of job {} has ended", lease.attempt, lease.id);
-    Error::Precondition { code: "attempt_over", message }
+    Error::Precondition { code: ErrorCode::AttemptOver, message }
 }
 
 fn require_active(active: bool, lease: Lease) -> Result<(), Error> {
@@ -108,7 +109,7 @@ pub async fn report(app: &App, lease: Lease, metrics: &[Metric], step: u64) -> R
     check_step("step", step)?;
     for (i, metric) in metrics.iter().enumerate() {
         if !is_metric_name(&metric.name) {
-            let expected = "1 to 63 letters, digits, '_', '-', '/' and '.'";
+            let expected = "1 to 63 letters, digits, '_', '-', '/' or '.'";
             return Err(Invalid::new(format!("metrics[{i}].name"), format!("{:?}", metric.name), expected).into());
         }
         check_step(&format!("metrics[{i}].step"), metric.step)?;
@@ -202,7 +203,12 @@ impl UploadDigest {
         in_range("data", bytes.len(), 1..=MAX_CHUNK)?;
         self.received += bytes.len() as u64;
         if self.received > self.header.size {
-            return Err(Invalid::new("data", self.received, format!("the {} bytes in the header", self.header.size)).into());
+            return Err(Invalid::new(
+                "data",
+                format!("{} bytes", self.received),
+                format!("the {} bytes in the header", self.header.size),
+            )
+            .into());
         }
         let (mut hash, bytes) = (std::mem::take(&mut self.hash), bytes.clone());
         // Hashing a megabyte takes milliseconds, which is too long on a thread that serves connections.
@@ -218,7 +224,12 @@ impl UploadDigest {
     /// Checks size and digest of the whole.
     fn verify(self) -> Result<UploadHeader, Error> {
         if self.received != self.header.size {
-            return Err(Invalid::new("data", self.received, format!("the {} bytes in the header", self.header.size)).into());
+            return Err(Invalid::new(
+                "data",
+                format!("{} bytes", self.received),
+                format!("the {} bytes in the header", self.header.size),
+            )
+            .into());
         }
         let sha256 = hex::encode(self.hash.finalize());
         if sha256 != self.header.sha256 {

@@ -1,51 +1,52 @@
-//! Why serving could not answer.
+//! The errors of `serving`. `service::Error` has a variant for each.
 
+use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 
-/// Why serving could not answer; `service` turns it into the one error type of all use cases.
+/// An error of `serving`.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Input that cannot be used.
+    /// The input is not accepted.
     #[error(transparent)]
     Invalid(#[from] Invalid),
-    /// Nothing of this name, and nothing that expired lately.
+    /// The resource does not exist and did not expire recently.
     #[error("no {what} {id:?}")]
     Unknown {
         /// `policy`, `session`, ...
         what: &'static str,
-        /// What was asked for.
+        /// The name requested.
         id: String,
     },
-    /// It exists, but not in a state in which this can be done.
+    /// The resource is in a state that does not allow the operation.
     #[error("{message}")]
     Precondition {
-        /// Stable code.
-        code: &'static str,
-        /// What is the case and what would be.
+        /// Names the state.
+        code: ErrorCode,
+        /// The state and what the caller can do.
         message: String,
     },
-    /// It exists already and differs.
+    /// The resource exists and differs from the requested one.
     #[error("{0}")]
     Exists(String),
-    /// A limit is reached; trying again later may help.
+    /// A limit is reached; the caller may retry later.
     #[error("{0}")]
     Busy(String),
     /// The caller's deadline passed.
     #[error("the deadline passed {0}")]
     Deadline(&'static str),
-    /// A policy did not keep its word (it panicked or is gone).
+    /// The server failed: a policy panicked, or the engine lost a request.
     #[error("{0}")]
     Fault(String),
 }
 
 impl Error {
-    /// No `what` called `id`.
+    /// There is no `what` with this `id`.
     pub fn unknown(what: &'static str, id: impl Into<String>) -> Self {
         Self::Unknown { what, id: id.into() }
     }
 
-    /// A state in which this cannot be done.
-    pub fn precondition(code: &'static str, message: impl Into<String>) -> Self {
+    /// The resource is in a state that does not allow the operation.
+    pub fn precondition(code: ErrorCode, message: impl Into<String>) -> Self {
         Self::Precondition { code, message: message.into() }
     }
 }

@@ -39,21 +39,27 @@ impl Fleet {
         fingerprint
     }
 
-    /// Checks that `now` has the ids of `self`, and says which id is new or gone.
+    /// Checks that `now` has the ids of `self`.
     ///
     /// # Errors
-    /// The ids differ.
+    /// [`Invalid`] with a new and a missing id, if the ids differ.
     pub fn check_same(&self, now: &Self) -> Result<(), Invalid> {
-        for (what, before, after) in [("UAVs", &self.uavs, &now.uavs), ("users", &self.users, &now.users)] {
+        for (field, what, before, after) in [("uavs", "UAVs", &self.uavs, &now.uavs), ("users", "users", &self.users, &now.users)]
+        {
             if before == after {
                 continue;
             }
             let lacks = |ids: &[String], id: &String| ids.binary_search_by(|probe| Self::order(probe, id)).is_err();
-            let new = after.iter().find(|id| lacks(before, id)).map(|id| format!("{id:?} is new"));
-            let gone = before.iter().find(|id| lacks(after, id)).map(|id| format!("{id:?} is missing"));
-            let value: Vec<String> = new.into_iter().chain(gone).collect();
-            let expected = format!("the same {} {what} as in the episode's first slot", before.len());
-            return Err(Invalid::new(format!("ids of {what}"), value.join(", "), expected));
+            let new = after.iter().find(|id| lacks(before, id));
+            let missing = before.iter().find(|id| lacks(after, id));
+            let value = match (new, missing) {
+                (Some(new), Some(missing)) => format!("{new:?} instead of {missing:?}"),
+                (Some(new), None) => format!("{new:?} in addition"),
+                (None, Some(missing)) => format!("no {missing:?}"),
+                (None, None) => format!("{} ids", after.len()),
+            };
+            let expected = format!("the same {} {what} as in slot 0", before.len());
+            return Err(Invalid::new(field, value, expected));
         }
         Ok(())
     }

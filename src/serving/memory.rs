@@ -63,19 +63,19 @@ impl HeldState {
     /// They are not the unchanged bytes of an earlier answer.
     pub fn decode(bytes: &[u8]) -> Result<Self, Invalid> {
         let wrong = |value: String| {
-            let expected = "the unchanged recurrent_state of the previous answer, or nothing at slot 0";
+            let expected = "the unchanged recurrent_state of the previous response, or none in slot 0";
             Invalid::new("recurrent_state", value, expected)
         };
         let inside = bytes.len().checked_sub(HEADER + CHECKSUM);
         if inside.is_none_or(|len| len % 4 != 0) || !bytes.starts_with(MAGIC) {
-            return Err(wrong(format!("{} bytes of another kind", bytes.len())));
+            return Err(wrong(format!("{} bytes of another format", bytes.len())));
         }
         let (body, sum) = bytes.split_at(bytes.len() - CHECKSUM);
         if Sha256::digest(body)[..CHECKSUM] != *sum {
-            return Err(wrong(format!("{} bytes, damaged,", bytes.len())));
+            return Err(wrong(format!("{} bytes with a wrong checksum", bytes.len())));
         }
         if body[4] != FORMAT {
-            return Err(wrong(format!("format {}", body[4])));
+            return Err(wrong(format!("format version {}", body[4])));
         }
         let (mut digest, mut fleet) = ([0; 32], [0; 16]);
         let mut rest = &body[MAGIC.len() + 1..];

@@ -122,15 +122,16 @@ impl Seen {
         let range = policy.detection_range();
         match self {
             Self::Scene { uavs, users, aoi } => {
-                Slot::from_scene_within(&uavs, &users, &aoi, range, MAX_DETECTIONS).ok_or_else(|| crowded("scene"))
+                Slot::from_scene_within(&uavs, &users, &aoi, range, MAX_DETECTIONS).ok_or_else(|| too_many_detections("scene"))
             }
             Self::Graph(graph) => graph.into_slot(policy.needs(), range),
         }
     }
 }
 
-fn crowded(field: &str) -> Invalid {
-    Invalid::new(field, "a crowd", format!("at most {MAX_DETECTIONS} pairs of nodes that detect each other"))
+fn too_many_detections(field: &str) -> Invalid {
+    let value = format!("more than {MAX_DETECTIONS} detections");
+    Invalid::new(field, value, format!("at most {MAX_DETECTIONS} detections per request"))
 }
 
 fn within(rel: &Point, range: f64) -> bool {
@@ -140,7 +141,7 @@ fn within(rel: &Point, range: f64) -> bool {
 impl Graph {
     fn into_slot(self, needs: RequiredInput, range: f64) -> Result<Slot, Invalid> {
         if needs == RequiredInput::FullScene {
-            return Err(Invalid::new("graph", "a graph", "a scene: this policy needs the positions of all UAVs and users"));
+            return Err(Invalid::missing("scene", "a scene instead of a graph, because this policy needs all positions"));
         }
         let uavs = self.positions.len();
         if needs == RequiredInput::OwnPositions
@@ -150,7 +151,7 @@ impl Graph {
                 GraphForm::Nodes => format!("graph.nodes[{}].position", self.places[i]),
                 GraphForm::Edges => "uav_positions".into(),
             };
-            return Err(Invalid::new(field, "nothing", "the UAV's own position, which this policy needs"));
+            return Err(Invalid::missing(field, "the position of the UAV, which this policy needs"));
         }
         self.check_range(range)?;
         let derived = self.derive(range)?;
@@ -189,7 +190,7 @@ impl Graph {
                 if !within(&sighting.rel, range * RANGE_TOLERANCE) {
                     let [x, y] = sighting.rel;
                     let field = self.rel_field(node, sighting.place);
-                    let expected = format!("coordinates within the policy's detection range of {range}");
+                    let expected = format!("a position within the detection range of the policy ({range})");
                     return Err(Invalid::new(field, format!("({x}, {y})"), expected));
                 }
             }
@@ -204,7 +205,7 @@ impl Graph {
         let (uavs, users) = (self.positions.len(), self.aoi.len());
         let mut total: usize = self.detections.iter().map(Vec::len).sum();
         if total > MAX_DETECTIONS {
-            return Err(crowded("graph"));
+            return Err(too_many_detections("graph"));
         }
         let mut derived = vec![Vec::new(); users];
         if !self.left_out.contains(&true) {
@@ -258,7 +259,7 @@ impl Graph {
                 }
             }
             if total > MAX_DETECTIONS {
-                return Err(crowded("graph"));
+                return Err(too_many_detections("graph"));
             }
         }
         Ok(derived)

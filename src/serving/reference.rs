@@ -33,7 +33,7 @@ impl FromStr for PolicySpec {
 
     fn from_str(text: &str) -> Result<Self, Invalid> {
         let wrong = || {
-            let expected = "NAME, NAME@ALIAS or NAME:VERSION, names of up to 64 letters, digits, '.', '_', '-', the first no '.'";
+            let expected = "NAME, NAME@ALIAS or NAME:VERSION; a name has 1 to 64 letters, digits, '.', '_' or '-' and does not start with '.'";
             Invalid::new("policy", format!("{text:?}"), expected)
         };
         let (name, which) = if let Some((name, alias)) = text.split_once('@') {
@@ -71,7 +71,7 @@ pub fn check_name(field: &str, name: &str) -> Result<(), Invalid> {
     if !name.is_empty() && name.len() <= LONGEST && name.bytes().all(allowed) && !name.starts_with('.') {
         return Ok(());
     }
-    let expected = format!("1 to {LONGEST} letters, digits, '.', '_' or '-', the first no '.'");
+    let expected = format!("1 to {LONGEST} letters, digits, '.', '_' or '-', not starting with '.'");
     Err(Invalid::new(field, format!("{name:?}"), expected))
 }
 

@@ -11,6 +11,7 @@ use serde_json::Value;
 use tokio::sync::{Mutex, MutexGuard};
 
 use super::{Error, PolicyRef, PolicySpec, Which};
+use crate::error_code::ErrorCode;
 use crate::policy::{Policy, RequiredInput};
 
 /// Where a policy comes from.
@@ -102,7 +103,7 @@ impl Version {
         self.loaded.clone().ok_or_else(|| {
             let reference = &self.about.reference;
             let message = format!("policy {reference} is unloaded; load it to fly it");
-            Error::Precondition { code: "policy_unloaded", message }
+            Error::Precondition { code: ErrorCode::PolicyUnloaded, message }
         })
     }
 }

@@ -14,6 +14,7 @@ use uuid::Uuid;
 
 use super::Error;
 use crate::clock::Clock;
+use crate::error_code::ErrorCode;
 
 /// Limits of a table.
 #[derive(Clone, Copy, Debug)]
@@ -28,8 +29,8 @@ pub struct Limits {
 pub trait Entry {
     /// What it is called: `session`.
     const WHAT: &'static str;
-    /// Stable code of the error that says that it expired.
-    const EXPIRED: &'static str;
+    /// The code of the error for an expired entry.
+    const EXPIRED: ErrorCode;
 
     /// Its name.
     fn id(&self) -> &str;

@@ -105,11 +105,10 @@ async fn memory_kept_by_the_caller_is_judged() {
         held("sweep", Bytes::from_static(b"hello"), scene(3, 5, 1)),
     ];
     for request in wrong {
-        let (code, _, message) = refused(client.act(request).await);
-        assert_eq!(code, Code::InvalidArgument);
-        assert!(message.starts_with("recurrent_state: "), "{message}");
+        let (code, _, field) = refused(client.act(request).await);
+        assert_eq!((code, field.as_str()), (Code::InvalidArgument, "recurrent_state"));
     }
-    assert!(refused(client.act(held("", state, scene(3, 5, 1))).await).2.starts_with("policy: "));
+    assert_invalid(client.act(held("", state, scene(3, 5, 1))).await, "policy", "");
 }
 
 #[tokio::test]
@@ -131,9 +130,7 @@ async fn an_episode_stays_with_its_version() {
     assert_eq!(refused(client.act(held("p:2", first.recurrent_state, scene(3, 5, 1))).await).0, Code::InvalidArgument);
     for other in ["p:2", "sweep"] {
         let request = v1::ActRequest { policy: other.into(), ..in_session("s", None, scene(3, 5, 0)) };
-        let (code, _, message) = refused(client.act(request).await);
-        assert_eq!(code, Code::InvalidArgument);
-        assert!(message.contains("p:1"), "{message}");
+        assert_invalid(client.act(request).await, "policy", other);
     }
 }
 
@@ -158,9 +155,8 @@ async fn ids_come_in_any_order_and_are_matched() {
     }
     let mut changed = scene(11, 6, 12);
     changed.users[3].id = "stranger".into();
-    let (code, _, message) = refused(client.act(in_session("straight", Some(12), changed)).await);
-    assert_eq!(code, Code::InvalidArgument);
-    assert!(message.contains("\"stranger\" is new") && message.contains("\"user-3\" is missing"), "{message}");
+    let response = client.act(in_session("straight", Some(12), changed)).await;
+    assert_invalid(response, "users", "\"stranger\" instead of \"user-3\"");
     client.act(in_session("straight", Some(12), scene(11, 6, 12))).await.unwrap();
 }
 
@@ -175,9 +171,8 @@ async fn a_new_run_resets_and_fences_the_former() {
     assert_eq!(refused(client.act(run("b", 2)).await).1, "wrong_step");
     let restarted = client.act(run("b", 0)).await.unwrap().into_inner();
     assert_eq!(headings(&restarted), headings(&first));
-    let (code, reason, message) = refused(client.act(run("a", 2)).await);
+    let (code, reason, _) = refused(client.act(run("a", 2)).await);
     assert_eq!((code, reason.as_str()), (Code::FailedPrecondition, "run_fenced"));
-    assert!(message.contains("\"a\"") && message.contains("\"b\""), "{message}");
     client.act(run("b", 1)).await.unwrap();
 }
 
@@ -189,9 +184,8 @@ async fn idle_sessions_expire_and_say_so() {
     server.pass(599);
     client.act(in_session("s", Some(0), scene(3, 5, 0))).await.unwrap();
     server.pass(601);
-    let (code, reason, message) = refused(client.act(in_session("s", Some(1), scene(3, 5, 1))).await);
+    let (code, reason, _) = refused(client.act(in_session("s", Some(1), scene(3, 5, 1))).await);
     assert_eq!((code, reason.as_str()), (Code::FailedPrecondition, "session_expired"));
-    assert!(message.contains("600 s"), "{message}");
     let closing = client.close_session(v1::CloseSessionRequest { session_id: "s".into() }).await;
     assert_eq!(refused(closing).1, "session_expired");
     assert_eq!(refused(client.act(in_session("never", None, scene(3, 5, 1))).await).0, Code::NotFound);
@@ -210,9 +204,9 @@ async fn q_values_on_request_and_hovering_without_degrees() {
     let answer = client.act(in_session("s", Some(1), scene(2, 1, 0))).await.unwrap().into_inner();
     assert_eq!((answer.actions[0].heading_index, answer.actions[0].heading_deg), (0, Some(0.0)));
     assert!(answer.actions[0].q_values.is_empty());
-    assert!(refused(client.act(in_session("s", Some(2), scene(4, 1, 0))).await).2.starts_with("uavs: 4"));
+    assert_invalid(client.act(in_session("s", Some(2), scene(4, 1, 0))).await, "uavs", "4");
     let seeded = v1::ActRequest { seed: Some(1), ..in_session("s", Some(2), scene(2, 1, 0)) };
-    assert!(refused(client.act(seeded).await).2.starts_with("seed: "));
+    assert_invalid(client.act(seeded).await, "seed", "1");
 }
 
 #[tokio::test]

@@ -200,9 +200,7 @@ async fn a_reset_says_which_episode_and_may_be_repeated() {
     let told = second.copies[1].seed;
     assert!(told < 1 << 53, "JSON holds it");
     assert_eq!(ask(at(Some(told), None)).await.copies[0].scene, second.copies[1].scene);
-    let (code, _, message) = refused(client.reset(at(Some(1 << 53), None)).await);
-    assert_eq!(code, Code::InvalidArgument);
-    assert!(message.starts_with("seed: 9007199254740992"), "{message}");
+    assert_invalid(client.reset(at(Some(1 << 53), None)).await, "seed", "9007199254740992");
 }
 
 #[tokio::test]
@@ -267,47 +265,41 @@ async fn input_that_cannot_be_used_names_its_field() {
     let server = Server::start().await;
     let mut client = client(&server).await;
     let cases = [
-        (json!({"uvas": 3}), "environment.uvas: an unknown field"),
-        (json!({"uavs": "three"}), "environment.uavs: \"three\""),
-        (json!({"uavs": 2.5}), "environment.uavs: 2.5"),
-        (json!({"M": 0}), "environment.uavs: 0"),
-        (json!({"N": 3, "users": 3}), "environment.N: a second value"),
-        (json!({"lr": 3}), "environment.lr: an unknown field"),
-        (json!({"d": 0.1}), "environment.detection_range: 0.1"),
-        (json!({"start": {"given": [[0.1, 0.2]]}}), "environment.start.given: 1 positions"),
-        (json!({"weights": [1, 2]}), "environment.weights: 2 values"),
-        (json!({"users": 60_000}), "count: 1 with 60003"),
+        (json!({"uvas": 3}), "environment.uvas", ""),
+        (json!({"uavs": "three"}), "environment.uavs", "\"three\""),
+        (json!({"uavs": 2.5}), "environment.uavs", "2.5"),
+        (json!({"M": 0}), "environment.uavs", "0"),
+        (json!({"N": 3, "users": 3}), "environment.N", "3"),
+        (json!({"lr": 3}), "environment.lr", ""),
+        (json!({"d": 0.1}), "environment.detection_range", "0.1"),
+        (json!({"start": {"given": [[0.1, 0.2]]}}), "environment.start.given", "1 positions"),
+        (json!({"weights": [1, 2]}), "environment.weights", "2 values"),
+        (json!({"users": 60_000}), "count", "1 copies of 60003"),
     ];
-    for (environment, begins) in cases {
-        let (code, _, message) = refused(client.create_environment(create("wrong", 1, &environment)).await);
-        assert_eq!(code, Code::InvalidArgument, "{message}");
-        assert!(message.starts_with(begins), "{begins}, but: {message}");
+    for (environment, field, value) in cases {
+        assert_invalid(client.create_environment(create("wrong", 1, &environment)).await, field, value);
     }
     let good = || create("e", 2, &json!({}));
     let wrong = [
-        (v1::CreateEnvironmentRequest { count: Some(0), ..good() }, "count: 0"),
-        (v1::CreateEnvironmentRequest { count: Some(1025), ..good() }, "count: 1025"),
-        (v1::CreateEnvironmentRequest { seed: u64::MAX, ..good() }, "seed: 18446744073709551615"),
-        (v1::CreateEnvironmentRequest { environment_id: "x".repeat(129), ..good() }, "environment_id: \"xxx"),
+        (v1::CreateEnvironmentRequest { count: Some(0), ..good() }, "count", "0"),
+        (v1::CreateEnvironmentRequest { count: Some(1025), ..good() }, "count", "1025"),
+        (v1::CreateEnvironmentRequest { seed: u64::MAX, ..good() }, "seed", "18446744073709551615"),
+        (v1::CreateEnvironmentRequest { environment_id: "x".repeat(129), ..good() }, "environment_id", "\"xxx"),
     ];
-    for (request, begins) in wrong {
-        let (code, _, message) = refused(client.create_environment(request).await);
-        assert_eq!(code, Code::InvalidArgument, "{message}");
-        assert!(message.starts_with(begins), "{begins}, but: {message}");
+    for (request, field, value) in wrong {
+        assert_invalid(client.create_environment(request).await, field, value);
     }
     client.create_environment(good()).await.unwrap();
     let copy = |headings: &[u32]| v1::Headings { headings: headings.to_vec() };
     let wrong = [
-        (vec![], "actions: 0 copies"),
-        (vec![copy(&[0, 0, 0]); 3], "actions: 3 copies"),
-        (vec![copy(&[0, 0, 0]), copy(&[0, 0])], "actions[1].headings: 2 heading indices"),
-        (vec![copy(&[0, 0, 0]), copy(&[0, 8, 0])], "actions[1].headings[1]: 8"),
-        (vec![copy(&[256, 0, 0]), copy(&[0, 0, 0])], "actions[0].headings[0]: 256"),
+        (vec![], "actions", "0 entries"),
+        (vec![copy(&[0, 0, 0]); 3], "actions", "3 entries"),
+        (vec![copy(&[0, 0, 0]), copy(&[0, 0])], "actions[1].headings", "2 heading indices"),
+        (vec![copy(&[0, 0, 0]), copy(&[0, 8, 0])], "actions[1].headings[1]", "8"),
+        (vec![copy(&[256, 0, 0]), copy(&[0, 0, 0])], "actions[0].headings[0]", "256"),
     ];
-    for (actions, begins) in wrong {
-        let (code, _, message) = refused(client.step(step("e", 0, actions)).await);
-        assert_eq!(code, Code::InvalidArgument, "{message}");
-        assert!(message.starts_with(begins), "{begins}, but: {message}");
+    for (actions, field, value) in wrong {
+        assert_invalid(client.step(step("e", 0, actions)).await, field, value);
     }
     assert_eq!(fly(&mut client, step("e", 0, headings(2, 3, 8, 0))).await.step, 1, "nothing refused was flown");
 }
@@ -321,14 +313,13 @@ async fn idle_environments_expire_and_say_so() {
     fly(&mut client, step("e", 0, headings(1, 3, 8, 0))).await;
     server.pass(61);
     let named = v1::DeleteEnvironmentRequest { environment_id: "e".into() };
-    for (code, reason, message) in [
+    for (code, reason, _) in [
         refused(client.step(step("e", 1, headings(1, 3, 8, 1))).await),
         refused(client.reset(reset("e")).await),
         refused(client.get_environment(v1::GetEnvironmentRequest { environment_id: "e".into() }).await),
         refused(client.delete_environment(named.clone()).await),
     ] {
         assert_eq!((code, reason.as_str()), (Code::FailedPrecondition, "environment_expired"));
-        assert!(message.contains("60 s"), "{message}");
     }
     assert_eq!(refused(client.reset(reset("never")).await).0, Code::NotFound);
     client.create_environment(create("e", 1, &json!({}))).await.unwrap();
@@ -353,14 +344,11 @@ async fn their_number_and_their_memory_are_bounded() {
     for id in ["a", "b"] {
         ask(id, 1).await.unwrap();
     }
-    let (code, reason, message) = refused(ask("c", 1).await);
+    let (code, reason, _) = refused(ask("c", 1).await);
     assert_eq!((code, reason.as_str()), (Code::ResourceExhausted, "resource_exhausted"));
-    assert!(message.starts_with("2 environments"), "{message}");
     server.pass(601);
     ask("c", 1000).await.unwrap();
-    let (code, _, message) = refused(ask("d", 1000).await);
-    assert_eq!(code, Code::ResourceExhausted);
-    assert!(message.contains("2048 KiB"), "{message}");
+    assert_eq!(refused(ask("d", 1000).await).0, Code::ResourceExhausted);
     ask("c", 1000).await.expect("a retry takes no memory");
     server.pass(601);
     ask("d", 1000).await.expect("what expired made room");
@@ -368,9 +356,8 @@ async fn their_number_and_their_memory_are_bounded() {
     let crowd = Server::start().await;
     let mut client = self::client(&crowd).await;
     client.create_environment(create("e", 1, &json!({"uavs": 10, "users": 1000}))).await.unwrap();
-    let (code, _, message) = refused(client.reset(v1::ResetRequest { return_graph: true, ..reset("e") }).await);
-    assert_eq!(code, Code::InvalidArgument);
-    assert!(message.starts_with("return_graph: true"), "{message}");
+    let with_graph = v1::ResetRequest { return_graph: true, ..reset("e") };
+    assert_invalid(client.reset(with_graph).await, "return_graph", "true");
     assert_eq!(client.reset(reset("e")).await.unwrap().into_inner().copies[0].scene.as_ref().unwrap().users.len(), 1000);
 }
 

@@ -21,6 +21,7 @@ use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
 use tonic::transport::Channel;
 use tonic::{Code, Status};
+use tonic_types::StatusExt;
 
 pub struct Server {
     pub app: Arc<App>,
@@ -239,11 +240,29 @@ pub fn headings(answer: &v1::ActResponse) -> HashMap<String, u32> {
     answer.actions.iter().map(|a| (a.uav_id.clone(), a.heading_index)).collect()
 }
 
-/// The status and stable code of an error.
-pub fn refused<T>(answer: Result<tonic::Response<T>, Status>) -> (Code, String, String) {
-    let status = answer.map(|_| ()).expect_err("this has to be refused");
+/// The gRPC status of an error, its code, and the field that is not accepted (empty if the error is about no field).
+pub fn refused<T>(response: Result<tonic::Response<T>, Status>) -> (Code, String, String) {
+    let status = response.map(|_| ()).expect_err("the request must be refused");
     let code = status.metadata().get("qedgix-code").map_or("", |code| code.to_str().unwrap()).to_owned();
-    (status.code(), code, status.message().to_owned())
+    let details = status.get_error_details();
+    if let Some(info) = details.error_info() {
+        assert_eq!((info.reason.to_lowercase(), info.domain.as_str()), (code.clone(), "qedgix"));
+    }
+    let field = details.bad_request().map(|request| request.field_violations[0].field.clone());
+    (status.code(), code, field.unwrap_or_default())
+}
+
+/// Checks that the request is refused with `invalid_argument` because `field` has a value that starts with `value`; an empty
+/// `value` means that the field is missing.
+#[track_caller]
+pub fn assert_invalid<T>(response: Result<tonic::Response<T>, Status>, field: &str, value: &str) {
+    let status = response.map(|_| ()).expect_err("the request must be refused");
+    let details = status.get_error_details();
+    let received = details.error_info().and_then(|info| info.metadata.get("value")).cloned().unwrap_or_default();
+    assert!(received.starts_with(value) && value.is_empty() == received.is_empty(), "{value:?}: {status:?}");
+    let (grpc, code, found) = refused::<()>(Err(status));
+    assert_eq!((grpc, found.as_str()), (Code::InvalidArgument, field));
+    assert!(code == "invalid_argument" || code == "invalid_schema", "{code}");
 }
 
 /// `future`, which must not hang: a bound that is far beyond what it takes.

@@ -260,7 +260,7 @@ impl Model {
             Ok(life) => self.begin(Call { life, asked, answer }),
             Err(code) => {
                 let refused = answer.now_or_never().expect("refused at once");
-                assert_eq!(refused.map_err(|e| e.code()), Err(code));
+                assert_eq!(refused.map_err(|e| e.code().as_str()), Err(code));
             }
         }
     }
@@ -277,7 +277,7 @@ impl Model {
         if let Poll::Ready(answer) = polled {
             let Call { life, asked, .. } = self.calls.swap_remove(at);
             let expected = self.expect(life, &asked);
-            assert_eq!(answer.map_err(|e| e.code()), expected);
+            assert_eq!(answer.map_err(|e| e.code().as_str()), expected);
             self.answered += 1;
         }
     }

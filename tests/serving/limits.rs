@@ -54,12 +54,11 @@ async fn messages_that_do_not_decode_or_are_too_large() {
     let server = Server::start().await;
     let act = "/qedgix.v1.PolicyService/Act";
     for garbage in [&b"\xff\xff\xff\xff"[..], b"\x12\x7f", b"\x0a\x02\xff\xfe"] {
-        let (code, reason, message) = raw(&server, act, Bytes::from_static(garbage)).await;
-        assert_eq!((code, reason.as_str()), (Code::InvalidArgument, "invalid_argument"), "{message}");
+        let (code, reason, field) = raw(&server, act, Bytes::from_static(garbage)).await;
+        assert_eq!((code, reason.as_str(), field.as_str()), (Code::InvalidArgument, "invalid_argument", "message"));
     }
-    let (code, reason, message) = raw(&server, act, vec![0; 17_000_000].into()).await;
-    assert_eq!((code, reason.as_str()), (Code::ResourceExhausted, "too_large"), "{message}");
-    assert!(message.contains("16777216"), "{message}");
+    let (code, reason, _) = raw(&server, act, vec![0; 17_000_000].into()).await;
+    assert_eq!((code, reason.as_str()), (Code::ResourceExhausted, "too_large"));
     for unknown in ["/qedgix.v1.PolicyService/Nothing", "/no.such.Service/Act"] {
         assert_eq!(raw(&server, unknown, Bytes::new()).await.0, Code::Unimplemented);
     }
@@ -85,37 +84,35 @@ fn in_scene(request: &mut v1::ActRequest) -> &mut v1::Scene {
 async fn scenes_that_cannot_be_used_name_their_field() {
     let server = Server::start().await;
     let mut client = server.grpc().await;
-    let cases: &[(&str, Change)] = &[
-        ("observation: nothing", |r| r.observation = None),
-        ("scene: no UAV", |r| in_scene(r).uavs.clear()),
-        ("scene: 20001 nodes", |r| in_scene(r).users = scene(1, 19_998, 0).users),
-        ("users: 0", |r| in_scene(r).users.clear()),
-        ("scene.uavs[1].x: NaN", |r| in_scene(r).uavs[1].x = f64::NAN),
-        ("scene.uavs[0].y: inf", |r| in_scene(r).uavs[0].y = f64::INFINITY),
-        ("scene.users[2].x: 1000000", |r| in_scene(r).users[2].x = 1e300),
-        ("scene.users[2].aoi: -1", |r| in_scene(r).users[2].aoi = -1.0),
-        ("scene.users[2].aoi: NaN", |r| in_scene(r).users[2].aoi = f64::NAN),
-        ("scene.users[2].aoi: 1000000000", |r| in_scene(r).users[2].aoi = 1e20),
-        ("scene.uavs[2].id: \"\"", |r| in_scene(r).uavs[2].id.clear()),
-        ("scene.users[0].id: \"xxx", |r| in_scene(r).users[0].id = "x".repeat(129)),
-        ("scene.uavs[1].id: \"uav-0\"", |r| in_scene(r).uavs[1].id = "uav-0".into()),
-        ("scene.users[1].id: \"uav-0\"", |r| in_scene(r).users[1].id = "uav-0".into()),
-        ("policy: \"no such:policy\"", |r| r.policy = "no such:policy".into()),
-        ("run_id: \"\"", |r| r.run_id = Some(String::new())),
-        ("session_id: \"\"", |r| r.memory = Some(v1::act_request::Memory::SessionId(String::new()))),
+    let cases: &[(&str, &str, Change)] = &[
+        ("observation", "", |r| r.observation = None),
+        ("scene", "no UAV", |r| in_scene(r).uavs.clear()),
+        ("scene", "20001 nodes", |r| in_scene(r).users = scene(1, 19_998, 0).users),
+        ("users", "0", |r| in_scene(r).users.clear()),
+        ("scene.uavs[1].x", "NaN", |r| in_scene(r).uavs[1].x = f64::NAN),
+        ("scene.uavs[0].y", "inf", |r| in_scene(r).uavs[0].y = f64::INFINITY),
+        ("scene.users[2].x", "1000000", |r| in_scene(r).users[2].x = 1e300),
+        ("scene.users[2].aoi", "-1", |r| in_scene(r).users[2].aoi = -1.0),
+        ("scene.users[2].aoi", "NaN", |r| in_scene(r).users[2].aoi = f64::NAN),
+        ("scene.users[2].aoi", "1000000000", |r| in_scene(r).users[2].aoi = 1e20),
+        ("scene.uavs[2].id", "\"\"", |r| in_scene(r).uavs[2].id.clear()),
+        ("scene.users[0].id", "\"xxx", |r| in_scene(r).users[0].id = "x".repeat(129)),
+        ("scene.uavs[1].id", "\"uav-0\"", |r| in_scene(r).uavs[1].id = "uav-0".into()),
+        ("scene.users[1].id", "\"uav-0\"", |r| in_scene(r).users[1].id = "uav-0".into()),
+        ("policy", "\"no such:policy\"", |r| r.policy = "no such:policy".into()),
+        ("run_id", "\"\"", |r| r.run_id = Some(String::new())),
+        ("session_id", "\"\"", |r| r.memory = Some(v1::act_request::Memory::SessionId(String::new()))),
     ];
-    for (begins, change) in cases {
+    for (field, value, change) in cases {
         let mut request = held("sweep", Bytes::new(), scene(3, 5, 1));
         change(&mut request);
-        let (code, reason, message) = refused(client.act(request).await);
-        assert_eq!((code, reason.as_str()), (Code::InvalidArgument, "invalid_argument"), "{message}");
-        assert!(message.starts_with(begins), "{begins}, but: {message}");
+        assert_invalid(client.act(request).await, field, value);
     }
     // As many nodes as are allowed, all in one place: refused for what they would cost, not for their number.
     let mut request = held("sweep", Bytes::new(), scene(100, 3996, 1));
     in_scene(&mut request).uavs.iter_mut().for_each(|u| (u.x, u.y) = (0.5, 0.5));
     in_scene(&mut request).users.iter_mut().for_each(|u| (u.x, u.y) = (0.5, 0.5));
-    assert!(refused(client.act(request).await).2.starts_with("scene: a crowd"));
+    assert_invalid(client.act(request).await, "scene", "more than");
 }
 
 #[tokio::test]
@@ -132,48 +129,45 @@ async fn graphs_that_cannot_be_used_name_their_field() {
         ..Default::default()
     };
     client.act(request()).await.unwrap();
-    let cases: &[(&str, Change)] = &[
-        ("graph.nodes: no UAV", |r| nodes(r).clear()),
-        ("graph.nodes[1].kind: 0", |r| nodes(r)[1].kind = 0),
-        ("graph.nodes[1].kind: 17", |r| nodes(r)[1].kind = 17),
-        ("graph.nodes[3].id: \"u\"", |r| nodes(r)[3].id = "u".into()),
-        ("graph.nodes[2].id: \"\"", |r| nodes(r)[2].id.clear()),
-        ("graph.nodes[0].detections[1].target_id: \"x\"", |r| nodes(r)[0].detections[1].target_id = "x".into()),
-        ("graph.nodes[0].detections[1].target_id: \"a\"", |r| nodes(r)[0].detections[1].target_id = "a".into()),
-        ("graph.nodes[0].detections[2].target_id: a target a second", |r| nodes(r)[0].detections[2].target_id = "u".into()),
-        ("graph.nodes[2].detections[0].rel_x: NaN", |r| nodes(r)[2].detections[0].rel_x = f64::NAN),
-        ("graph.nodes[2].detections[0].rel_y: -inf", |r| nodes(r)[2].detections[0].rel_y = f64::NEG_INFINITY),
-        ("graph.nodes[0].detections[1].aoi: nothing", |r| nodes(r)[0].detections[1].aoi = None),
-        ("graph.nodes[0].detections[0].aoi: 4", |r| nodes(r)[0].detections[0].aoi = Some(4.0)),
-        ("graph.nodes[0].detections[1].aoi: -2", |r| nodes(r)[0].detections[1].aoi = Some(-2.0)),
-        ("graph.nodes[2].aoi: NaN", |r| nodes(r)[2].aoi = Some(f64::NAN)),
-        ("graph.nodes[0].aoi: 3", |r| nodes(r)[0].aoi = Some(3.0)),
-        ("graph.nodes[2].position: ", |r| nodes(r)[2].position = Some(v1::Position { x: 0.0, y: 0.0 })),
-        ("graph.nodes[1].position: nothing", |r| nodes(r)[1].position = None),
-        ("graph.nodes[1].position.x: NaN", |r| nodes(r)[1].position = Some(v1::Position { x: f64::NAN, y: 0.0 })),
-        ("graph: a graph", |r| r.policy = "greedy-global".into()),
+    let cases: &[(&str, &str, Change)] = &[
+        ("graph.nodes", "no UAV", |r| nodes(r).clear()),
+        ("graph.nodes[1].kind", "0", |r| nodes(r)[1].kind = 0),
+        ("graph.nodes[1].kind", "17", |r| nodes(r)[1].kind = 17),
+        ("graph.nodes[3].id", "\"u\"", |r| nodes(r)[3].id = "u".into()),
+        ("graph.nodes[2].id", "\"\"", |r| nodes(r)[2].id.clear()),
+        ("graph.nodes[0].detections[1].target_id", "\"x\"", |r| nodes(r)[0].detections[1].target_id = "x".into()),
+        ("graph.nodes[0].detections[1].target_id", "\"a\"", |r| nodes(r)[0].detections[1].target_id = "a".into()),
+        ("graph.nodes[0].detections[2].target_id", "\"u\"", |r| nodes(r)[0].detections[2].target_id = "u".into()),
+        ("graph.nodes[2].detections[0].rel_x", "NaN", |r| nodes(r)[2].detections[0].rel_x = f64::NAN),
+        ("graph.nodes[2].detections[0].rel_y", "-inf", |r| nodes(r)[2].detections[0].rel_y = f64::NEG_INFINITY),
+        ("graph.nodes[0].detections[1].aoi", "", |r| nodes(r)[0].detections[1].aoi = None),
+        ("graph.nodes[0].detections[0].aoi", "4", |r| nodes(r)[0].detections[0].aoi = Some(4.0)),
+        ("graph.nodes[0].detections[1].aoi", "-2", |r| nodes(r)[0].detections[1].aoi = Some(-2.0)),
+        ("graph.nodes[2].aoi", "NaN", |r| nodes(r)[2].aoi = Some(f64::NAN)),
+        ("graph.nodes[0].aoi", "3", |r| nodes(r)[0].aoi = Some(3.0)),
+        ("graph.nodes[2].position", "(0, 0)", |r| nodes(r)[2].position = Some(v1::Position { x: 0.0, y: 0.0 })),
+        ("graph.nodes[1].position", "", |r| nodes(r)[1].position = None),
+        ("graph.nodes[1].position.x", "NaN", |r| nodes(r)[1].position = Some(v1::Position { x: f64::NAN, y: 0.0 })),
+        ("scene", "", |r| r.policy = "greedy-global".into()),
     ];
-    for (begins, change) in cases {
+    for (field, value, change) in cases {
         let mut request = request();
         change(&mut request);
-        let (code, _, message) = refused(client.act(request).await);
-        assert_eq!(code, Code::InvalidArgument, "{message}");
-        assert!(message.starts_with(begins), "{begins}, but: {message}");
+        assert_invalid(client.act(request).await, field, value);
     }
     let contradictions: &[(&str, Change)] = &[
-        ("said of the same user elsewhere", |r| nodes(r)[1].detections[1].aoi = Some(5.0)),
-        ("negation of what its target reports", |r| nodes(r)[1].detections[0].rel_x = 0.05),
-        ("within the policy's detection range of 0.28", |r| {
+        ("graph.nodes[1].detections[1].aoi", |r| nodes(r)[1].detections[1].aoi = Some(5.0)),
+        ("graph.nodes[1].detections[0].rel_x", |r| nodes(r)[1].detections[0].rel_x = 0.05),
+        ("graph.nodes[3].detections[0].rel_x", |r| {
             nodes(r)[0].detections.pop();
             nodes(r)[3].detections[0].rel_x = -0.2801;
         }),
     ];
-    for (contains, change) in contradictions {
+    for (field, change) in contradictions {
         let mut request = request();
         change(&mut request);
-        let (code, _, message) = refused(client.act(request).await);
-        assert_eq!(code, Code::InvalidArgument, "{message}");
-        assert!(message.contains(contains), "{contains}, but: {message}");
+        let (code, _, found) = refused(client.act(request).await);
+        assert_eq!((code, found.as_str()), (Code::InvalidArgument, *field));
     }
 }
 
@@ -281,8 +275,8 @@ async fn a_policy_that_panics_is_an_internal_error_and_no_more() {
     let mut client = server.grpc().await;
     client.open_session(open("panics", "s")).await.unwrap();
     for _ in 0..3 {
-        let (code, reason, message) = refused(client.act(in_session("s", Some(0), scene(2, 2, 0))).await);
-        assert_eq!((code, reason.as_str(), message.as_str()), (Code::Internal, "internal", "internal error"));
+        let (code, reason, _) = refused(client.act(in_session("s", Some(0), scene(2, 2, 0))).await);
+        assert_eq!((code, reason.as_str()), (Code::Internal, "internal"));
     }
     client.act(held("sweep", Bytes::new(), scene(2, 2, 0))).await.unwrap();
 }

@@ -76,27 +76,27 @@ async fn what_cannot_be_published_is_refused_and_leaves_nothing() {
     let json = Some("application/json");
     let nowhere = r#"{"checkpoint_id": "01a202d1-93be-769e-80f7-75eef9496f12"}"#;
     let cases = [
-        ("mine", Some(BYTES), b"hello".to_vec(), 400, "invalid_argument", "checkpoint: 5 bytes is not valid"),
-        ("mine", Some(BYTES), Vec::new(), 400, "invalid_argument", "checkpoint: 0 bytes"),
-        ("mine", Some(BYTES), torn, 400, "invalid_argument", "not a safetensors file: tensor `"),
-        ("mine", Some(BYTES), vec![b' '; (64 << 20) + 1], 413, "too_large", "limit of 67108864 bytes"),
-        ("mine", None, good.clone(), 415, "unsupported_media_type", "content-type: nothing"),
-        ("mine", Some("text/plain"), good.clone(), 415, "unsupported_media_type", "content-type: \"text/plain\""),
-        ("sweep", Some(BYTES), good.clone(), 400, "invalid_argument", "not a baseline's"),
-        ("mine:1", Some(BYTES), good.clone(), 400, "invalid_argument", "name: \"mine:1\""),
-        ("mine?alias=a:b", Some(BYTES), good.clone(), 400, "invalid_argument", "alias: \"a:b\""),
-        ("mine?allias=live", Some(BYTES), good.clone(), 400, "invalid_argument", "unknown field `allias`"),
-        ("mine", json, nowhere.into(), 404, "not_found", "no checkpoint \"01a202d1"),
-        ("mine", json, br#"{"checkpoint_id": "../../x"}"#.to_vec(), 404, "not_found", "no checkpoint"),
-        ("mine", json, br#"{"checkpoint": 3}"#.to_vec(), 422, "invalid_schema", "unknown field `checkpoint`"),
-        ("mine", json, good, 400, "invalid_argument", "not JSON"),
+        ("mine", Some(BYTES), b"hello".to_vec(), 400, "invalid_argument", "checkpoint"),
+        ("mine", Some(BYTES), Vec::new(), 400, "invalid_argument", "checkpoint"),
+        ("mine", Some(BYTES), torn, 400, "invalid_argument", "checkpoint"),
+        ("mine", Some(BYTES), vec![b' '; (64 << 20) + 1], 413, "too_large", ""),
+        ("mine", None, good.clone(), 415, "unsupported_media_type", "content-type"),
+        ("mine", Some("text/plain"), good.clone(), 415, "unsupported_media_type", "content-type"),
+        ("sweep", Some(BYTES), good.clone(), 400, "invalid_argument", "name"),
+        ("mine:1", Some(BYTES), good.clone(), 400, "invalid_argument", "name"),
+        ("mine?alias=a:b", Some(BYTES), good.clone(), 400, "invalid_argument", "alias"),
+        ("mine?allias=live", Some(BYTES), good.clone(), 400, "invalid_argument", "query"),
+        ("mine", json, nowhere.into(), 404, "not_found", ""),
+        ("mine", json, br#"{"checkpoint_id": "../../x"}"#.to_vec(), 404, "not_found", ""),
+        ("mine", json, br#"{"checkpoint": 3}"#.to_vec(), 422, "invalid_schema", "checkpoint"),
+        ("mine", json, good, 400, "invalid_argument", "body"),
     ];
-    for (name, kind, body, status, code, contains) in cases {
+    for (name, kind, body, status, code, field) in cases {
         let (policy, query) = name.split_once('?').map_or((name, String::new()), |(name, query)| (name, format!("?{query}")));
         let (found, problem, head) = sent(&server, &format!("/v1/policies/{policy}/versions{query}"), kind, body).await;
         assert_eq!((found.as_u16(), &problem["code"]), (status, &json!(code)), "{problem}");
         assert_eq!(head.headers()["content-type"], "application/problem+json");
-        assert!(problem["detail"].as_str().unwrap().contains(contains), "{contains}, but: {problem}");
+        assert_eq!(problem["field"].as_str().unwrap_or_default(), field, "{problem}");
     }
     assert_eq!(server.app.store.policy_versions().await.unwrap(), before);
 }
@@ -305,7 +305,7 @@ async fn the_command_line_does_all_of_it() {
         (&["get", "mine@live"][..], "no policy \"mine@live\""),
         (&["export", "sweep"], "has no checkpoint to export"),
         (&["upload", "mine", "/no/such/file"], "cannot read /no/such/file"),
-        (&["upload", "sweep", one], "not a baseline's"),
+        (&["upload", "sweep", one], "name"),
         (&["unload", "a/../b"], "policy: \"a/../b\""),
     ] {
         let (code, _, err) = run(&server, words).await;

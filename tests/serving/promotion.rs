@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use bytes::Bytes;
+use qedgix::error_code::ErrorCode;
 use qedgix::policy::FleetStep;
 use qedgix::service::policies::{self, AliasChange};
 use qedgix::service::{App, PageRequest};
@@ -323,7 +324,7 @@ async fn of_all_who_expect_the_same_one_moves_it() {
                     assert_eq!(previous.unwrap_or(0), now);
                     won += 1;
                 }
-                Err(refused) => assert_eq!(refused.code(), "alias_moved"),
+                Err(refused) => assert_eq!(refused.code(), ErrorCode::AliasMoved),
             }
         }
         assert_eq!((won, server.app.registry.aliases("mine").unwrap()["live"]), (1, next), "round {round}");

@@ -34,12 +34,12 @@ impl<'a> Rest<'a> {
         self.send(Method::GET, path, "").await
     }
 
-    /// A body that is refused: status, code and detail.
+    /// Status and code of the problem, and the field that is not accepted (empty if the problem is about no field).
     pub async fn refused(&self, path: &str, body: &str) -> (u16, String, String) {
         let (status, problem) = self.send(Method::POST, path, body.to_owned()).await;
         assert_eq!(problem["status"], status.as_u16());
-        let text = |name: &str| problem[name].as_str().unwrap().to_owned();
-        (status.as_u16(), text("code"), text("detail"))
+        let text = |name: &str| problem[name].as_str().unwrap_or_default().to_owned();
+        (status.as_u16(), text("code"), text("field"))
     }
 }
 
@@ -96,9 +96,8 @@ async fn memory_kept_by_the_caller_travels_in_base64() {
     let (status, second) = rest.post("/v1/act", &next).await;
     assert_eq!((status, &second["step"]), (StatusCode::OK, &json!(1)), "{second}");
     next["recurrent_state"] = json!("not base64!");
-    let (status, code, detail) = rest.refused("/v1/act", &next.to_string()).await;
-    assert_eq!((status, code.as_str()), (422, "invalid_schema"));
-    assert!(detail.starts_with("recurrent_state: not base64"), "{detail}");
+    let (status, code, field) = rest.refused("/v1/act", &next.to_string()).await;
+    assert_eq!((status, code.as_str(), field.as_str()), (422, "invalid_schema", "recurrent_state"));
 }
 
 #[tokio::test]
@@ -152,31 +151,30 @@ async fn the_table_of_errors() {
     };
     let good = slot("s", 0).to_string();
     let cases = [
-        (with(&["scene", "users", "2", "aoi"], json!(-1.0)), 400, "invalid_argument", "scene.users[2].aoi: -1"),
-        (with(&["scene", "uavs", "1", "x"], json!("east")), 422, "invalid_schema", "scene.uavs[1].x: invalid type"),
-        (with(&["scene", "uavs", "1", "x"], Value::Null), 422, "invalid_schema", "scene.uavs[1].x: invalid type"),
-        (with(&["scene", "uavs", "1", "z"], json!(1)), 422, "invalid_schema", "scene.uavs[1].z: unknown field"),
-        (with(&["scene", "uavs", "0"], json!({"id": "a", "x": 0})), 422, "invalid_schema", "scene.uavs[0]: missing field `y`"),
-        (with(&["scene", "users"], json!([])), 400, "invalid_argument", "users: 0"),
-        (with(&["graph"], json!({"nodes": []})), 422, "invalid_schema", "graph: one of graph and scene"),
-        (with(&["recurrent_state"], json!("")), 422, "invalid_schema", "session_id: one of"),
-        (with(&["hello"], json!(1)), 422, "invalid_schema", "hello: unknown field"),
-        (with(&["step"], json!(-1)), 422, "invalid_schema", "step: invalid value"),
-        (with(&["step"], json!(3)), 409, "wrong_step", "step 3 does not follow"),
-        (with(&["session_id"], json!("nobody")), 404, "not_found", "no session \"nobody\""),
-        (good[..good.len() / 2].to_owned(), 400, "invalid_argument", "body: "),
-        (format!("{good}{good}"), 400, "invalid_argument", "body: more than one"),
-        (good.replacen("0.", "1e999", 1), 400, "invalid_argument", "body: "),
-        (String::new(), 400, "invalid_argument", "body: 0 bytes"),
-        ("[".repeat(100_000), 422, "invalid_schema", ""),
-        ("null".into(), 422, "invalid_schema", "invalid type"),
-        (" ".repeat(20_000_000), 413, "too_large", "the body is larger than the limit of 16777216"),
+        (with(&["scene", "users", "2", "aoi"], json!(-1.0)), 400, "invalid_argument", "scene.users[2].aoi"),
+        (with(&["scene", "uavs", "1", "x"], json!("east")), 422, "invalid_schema", "scene.uavs[1].x"),
+        (with(&["scene", "uavs", "1", "x"], Value::Null), 422, "invalid_schema", "scene.uavs[1].x"),
+        (with(&["scene", "uavs", "1", "z"], json!(1)), 422, "invalid_schema", "scene.uavs[1].z"),
+        (with(&["scene", "uavs", "0"], json!({"id": "a", "x": 0})), 422, "invalid_schema", "scene.uavs[0].y"),
+        (with(&["scene", "users"], json!([])), 400, "invalid_argument", "users"),
+        (with(&["graph"], json!({"nodes": []})), 422, "invalid_schema", "graph"),
+        (with(&["recurrent_state"], json!("")), 422, "invalid_schema", "session_id"),
+        (with(&["hello"], json!(1)), 422, "invalid_schema", "hello"),
+        (with(&["step"], json!(-1)), 422, "invalid_schema", "step"),
+        (with(&["step"], json!(3)), 409, "wrong_step", ""),
+        (with(&["session_id"], json!("nobody")), 404, "not_found", ""),
+        (good[..good.len() / 2].to_owned(), 400, "invalid_argument", "body"),
+        (format!("{good}{good}"), 400, "invalid_argument", "body"),
+        (good.replacen("0.", "1e999", 1), 400, "invalid_argument", "body"),
+        (String::new(), 400, "invalid_argument", "body"),
+        ("[".repeat(100_000), 422, "invalid_schema", "body"),
+        ("null".into(), 422, "invalid_schema", "body"),
+        (" ".repeat(20_000_000), 413, "too_large", ""),
     ];
-    for (body, status, code, begins) in cases {
+    for (body, status, code, field) in cases {
         let shown: String = body.chars().take(200).collect();
         let refused = rest.refused("/v1/act", &body).await;
-        assert_eq!((refused.0, refused.1.as_str()), (status, code), "{shown}: {}", refused.2);
-        assert!(refused.2.starts_with(begins), "{begins}, but: {}", refused.2);
+        assert_eq!((refused.0, refused.1.as_str(), refused.2.as_str()), (status, code, field), "{shown}");
     }
     assert_eq!(rest.refused("/v1/sessions", r#"{"policy": "swoop"}"#).await.0, 404);
     assert_eq!(rest.refused("/v1/sessions", r#"{"policy": "sweep", "sesion_id": "x"}"#).await.0, 422);

@@ -36,7 +36,7 @@ impl Ids {
 /// Checks how many nodes there are.
 pub(super) fn check_counts(field: &str, uavs: usize, users: usize) -> Result<(), Invalid> {
     if uavs == 0 {
-        return Err(Invalid::new(field, "no UAV", "at least one UAV"));
+        return Err(Invalid::new(field, "no UAV", "at least 1 UAV"));
     }
     check_nodes(field, uavs + users)
 }
@@ -44,7 +44,7 @@ pub(super) fn check_counts(field: &str, uavs: usize, users: usize) -> Result<(),
 /// Checks that there are not too many nodes.
 pub(super) fn check_nodes(field: &str, nodes: usize) -> Result<(), Invalid> {
     if nodes > MAX_NODES {
-        return Err(Invalid::new(field, format!("{nodes} nodes"), format!("at most {MAX_NODES}")));
+        return Err(Invalid::new(field, format!("{nodes} UAVs and users"), format!("at most {MAX_NODES} UAVs and users")));
     }
     Ok(())
 }
@@ -58,8 +58,9 @@ pub(super) fn distinct(
     users: (&[String], &[u32]),
     field: impl Fn(bool, u32) -> String,
 ) -> Result<(), Invalid> {
-    let again =
-        |is_uav, id: &String, place| Err(Invalid::new(field(is_uav, place), format!("{id:?}"), "an id that no other node has"));
+    let again = |is_uav, id: &String, place| {
+        Err(Invalid::new(field(is_uav, place), format!("{id:?}"), "an id that no other UAV or user has"))
+    };
     for (is_uav, (ids, places)) in [(true, uavs), (false, users)] {
         if let Some(at) = ids.windows(2).position(|pair| pair[0] == pair[1]) {
             return again(is_uav, &ids[at + 1], places[at + 1]);

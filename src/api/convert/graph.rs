@@ -74,12 +74,16 @@ impl Builder {
                 self.tell_aoi(user, value, || format!("{}.aoi", at()))?;
             }
             if sent.position.is_some() {
-                return Err(Invalid::new(format!("{}.position", at()), "a position", "nothing: only UAVs tell their own"));
+                return Err(Invalid::new(
+                    format!("{}.position", at()),
+                    "a position",
+                    "no value, because only UAVs have positions in a graph",
+                ));
             }
             self.graph.left_out[user] = sent.detections.is_empty();
         } else {
             if let Some(value) = sent.aoi {
-                return Err(Invalid::new(format!("{}.aoi", at()), value, "nothing: only users have an AoI"));
+                return Err(Invalid::new(format!("{}.aoi", at()), value, "no value, because only users have an AoI"));
             }
             if let Some(p) = sent.position {
                 self.graph.positions[node] = Some(point(|| format!("{}.position", at()), p.x, p.y)?);
@@ -92,17 +96,17 @@ impl Builder {
                 return Err(Invalid::new(
                     field("target_id"),
                     format!("{:?}", detection.target_id),
-                    "the id of a node of this graph",
+                    "the id of a node in the graph",
                 ));
             };
             if target as usize == node {
-                return Err(Invalid::new(field("target_id"), format!("{:?}", detection.target_id), "another node than itself"));
+                return Err(Invalid::new(field("target_id"), format!("{:?}", detection.target_id), "the id of another node"));
             }
             let rel = [finite(|| field("rel_x"), detection.rel_x)?, finite(|| field("rel_y"), detection.rel_y)?];
             match ((target as usize).checked_sub(uavs), detection.aoi) {
                 (Some(user), Some(value)) => self.tell_aoi(user, value, || field("aoi"))?,
-                (Some(_), None) => return Err(Invalid::new(field("aoi"), "nothing", "the AoI of the user, in slots")),
-                (None, Some(value)) => return Err(Invalid::new(field("aoi"), value, "nothing: the target is a UAV")),
+                (Some(_), None) => return Err(Invalid::missing(field("aoi"), "the AoI of the user in slots")),
+                (None, Some(value)) => return Err(Invalid::new(field("aoi"), value, "no value, because the target is a UAV")),
                 (None, None) => {}
             }
             list.push(Sighting { target, rel, place: i as u32, mirrored: false });
@@ -110,7 +114,8 @@ impl Builder {
         list.sort_by_key(|s| s.target);
         if let Some(pair) = list.windows(2).find(|pair| pair[0].target == pair[1].target) {
             let field = format!("{}.detections[{}].target_id", at(), pair[1].place);
-            return Err(Invalid::new(field, "a target a second time", "one detection per target"));
+            let target = format!("node {} twice", pair[1].target);
+            return Err(Invalid::new(field, target, "one detection per target"));
         }
         self.graph.detections.push(list);
         Ok(())
@@ -120,7 +125,7 @@ impl Builder {
         let value = aoi(&field, value)?;
         let known = self.graph.aoi[user];
         if self.told[user] && known.to_bits() != value.to_bits() {
-            return Err(Invalid::new(field(), value, format!("{known}, which is said of the same user elsewhere")));
+            return Err(Invalid::new(field(), value, format!("{known}, the AoI of the same user elsewhere in the graph")));
         }
         self.graph.aoi[user] = value;
         self.told[user] = true;
@@ -143,7 +148,8 @@ pub(super) fn mirror(mut graph: Graph) -> Result<Graph, Invalid> {
             let [x, y] = other[at].rel;
             if (x - back[0]).abs() > AGREEMENT || (y - back[1]).abs() > AGREEMENT {
                 let field = graph.rel_field(sighting.target as usize, other[at].place);
-                let expected = format!("about ({}, {}), the negation of what its target reports", back[0], back[1]);
+                let expected =
+                    format!("about ({}, {}), the negation of the position that the other node reports", back[0], back[1]);
                 return Err(Invalid::new(field, format!("({x}, {y})"), expected));
             }
         }

@@ -280,7 +280,7 @@ impl From<JobState> for v1::JobState {
 /// A number that names no state.
 pub fn state_filter(state: i32) -> Result<Option<JobState>, Invalid> {
     let known = v1::JobState::try_from(state);
-    Ok(Some(match known.map_err(|_| Invalid::new("state", state, "a JobState"))? {
+    Ok(Some(match known.map_err(|_| Invalid::new("state", state, "the number of a JobState"))? {
         v1::JobState::Unspecified => return Ok(None),
         v1::JobState::Queued => JobState::Queued,
         v1::JobState::Running => JobState::Running,
@@ -353,7 +353,9 @@ impl TryFrom<v1::FinishRequest> for AttemptResult {
             v1::Outcome::Succeeded => Ok(Self::Succeeded),
             v1::Outcome::Stopped => Ok(Self::Stopped),
             v1::Outcome::Failed => Ok(Self::Failed { reason: request.reason, permanent: request.permanent }),
-            v1::Outcome::Unspecified => Err(Invalid::new("outcome", request.outcome, "succeeded, stopped or failed")),
+            v1::Outcome::Unspecified => {
+                Err(Invalid::new("outcome", request.outcome, "OUTCOME_SUCCEEDED, OUTCOME_STOPPED or OUTCOME_FAILED"))
+            }
         }
     }
 }
@@ -366,7 +368,9 @@ impl TryFrom<v1::CheckpointHeader> for NewCheckpoint {
         let kind = match header.kind() {
             v1::CheckpointKind::Best => CheckpointKind::Best,
             v1::CheckpointKind::Last => CheckpointKind::Last,
-            v1::CheckpointKind::Unspecified => return Err(Invalid::new("header.kind", header.kind, "best or last")),
+            v1::CheckpointKind::Unspecified => {
+                return Err(Invalid::new("header.kind", header.kind, "CHECKPOINT_KIND_BEST or CHECKPOINT_KIND_LAST"));
+            }
         };
         let metrics = header.metrics.into_iter().filter(|(_, value)| value.is_finite()).collect();
         Ok(Self { kind, step: header.step, sha256: header.sha256, metrics, bytes: Vec::new() })

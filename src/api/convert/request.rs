@@ -26,7 +26,7 @@ impl TryFrom<v1::ActRequest> for act::Request {
         let observation = match request.observation {
             Some(Sent::Graph(graph)) => Observation::try_from(graph)?,
             Some(Sent::Scene(scene)) => Observation::try_from(scene)?,
-            None => return Err(Invalid::new("observation", "nothing", "a graph or a scene")),
+            None => return Err(Invalid::missing("observation", "a graph or a scene")),
         };
         Ok(Self { policy, observation, memory, step: request.step, run_id: request.run_id, seed: request.seed })
     }

@@ -1,4 +1,4 @@
-//! One gRPC call from its head to its last byte: the bodies of both directions, counted as they pass, and its end, told once.
+//! One gRPC call: its request and response bodies, whose messages are counted as they pass, and its end, which is logged once.
 
 use std::fmt::Display;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -15,23 +15,24 @@ use tonic::body::Body;
 use tonic::{Code, Status};
 use tracing::Span;
 
-use super::meters::{Frames, Meters, Method, code_name};
-use crate::api::observe::{Ending, Ids, RequestId, Valve, Verdict, tell};
+use super::metrics::{MessageCounter, Method, Methods, code_name};
+use crate::api::errors::CODE_METADATA;
+use crate::api::observe::{Completion, LogLimiter, RequestId, RequestIds, Severity, log_request};
 use crate::invalid::Invalid;
 use crate::service::Error;
 
-/// What all calls share.
-pub(super) struct Shared {
-    pub(super) meters: Meters,
-    pub(super) ids: Ids,
-    pub(super) valve: Valve,
+/// The state that all calls share.
+pub(super) struct CallContext {
+    pub(super) methods: Methods,
+    pub(super) ids: RequestIds,
+    pub(super) log_limiter: LogLimiter,
     /// Cancelled when the server closes.
     pub(super) closing: CancellationToken,
 }
 
-/// A call. It ends once: with a status, or cancelled when it is dropped before.
+/// A call. It ends once: with a status, or as cancelled if it is dropped before.
 pub(super) struct Call {
-    shared: Arc<Shared>,
+    context: Arc<CallContext>,
     method: usize,
     id: RequestId,
     begun: Instant,
@@ -40,9 +41,9 @@ pub(super) struct Call {
 }
 
 impl Call {
-    /// One of method number `method` that begins now.
-    pub(super) fn begin(shared: Arc<Shared>, method: usize, id: RequestId, span: Span) -> Self {
-        Self { shared, method, id, begun: Instant::now(), span, over: false }
+    /// A call of method number `method` that begins now.
+    pub(super) fn begin(context: Arc<CallContext>, method: usize, id: RequestId, span: Span) -> Self {
+        Self { context, method, id, begun: Instant::now(), span, over: false }
     }
 
     pub(super) fn id(&self) -> &RequestId {
@@ -54,10 +55,10 @@ impl Call {
     }
 
     fn method(&self) -> &Method {
-        self.shared.meters.method(self.method)
+        self.context.methods.get(self.method)
     }
 
-    /// Counts it and says how it went.
+    /// Counts and logs the call, the first time it is called.
     pub(super) fn end(&mut self, code: Code, detail: &dyn Display) {
         if std::mem::replace(&mut self.over, true) {
             return;
@@ -66,54 +67,57 @@ impl Call {
         let seconds = self.begun.elapsed().as_secs_f64();
         method.handled(code).increment(1);
         method.handles().seconds.record(seconds);
-        let verdict = match code {
-            Code::Internal | Code::Unknown | Code::DataLoss => Verdict::Fault,
-            Code::ResourceExhausted | Code::DeadlineExceeded | Code::Unauthenticated | Code::PermissionDenied => Verdict::Refused,
-            _ => Verdict::Settled,
+        let severity = match code {
+            Code::Internal | Code::Unknown | Code::DataLoss => Severity::Failed,
+            Code::ResourceExhausted | Code::DeadlineExceeded | Code::Unauthenticated | Code::PermissionDenied => {
+                Severity::Refused
+            }
+            _ => Severity::Normal,
         };
-        let ending = Ending { method: &method.path, id: &self.id, code: code_name(code), seconds, verdict, detail };
-        tell(&ending, &self.span, &self.shared.valve);
+        let completion = Completion { method: &method.path, id: &self.id, code: code_name(code), seconds, severity, detail };
+        log_request(&completion, &self.span, &self.context.log_limiter);
     }
 }
 
 impl Drop for Call {
     fn drop(&mut self) {
-        self.end(Code::Cancelled, &"the caller left");
+        self.end(Code::Cancelled, &"cancelled by the client");
     }
 }
 
-/// The transport has its own statuses for messages that are too large or do not decode; the table of errors has others.
-pub(super) fn in_line(status: &Status) -> Option<Status> {
-    if status.metadata().contains_key("qedgix-code") {
+/// The replacement for a status that tonic made and that has no code of the product: a message that is too large or does
+/// not decode.
+pub(super) fn with_code(status: &Status) -> Option<Status> {
+    if status.metadata().contains_key(CODE_METADATA) {
         return None;
     }
     Some(Status::from(match status.code() {
-        Code::OutOfRange => Error::TooLarge(status.message().to_owned()),
-        Code::Internal => Error::from(Invalid::new("message", status.message(), "one message of the method's request type")),
+        Code::OutOfRange => Error::TooLarge { message: status.message().to_owned(), limit: None },
+        Code::Internal => Error::from(Invalid::new("message", status.message(), "a message of the request type of the method")),
         _ => return None,
     }))
 }
 
-/// The body of a request of many messages. It ends when the server closes, however long its caller would go on, and with it
-/// the stream that answers it.
-pub(super) struct Question {
+/// The body of a stream from the client. It ends when the server closes, even if the client would continue; then the
+/// response ends, too.
+pub(super) struct RequestBody {
     body: Body,
-    frames: Frames,
-    shared: Arc<Shared>,
+    messages: MessageCounter,
+    context: Arc<CallContext>,
     method: usize,
     closing: Pin<Box<WaitForCancellationFutureOwned>>,
 }
 
-impl Question {
-    pub(super) fn new(body: Body, shared: Arc<Shared>, method: usize) -> Self {
-        let closing = Box::pin(shared.closing.clone().cancelled_owned());
-        Self { body, frames: Frames::default(), shared, method, closing }
+impl RequestBody {
+    pub(super) fn new(body: Body, context: Arc<CallContext>, method: usize) -> Self {
+        let closing = Box::pin(context.closing.clone().cancelled_owned());
+        Self { body, messages: MessageCounter::default(), context, method, closing }
     }
 }
 
 type Polled = Poll<Option<Result<Frame<Bytes>, Status>>>;
 
-impl http_body::Body for Question {
+impl http_body::Body for RequestBody {
     type Data = Bytes;
     type Error = Status;
 
@@ -122,8 +126,8 @@ impl http_body::Body for Question {
             return self.closing.as_mut().poll(context).map(|()| None);
         };
         if let Some(piece) = frame.as_ref().and_then(|frame| frame.as_ref().ok()?.data_ref()) {
-            let messages = self.frames.count(piece);
-            self.shared.meters.method(self.method).handles().received.increment(messages);
+            let messages = self.messages.count(piece);
+            self.context.methods.get(self.method).handles().received.increment(messages);
         }
         Poll::Ready(frame)
     }
@@ -137,25 +141,25 @@ impl http_body::Body for Question {
     }
 }
 
-/// The body of an answer; the call ends with it.
-pub struct Answer {
+/// The body of a response. The call ends with its last frame.
+pub struct ResponseBody {
     body: Body,
-    frames: Frames,
+    messages: MessageCounter,
     call: Call,
 }
 
-impl Answer {
+impl ResponseBody {
     pub(super) fn new(body: Body, call: Call) -> Self {
-        Self { body, frames: Frames::default(), call }
+        Self { body, messages: MessageCounter::default(), call }
     }
 
     fn sent(&mut self, piece: &Bytes) {
         let method = self.call.method();
-        let messages = if method.streams.server { self.frames.count(piece) } else { 1 };
+        let messages = if method.streams.server { self.messages.count(piece) } else { 1 };
         method.handles().sent.increment(messages);
     }
 
-    /// The trailers tell how it went; they are brought in line, too.
+    /// Ends the call with the status in the trailers, and adds the code of the product where it is missing.
     fn ended(&mut self, trailers: HeaderMap) -> HeaderMap {
         if trailers.get(Status::GRPC_STATUS).is_some_and(|code| code == "0") {
             self.call.end(Code::Ok, &"");
@@ -165,7 +169,7 @@ impl Answer {
             self.call.end(Code::Unknown, &"no status");
             return trailers;
         };
-        match in_line(&status) {
+        match with_code(&status) {
             None => {
                 self.call.end(status.code(), &status.message());
                 trailers
@@ -178,14 +182,14 @@ impl Answer {
     }
 }
 
-/// A status as it stands behind the messages.
+/// The trailers of a status.
 fn trailers_of(status: Status) -> HeaderMap {
     let mut trailers = std::mem::take(status.into_http::<()>().headers_mut());
     trailers.remove(header::CONTENT_TYPE);
     trailers
 }
 
-impl http_body::Body for Answer {
+impl http_body::Body for ResponseBody {
     type Data = Bytes;
     type Error = Status;
 
@@ -215,7 +219,7 @@ impl http_body::Body for Answer {
                 Some(Err(status))
             }
             None => {
-                // Trailers came before, or with the head.
+                // The trailers came before, or the response had only a head.
                 this.call.end(Code::Unknown, &"no status");
                 None
             }
@@ -248,14 +252,15 @@ mod tests {
     }
 
     #[test]
-    fn a_stream_that_panics_ends_with_a_status() {
-        let shared = Shared { meters: Meters::new(&[]), ids: Ids::new(), valve: Valve::new(), closing: CancellationToken::new() };
-        let id = shared.ids.of(&HeaderMap::new());
-        let mut answer = Answer::new(Body::new(Panics), Call::begin(Arc::new(shared), 0, id, Span::none()));
+    fn a_panic_in_a_stream_ends_it_with_a_status() {
+        let (methods, closing) = (Methods::new(&[]), CancellationToken::new());
+        let context = CallContext { methods, ids: RequestIds::new(), log_limiter: LogLimiter::new(), closing };
+        let id = context.ids.for_request(&HeaderMap::new());
+        let mut body = ResponseBody::new(Body::new(Panics), Call::begin(Arc::new(context), 0, id, Span::none()));
         let mut context = Context::from_waker(std::task::Waker::noop());
-        let Poll::Ready(Some(Ok(frame))) = Pin::new(&mut answer).poll_frame(&mut context) else { panic!("no frame") };
+        let Poll::Ready(Some(Ok(frame))) = Pin::new(&mut body).poll_frame(&mut context) else { panic!("no frame") };
         let status = Status::from_header_map(frame.trailers_ref().unwrap()).unwrap();
         assert_eq!((status.code(), status.message()), (Code::Internal, "internal error"));
-        assert!(answer.call.over && matches!(Pin::new(&mut answer).poll_frame(&mut context), Poll::Ready(None)));
+        assert!(body.call.over && matches!(Pin::new(&mut body).poll_frame(&mut context), Poll::Ready(None)));
     }
 }

@@ -1,16 +1,16 @@
-//! `grpc-timeout`: the moment after which a caller no longer waits.
+//! The deadline of a call, from the header `grpc-timeout`.
 
 use std::time::{Duration, Instant};
 
 use axum::http::Request;
 use tonic::Extensions;
 
-/// The moment after which the caller no longer waits.
+/// Time at which the client stops waiting.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Deadline(pub(super) Instant);
 
-/// Notes the deadline of a request; to be called as soon as its head is there.
-pub(super) fn stamp<B>(mut request: Request<B>) -> Request<B> {
+/// Puts the deadline of a request into its extensions. To be called when the head of the request arrives.
+pub(super) fn read_deadline<B>(mut request: Request<B>) -> Request<B> {
     let timeout = request.headers().get("grpc-timeout").and_then(|value| timeout(value.to_str().ok()?));
     if let Some(timeout) = timeout {
         request.extensions_mut().insert(Deadline(Instant::now() + timeout));
@@ -23,7 +23,7 @@ pub(super) fn deadline(extensions: &Extensions) -> Option<Instant> {
     extensions.get::<Deadline>().map(|deadline| deadline.0)
 }
 
-/// A `grpc-timeout`: up to 8 digits and a unit.
+/// Parses a `grpc-timeout`: up to 8 digits and a unit.
 fn timeout(value: &str) -> Option<Duration> {
     let (digits, unit) = value.split_at_checked(value.len().checked_sub(1)?)?;
     if digits.is_empty() || digits.len() > 8 || !digits.bytes().all(|b| b.is_ascii_digit()) {
@@ -46,7 +46,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn timeouts_as_the_protocol_writes_them() {
+    fn timeouts_are_parsed_as_the_grpc_specification_defines() {
         assert_eq!(timeout("100m"), Some(Duration::from_millis(100)));
         assert_eq!(timeout("99999999H"), Some(Duration::from_secs(99_999_999 * 3600)));
         assert_eq!(timeout("0n"), Some(Duration::ZERO));

@@ -6,10 +6,10 @@ use std::sync::Arc;
 use futures::stream::{BoxStream, StreamExt, TryStreamExt};
 use tonic::{Request, Response, Status};
 
+use crate::api::auth::StreamCaller;
 use crate::api::convert::jobs::state_filter;
 use crate::api::convert::structs::from_struct;
-use crate::api::errors::in_stream;
-use crate::api::gate::Opener;
+use crate::api::errors::stream_status;
 use crate::service::{App, Error, PageRequest, events, jobs};
 use crate::store::JobAction;
 use crate::wire::v1;
@@ -78,10 +78,10 @@ impl JobService for Service {
     type WatchJobStream = BoxStream<'static, Result<v1::JobEvent, Status>>;
 
     async fn watch_job(&self, request: Request<v1::WatchJobRequest>) -> Answer<Self::WatchJobStream> {
-        let (app, opener) = (self.0.clone(), Opener::of(request.extensions()));
+        let (app, caller) = (self.0.clone(), StreamCaller::new(request.extensions()));
         let v1::WatchJobRequest { id, after } = request.into_inner();
         let events = events::watch(&self.0, &id, after).await?.events();
-        let events = events.and_then(move |event| ready(opener.check(&app).map(|()| event)));
-        Ok(Response::new(events.map_ok(Into::into).map_err(in_stream).boxed()))
+        let events = events.and_then(move |event| ready(caller.check(&app).map(|()| event)));
+        Ok(Response::new(events.map_ok(Into::into).map_err(stream_status).boxed()))
     }
 }

@@ -1,13 +1,13 @@
-//! gRPC: all services on one router, health and reflection included.
+//! gRPC: the router with all services, including health and reflection.
 
 mod call;
 mod deadline;
-mod envelope;
 mod environment;
 mod health;
 mod inference;
 mod job;
-mod meters;
+mod metrics;
+mod middleware;
 mod policy;
 mod stream;
 mod worker;
@@ -18,15 +18,15 @@ use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
 
 use deadline::deadline;
-use envelope::Envelope;
 pub use health::Health;
+use middleware::Middleware;
 
-use super::gate::Gate;
+use super::auth::Authorized;
 use crate::service::App;
 use crate::wire::v1::worker_service_server::{WorkerService, WorkerServiceServer};
 use crate::wire::{DESCRIPTORS, oip, v1};
 
-/// Names of the services that health tells about.
+/// Names of the services with a health status.
 pub const SERVICES: &[&str] = &[
     v1::policy_service_server::SERVICE_NAME,
     v1::environment_service_server::SERVICE_NAME,
@@ -37,13 +37,13 @@ pub const SERVICES: &[&str] = &[
 
 const BUILT_IN: &str = "the descriptors are built into the program";
 
-/// Services behind the gate, and what happens around every call.
-pub type Services = Envelope<Gate<Routes>>;
+/// The services with authorization and the middleware for all calls.
+pub type Services = Middleware<Authorized<Routes>>;
 
-/// All services. A message larger than `max_message` bytes is refused; streams end when `closing` is cancelled.
+/// All services. Messages larger than `max_message` bytes are refused. Streams end when `closing` is cancelled.
 ///
 /// # Panics
-/// When a descriptor set built into the program does not decode; a test would have failed before.
+/// If a descriptor set built into the program does not decode.
 pub fn services(app: &Arc<App>, health: &Health, max_message: usize, closing: CancellationToken) -> Services {
     let reflection = || {
         let builder = tonic_reflection::server::Builder::configure().register_encoded_file_descriptor_set(DESCRIPTORS);
@@ -59,23 +59,23 @@ pub fn services(app: &Arc<App>, health: &Health, max_message: usize, closing: Ca
         .add_service(health.server())
         .add_service(reflection().build_v1().expect(BUILT_IN))
         .add_service(reflection().build_v1alpha().expect(BUILT_IN));
-    within(app, routes.routes(), closing)
+    wrap(app, routes.routes(), closing)
 }
 
-/// What workers need and nothing else, for an address of their own.
+/// Only the service for workers, for an address of its own.
 ///
 /// # Panics
 /// As [`services`].
 pub fn worker_services(app: &Arc<App>, max_message: usize, closing: CancellationToken) -> Services {
-    within(app, Routes::new(workers(app, max_message)), closing)
+    wrap(app, Routes::new(workers(app, max_message)), closing)
 }
 
 fn workers(app: &Arc<App>, max_message: usize) -> WorkerServiceServer<impl WorkerService> {
     worker::service(app.clone()).max_decoding_message_size(max_message.max(worker::LARGEST_MESSAGE))
 }
 
-fn within(app: &Arc<App>, routes: Routes, closing: CancellationToken) -> Services {
+fn wrap(app: &Arc<App>, routes: Routes, closing: CancellationToken) -> Services {
     use tonic_reflection::pb::{v1, v1alpha};
     let known = [DESCRIPTORS, tonic_health::pb::FILE_DESCRIPTOR_SET, v1::FILE_DESCRIPTOR_SET, v1alpha::FILE_DESCRIPTOR_SET];
-    Envelope::new(Gate::new(routes.prepare(), app.clone()), &known, closing)
+    Middleware::new(Authorized::new(routes.prepare(), app.clone()), &known, closing)
 }

@@ -8,9 +8,9 @@ use futures::stream::{BoxStream, StreamExt};
 use tonic::{Request, Response, Status, Streaming};
 
 use super::{deadline, stream};
+use crate::api::auth::StreamCaller;
 use crate::api::convert::{request::open_session, response::act_response};
 use crate::api::errors::act_error;
-use crate::api::gate::Opener;
 use crate::invalid::in_range;
 use crate::service::{App, Error, PageRequest, act, policies, sessions};
 use crate::serving::PolicySpec;
@@ -65,11 +65,11 @@ impl PolicyService for Handlers {
     }
 
     async fn act_batch(&self, request: Request<v1::ActBatchRequest>) -> Result<Response<v1::ActBatchResponse>, Status> {
-        let (deadline, opener) = (deadline(request.extensions()), Opener::of(request.extensions()));
+        let (deadline, caller) = (deadline(request.extensions()), StreamCaller::new(request.extensions()));
         let requests = request.into_inner().requests;
         in_range("requests", requests.len(), 1..=LARGEST_BATCH).map_err(Error::from)?;
         // One of them was counted as the call itself.
-        opener.charge(&self.0, requests.len() as u32 - 1);
+        caller.charge(&self.0, requests.len() as u32 - 1);
         let answers = requests.into_iter().map(|request| answer(&self.0, request, deadline));
         let results = join_all(answers).await.into_iter().map(act_result).collect();
         Ok(Response::new(v1::ActBatchResponse { results }))
@@ -78,11 +78,11 @@ impl PolicyService for Handlers {
     type ActStreamStream = BoxStream<'static, Result<v1::ActResult, Status>>;
 
     async fn act_stream(&self, request: Request<Streaming<v1::ActRequest>>) -> Result<Response<Self::ActStreamStream>, Status> {
-        let (deadline, opener) = (deadline(request.extensions()), Opener::of(request.extensions()));
+        let (deadline, caller) = (deadline(request.extensions()), StreamCaller::new(request.extensions()));
         let app = self.0.clone();
         let requests = stream::requests(app.clone(), request.into_inner());
         let answers = requests.map(move |request| {
-            let (app, counted) = (app.clone(), opener.count(&app));
+            let (app, counted) = (app.clone(), caller.count_message(&app));
             async move {
                 Ok(act_result(match (request?, counted?) {
                     (request, Ok(())) => answer(&app, request, deadline).await,

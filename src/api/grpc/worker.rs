@@ -7,7 +7,7 @@ use futures::Stream;
 use tonic::metadata::MetadataMap;
 use tonic::{Request, Response, Status, Streaming};
 
-use crate::api::errors::in_stream;
+use crate::api::errors::stream_status;
 use crate::invalid::Invalid;
 use crate::service::worker::{self, CheckpointUpload, Credentials, SnapshotUpload, UploadHeader};
 use crate::service::{App, Error};
@@ -38,7 +38,7 @@ impl Service {
 }
 
 fn headless() -> Error {
-    Invalid::new("part", "out of order", "one header, then data").into()
+    Invalid::new("part", "parts in another order", "one header, then data").into()
 }
 
 #[tonic::async_trait]
@@ -63,7 +63,7 @@ impl WorkerService for Service {
         let chunks = futures::stream::try_unfold(0, move |number| {
             let (app, snapshot) = (Arc::clone(&app), snapshot.clone());
             async move {
-                let chunk = worker::snapshot_chunk(&app, &snapshot, number).await.map_err(in_stream)?;
+                let chunk = worker::snapshot_chunk(&app, &snapshot, number).await.map_err(stream_status)?;
                 Ok(chunk.map(|data| (v1::Chunk { data: data.into() }, number + 1)))
             }
         });

@@ -1,9 +1,9 @@
-//! What both transports tell of every request: its id, a span, and a line where it went wrong.
+//! Request ids, spans and log lines of both transports.
 //!
-//! The path of an `Act` pays for none of it unless somebody listens: a span is made where a subscriber wants it, an id is
-//! a number until it is written, and metrics are handles that are kept.
+//! `Act` is fast: its span exists only if a subscriber enables it, a request id is a number until it is written, and metric
+//! handles are kept.
 
-mod valve;
+mod log_limiter;
 
 use std::fmt;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -13,13 +13,13 @@ use opentelemetry::propagation::Extractor;
 use tracing::Span;
 use tracing_opentelemetry::OpenTelemetrySpanExt;
 
-pub(super) use valve::Valve;
+pub(super) use log_limiter::LogLimiter;
 
-/// Names a request; taken from the caller where it says one.
+/// Header with the id of a request. The server uses the id of the client, if there is one.
 pub(super) const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
 
-/// What is called once per slot, and by machines that only look: its spans are for debugging, so that they cost nothing
-/// otherwise.
+/// Methods and routes called once per slot or by monitoring. Their spans have level DEBUG, so that they cost nothing by
+/// default.
 const QUIET: &[&str] = &[
     "Act",
     "Step",
@@ -36,33 +36,33 @@ const QUIET: &[&str] = &[
     "/metrics",
 ];
 
-/// Whether the method or route `name` is one of those.
+/// Whether the span of the method or route `name` has level DEBUG.
 pub(super) fn is_quiet(name: &str) -> bool {
     QUIET.contains(&name)
 }
 
-/// Where ids of requests come from: what tells this process from others, and a number.
-pub(super) struct Ids {
+/// Creates request ids: a random number per process and a counter.
+pub(super) struct RequestIds {
     prefix: u64,
     next: AtomicU64,
 }
 
-impl Ids {
+impl RequestIds {
     pub(super) fn new() -> Self {
         let mut prefix = [0; 8];
-        // Without randomness the time of day tells processes apart well enough: ids are for reading.
+        // Ids need not be secret: without a random source the time distinguishes processes well enough.
         if getrandom::fill(&mut prefix).is_err() {
             prefix = jiff::Timestamp::now().as_nanosecond().to_le_bytes()[..8].try_into().expect("8 of 16 bytes");
         }
         Self { prefix: u64::from_le_bytes(prefix), next: AtomicU64::new(0) }
     }
 
-    /// The caller's id if it fits a line of a log, else a new one.
-    pub(super) fn of(&self, headers: &HeaderMap) -> RequestId {
+    /// The client's id if it is text of 1 to 128 bytes, otherwise a new one.
+    pub(super) fn for_request(&self, headers: &HeaderMap) -> RequestId {
         let fits = |value: &&HeaderValue| value.len() <= 128 && value.to_str().is_ok_and(|text| !text.is_empty());
         match headers.get(REQUEST_ID).filter(fits) {
-            Some(value) => RequestId::Told(value.clone()),
-            None => RequestId::Ours(self.prefix, self.next.fetch_add(1, Ordering::Relaxed)),
+            Some(value) => RequestId::Client(value.clone()),
+            None => RequestId::Generated(self.prefix, self.next.fetch_add(1, Ordering::Relaxed)),
         }
     }
 }
@@ -70,18 +70,18 @@ impl Ids {
 /// The id of one request.
 #[derive(Clone)]
 pub(super) enum RequestId {
-    /// The caller's.
-    Told(HeaderValue),
-    /// The process and a number.
-    Ours(u64, u64),
+    /// Chosen by the client.
+    Client(HeaderValue),
+    /// The number of the process and of the request.
+    Generated(u64, u64),
 }
 
 impl RequestId {
-    /// As it is sent back.
+    /// The value of the response header.
     pub(super) fn header(&self) -> HeaderValue {
         match self {
-            Self::Told(value) => value.clone(),
-            Self::Ours(prefix, number) => {
+            Self::Client(value) => value.clone(),
+            Self::Generated(prefix, number) => {
                 use std::io::Write;
                 // 16 digits, a dash, at most 16 digits.
                 let mut text = [0; 33];
@@ -97,17 +97,17 @@ impl RequestId {
 impl fmt::Display for RequestId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            // Checked when it came.
-            Self::Told(value) => f.write_str(value.to_str().unwrap_or_default()),
-            Self::Ours(prefix, number) => write!(f, "{prefix:016x}-{number:x}"),
+            // `RequestIds::for_request` has checked that it is text.
+            Self::Client(value) => f.write_str(value.to_str().unwrap_or_default()),
+            Self::Generated(prefix, number) => write!(f, "{prefix:016x}-{number:x}"),
         }
     }
 }
 
-/// The span of a request, child of the caller's trace where it tells one. `key`, `session` and `policy` are filled in where they
-/// become known, `code` at the end.
+/// The span of a request, child of the client's trace if there is one. Handlers record `key`, `session` and `policy`;
+/// [`log_request`] records `code`.
 pub(super) fn span(method: &dyn fmt::Display, quiet: bool, id: &RequestId, headers: &HeaderMap) -> Span {
-    macro_rules! of_level {
+    macro_rules! span_of_level {
         ($level:ident) => {
             tracing::span!(
                 target: "qedgix::request",
@@ -125,10 +125,10 @@ pub(super) fn span(method: &dyn fmt::Display, quiet: bool, id: &RequestId, heade
             )
         };
     }
-    let span = if quiet { of_level!(DEBUG) } else { of_level!(INFO) };
+    let span = if quiet { span_of_level!(DEBUG) } else { span_of_level!(INFO) };
     if !span.is_disabled() && headers.contains_key("traceparent") {
         let parent = opentelemetry::global::get_text_map_propagator(|propagator| propagator.extract(&Headers(headers)));
-        // Refused only where nobody exports traces.
+        // Fails only if no traces are exported.
         let _ = span.set_parent(parent);
     }
     span
@@ -146,51 +146,53 @@ impl Extractor for Headers<'_> {
     }
 }
 
-/// What became of a request, for who runs the server.
+/// How important the end of a request is to the operator.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Verdict {
-    /// Answered, or the caller's mistake, or a server that drains, which says so itself.
-    Settled,
-    /// Turned away: a limit, no right to ask, too late.
+pub(super) enum Severity {
+    /// A success, an error of the client, or a refusal during shutdown.
+    Normal,
+    /// Refused because of a limit, a missing permission or a deadline.
     Refused,
-    /// A fault of the server.
-    Fault,
+    /// The server failed.
+    Failed,
 }
 
 /// The end of a request.
-pub(super) struct Ending<'a> {
+pub(super) struct Completion<'a> {
     pub(super) method: &'a dyn fmt::Display,
     pub(super) id: &'a RequestId,
     pub(super) code: &'a str,
     pub(super) seconds: f64,
-    pub(super) verdict: Verdict,
-    /// What was the matter; empty where nothing was.
+    pub(super) severity: Severity,
+    /// The error; empty if there is none.
     pub(super) detail: &'a dyn fmt::Display,
 }
 
-/// Says how a request ended, inside its span: faults as errors, refusals as warnings as long as there are not too many
-/// (they come when the server has least time to write), everything else to who debugs or wants an access log.
-pub(super) fn tell(ending: &Ending<'_>, span: &Span, valve: &Valve) {
-    let Ending { method, id, code, seconds, verdict, detail } = *ending;
+/// Logs the end of a request inside its span: failures as ERROR, refusals as WARN up to the limit of `limiter`, all others as
+/// DEBUG. The access log (target `qedgix::access`) has a line for every request.
+pub(super) fn log_request(completion: &Completion<'_>, span: &Span, limiter: &LogLimiter) {
+    let Completion { method, id, code, seconds, severity, detail } = *completion;
     if !span.is_disabled() {
         span.record("code", code);
-        if verdict == Verdict::Fault {
+        if severity == Severity::Failed {
             span.record("otel.status_code", "ERROR");
         }
     }
     tracing::info!(target: "qedgix::access", %method, request_id = %id, code, seconds, "answered");
     let _inside = span.enter();
-    match verdict {
-        Verdict::Fault => {
+    match severity {
+        Severity::Failed => {
             tracing::error!(target: "qedgix::request", %method, request_id = %id, code, seconds, error = %detail, "failed");
         }
-        Verdict::Refused => {
-            if let Some(muted) = valve.pass() {
-                let muted = (muted > 0).then_some(muted);
-                tracing::warn!(target: "qedgix::request", %method, request_id = %id, code, seconds, detail = %detail, muted, "refused");
+        Severity::Refused => {
+            if let Some(suppressed) = limiter.allow() {
+                let suppressed = (suppressed > 0).then_some(suppressed);
+                tracing::warn!(
+                    target: "qedgix::request", %method, request_id = %id, code, seconds, detail = %detail, suppressed, "refused"
+                );
             }
         }
-        Verdict::Settled => {
+        Severity::Normal => {
             tracing::debug!(target: "qedgix::request", %method, request_id = %id, code, seconds, detail = %detail, "answered");
         }
     }
@@ -201,21 +203,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ids_are_the_callers_where_they_fit_a_line_and_never_come_twice() {
-        let ids = Ids::new();
-        let of = |value: &[u8]| {
+    fn valid_client_ids_are_kept_and_generated_ids_are_distinct() {
+        let ids = RequestIds::new();
+        let id_for = |value: &[u8]| {
             let headers = HeaderMap::from_iter([(REQUEST_ID, HeaderValue::from_bytes(value).unwrap())]);
-            ids.of(&headers)
+            ids.for_request(&headers)
         };
-        assert_eq!(of(b"mission 7/3").to_string(), "mission 7/3");
-        assert_eq!(of(b"mission 7/3").header(), "mission 7/3");
+        assert_eq!(id_for(b"mission 7/3").to_string(), "mission 7/3");
+        assert_eq!(id_for(b"mission 7/3").header(), "mission 7/3");
         let long = vec![b'x'; 129];
-        let ours = [of(b""), of(&long), of(b"caf\xe9"), ids.of(&HeaderMap::new())];
-        let texts: std::collections::BTreeSet<_> = ours.iter().map(ToString::to_string).collect();
-        assert_eq!(texts.len(), ours.len(), "{texts:?}");
-        for id in &ours {
+        let generated = [id_for(b""), id_for(&long), id_for(b"caf\xe9"), ids.for_request(&HeaderMap::new())];
+        let texts: std::collections::BTreeSet<_> = generated.iter().map(ToString::to_string).collect();
+        assert_eq!(texts.len(), generated.len(), "{texts:?}");
+        for id in &generated {
             assert_eq!(id.header(), id.to_string());
         }
-        assert_eq!(RequestId::Ours(u64::MAX, u64::MAX).header().len(), 33);
+        assert_eq!(RequestId::Generated(u64::MAX, u64::MAX).header().len(), 33);
     }
 }

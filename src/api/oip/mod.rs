@@ -1,5 +1,5 @@
-//! The Open Inference Protocol as both transports speak it: every policy is a model, a request is a slot of a fleet.
-//! Transports read their messages into a [`Call`] and write a [`Reply`]; all that has a meaning is here.
+//! The Open Inference Protocol, independent of the transport: every policy is a model, and a request is one slot of a fleet.
+//! The transports read their messages into an [`InferRequest`] and write an [`InferResponse`].
 
 mod model;
 mod outputs;
@@ -14,69 +14,70 @@ use bytes::Bytes;
 pub use model::{Model, config_type, describe, index, is_ready, load, state, unload};
 pub use parameters::Parameter;
 
-use self::model::{in_words_of_models, spec};
-use self::outputs::Outputs;
+use self::model::{model_error, policy_spec};
+use self::outputs::OutputSelection;
 use self::parameters::Parameters;
 use super::convert::tensors::{INPUTS, Tensor, observation, weight};
 use crate::invalid::Invalid;
 use crate::service::act::{self, Memory};
 use crate::service::{App, Error};
 
-/// What the server calls itself.
+/// Name of the server in its metadata.
 pub const NAME: &str = "qedgix";
-/// Its version.
+/// Version of the server in its metadata.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
-/// Parts of the protocol beyond its core that are spoken here.
+/// Supported extensions of the protocol.
 pub const EXTENSIONS: [&str; 6] =
     ["sequence", "sequence(string_id)", "model_repository", "model_configuration", "binary_tensor_data", "parameters"];
-/// Memory that callers keep, in and out.
+/// Input and output with the recurrent state that callers keep.
 const STATE: &str = "recurrent_state";
-/// Requests of more elements are read away from the threads that serve connections.
+/// Requests with more elements are decoded on a blocking thread.
 const LARGE: usize = 2048;
 
 /// A request for inference.
 #[derive(Clone, Debug, Default)]
-pub struct Call {
-    /// A policy: `NAME`, `NAME@ALIAS` or `NAME:VERSION`.
+pub struct InferRequest {
+    /// The policy: `NAME`, `NAME@ALIAS` or `NAME:VERSION`.
     pub model: String,
-    /// A version of `NAME`; empty: the newest.
+    /// The version of `NAME`; empty for the newest.
     pub version: String,
-    /// Comes back in the answer.
+    /// Repeated in the response.
     pub id: String,
-    /// Of the request as a whole.
+    /// Parameters of the whole request.
     pub parameters: Vec<(String, Parameter)>,
     /// Inputs.
     pub inputs: Vec<Tensor>,
-    /// Outputs asked for; none: all there are.
+    /// Names of the requested outputs; empty for all.
     pub outputs: Vec<String>,
 }
 
-/// The answer to a [`Call`].
+/// The response to an [`InferRequest`].
 #[derive(Clone, Debug, PartialEq)]
-pub struct Reply {
-    /// The model as it was asked for.
+pub struct InferResponse {
+    /// The model as the request names it.
     pub model: String,
-    /// The version that answered.
+    /// The version that was run.
     pub version: u64,
-    /// The request's.
+    /// The id of the request.
     pub id: String,
-    /// The step that was answered.
+    /// The step.
     pub step: u64,
-    /// The policy version's digest, in hexadecimal.
+    /// The digest of the policy version in hexadecimal.
     pub digest: String,
-    /// Outputs in the order asked for.
+    /// Outputs in the order of the request.
     pub outputs: Vec<Tensor>,
 }
 
-/// Answers one slot.
+/// Runs the policy for one slot.
 ///
 /// # Errors
-/// Everything in the table of errors that concerns policies, sessions and input.
-pub async fn infer(app: &App, call: Call, deadline: Option<Instant>) -> Result<Reply, Error> {
-    let Call { model, version, id, parameters, inputs, outputs } = call;
-    let spec = spec(&model, &version)?;
+/// [`Error::Invalid`] for input that is not accepted, [`Error::NotFound`] for a model that is unknown or not loaded, and the
+/// errors of [`act::act`].
+pub async fn infer(app: &App, request: InferRequest, deadline: Option<Instant>) -> Result<InferResponse, Error> {
+    let InferRequest { model, version, id, parameters, inputs, outputs } = request;
+    let spec = policy_spec(&model, &version)?;
     let Parameters { sequence, step, seed, timeout } = Parameters::read(parameters)?;
-    let outputs = Outputs::asked(outputs, sequence.is_none())?;
+    let outputs = OutputSelection::new(outputs, sequence.is_none())?;
     check_names(&inputs)?;
     let (state, observation) = if weight(&inputs) < LARGE {
         read(inputs)?
@@ -87,59 +88,59 @@ pub async fn infer(app: &App, call: Call, deadline: Option<Instant>) -> Result<R
         (None, state) => Memory::Held(state.unwrap_or_default()),
         (Some(sequence), None) => Memory::Sequence(sequence),
         (Some(_), Some(_)) => {
-            let expected = "nothing beside sequence_id: the server keeps the memory of a sequence";
+            let expected = "no value beside sequence_id, because the server keeps the state of a sequence";
             return Err(Invalid::new(STATE, "a tensor", expected).into());
         }
     };
     let timeout = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
     let deadline = deadline.into_iter().chain(timeout).min();
     let request = act::Request { policy: Some(spec.clone()), observation, memory, step, run_id: None, seed };
-    let answer = act::act(app, request, deadline).await.map_err(|error| in_words_of_models(&spec, error))?;
+    let answer = act::act(app, request, deadline).await.map_err(|error| model_error(&spec, error))?;
     let reference = &answer.policy.reference;
     let (version, digest, step) = (reference.version, reference.digest_hex(), answer.step);
-    Ok(Reply { model, version, id, step, digest, outputs: outputs.of(answer) })
+    Ok(InferResponse { model, version, id, step, digest, outputs: outputs.tensors(answer) })
 }
 
-/// Checks the parameters of the input or output `field`: those that would have its values elsewhere, or others, are refused.
+/// Checks the names of the parameters of the input or output `field`.
 ///
 /// # Errors
-/// The first one.
+/// [`Invalid`] for parameters of extensions that are not supported: shared memory and classification.
 pub fn check_tensor_parameters<'a>(field: &str, mut names: impl Iterator<Item = &'a String>) -> Result<(), Invalid> {
-    let elsewhere = |name: &&String| name.starts_with("shared_memory") || *name == "classification";
-    match names.find(elsewhere) {
+    let unsupported = |name: &&String| name.starts_with("shared_memory") || *name == "classification";
+    match names.find(unsupported) {
         None => Ok(()),
         Some(name) => {
-            let expected = "tensors that travel with the request and its answer";
+            let expected = "no shared memory and no classification, which are not supported";
             Err(Invalid::new(format!("{field}.parameters"), format!("{name:?}"), expected))
         }
     }
 }
 
-/// Checks that every input is a known one, once.
+/// Checks that every input is known and occurs once.
 fn check_names(inputs: &[Tensor]) -> Result<(), Invalid> {
     for (i, Tensor { name, .. }) in inputs.iter().enumerate() {
-        let wrong = |expected: String| Invalid::new(format!("inputs[{i}].name"), format!("{name:?}"), expected);
+        let invalid = |expected: String| Invalid::new(format!("inputs[{i}].name"), format!("{name:?}"), expected);
         if name != STATE && !INPUTS.iter().any(|(known, ..)| known == name) {
             let known: Vec<&str> = INPUTS.iter().map(|(known, ..)| *known).chain([STATE]).collect();
-            return Err(wrong(format!("one of {}", known.join(", "))));
+            return Err(invalid(format!("one of {}", known.join(", "))));
         }
         if inputs[..i].iter().any(|other| other.name == *name) {
-            return Err(wrong("each input once".into()));
+            return Err(invalid("each input once".into()));
         }
     }
     Ok(())
 }
 
-/// The memory that was sent, and what is observed.
+/// The recurrent state, if there is one, and the observation.
 fn read(mut inputs: Vec<Tensor>) -> Result<(Option<Bytes>, crate::serving::Observation), Invalid> {
     let observation = observation(&mut inputs)?;
     let state = inputs.into_iter().find(|tensor| tensor.name == STATE);
-    Ok((state.map(|state| held(&state)).transpose()?, observation))
+    Ok((state.map(|state| decode_state(&state)).transpose()?, observation))
 }
 
-/// The bytes of a `recurrent_state`. JSON has it in base64, and whoever read it there may send it on by other ways; the
-/// bytes themselves are never base64, because the fifth is none of its letters.
-fn held(state: &Tensor) -> Result<Bytes, Invalid> {
+/// The bytes of a `recurrent_state`. JSON responses have it in base64, and a client may send this text on another transport.
+/// The bytes themselves are never valid base64, because the fifth byte is no letter of it.
+fn decode_state(state: &Tensor) -> Result<Bytes, Invalid> {
     let bytes = state.one_byte_string()?;
     Ok(BASE64_STANDARD.decode(&bytes).map_or(bytes, Bytes::from))
 }

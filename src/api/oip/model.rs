@@ -1,7 +1,8 @@
-//! Policies as models: how they are named, what they take and give, which there are.
+//! Policies as models: names, metadata, the repository index, loading and unloading.
 
 use super::{STATE, outputs};
 use crate::api::convert::tensors::{Datatype, Dimension, INPUTS, TensorShape};
+use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::policy::RequiredInput;
 use crate::service::policies::{self, IndexEntry};
@@ -11,42 +12,44 @@ use crate::serving::{Kind, PolicySpec, Which};
 /// A model as metadata and configuration show it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Model {
-    /// As it was asked for.
+    /// The name in the request.
     pub name: String,
     /// Versions of that name.
     pub versions: Vec<String>,
-    /// What it takes: a scene or a graph.
+    /// Inputs: those of a scene or of a graph.
     pub inputs: Vec<TensorShape>,
-    /// What it gives.
+    /// Outputs.
     pub outputs: Vec<TensorShape>,
 }
 
-/// The policy that a model's name and version mean.
+/// The policy that the name and the version of a model select.
 ///
 /// # Errors
-/// Neither is one, or they contradict each other.
-pub(super) fn spec(name: &str, version: &str) -> Result<PolicySpec, Invalid> {
+/// [`Invalid`] if one does not parse or they select different versions.
+pub(super) fn policy_spec(name: &str, version: &str) -> Result<PolicySpec, Invalid> {
     let mut spec: PolicySpec = name.parse().map_err(|e: Invalid| Invalid { field: "model_name".into(), ..e })?;
     if version.is_empty() {
         return Ok(spec);
     }
-    let wrong = |expected: String| Invalid::new("model_version", format!("{version:?}"), expected);
+    let invalid = |expected: String| Invalid::new("model_version", format!("{version:?}"), expected);
     let digits = version.bytes().all(|b| b.is_ascii_digit());
     let number = version.parse().ok().filter(|&number: &u64| digits && number > 0);
-    let number = number.ok_or_else(|| wrong("a whole number from 1, or nothing for the newest".into()))?;
+    let number = number.ok_or_else(|| invalid("a whole number from 1, or no value for the newest".into()))?;
     match spec.which {
         Which::Newest => spec.which = Which::Version(number),
         Which::Version(named) if named == number => {}
-        Which::Version(_) | Which::Alias(_) => return Err(wrong(format!("nothing: model_name says which, {spec}"))),
+        Which::Version(_) | Which::Alias(_) => {
+            return Err(invalid(format!("no value, because model_name selects the version: {spec}")));
+        }
     }
     Ok(spec)
 }
 
-/// Tells of policies as of models.
-pub(super) fn in_words_of_models(spec: &PolicySpec, error: Error) -> Error {
+/// The error of a policy as the error of a model.
+pub(super) fn model_error(spec: &PolicySpec, error: Error) -> Error {
     match error {
         Error::NotFound { what: "policy", id } => Error::NotFound { what: "model", id },
-        Error::Precondition { code: "policy_unloaded", .. } => not_loaded(spec),
+        Error::Precondition { code: ErrorCode::PolicyUnloaded, .. } => not_loaded(spec),
         Error::Invalid(e) if e.field == "policy" => Invalid { field: "model_name".into(), ..e }.into(),
         other => other,
     }
@@ -59,10 +62,10 @@ fn not_loaded(spec: &PolicySpec) -> Error {
 /// Describes a model.
 ///
 /// # Errors
-/// There is none of this name and version, or it is not loaded.
+/// [`Error::NotFound`] if the model does not exist or is not loaded.
 pub fn describe(app: &App, name: &str, version: &str) -> Result<Model, Error> {
-    let spec = spec(name, version)?;
-    let described = policies::get(app, &spec).map_err(|error| in_words_of_models(&spec, error))?;
+    let spec = policy_spec(name, version)?;
+    let described = policies::get(app, &spec).map_err(|error| model_error(&spec, error))?;
     if !described.loaded {
         return Err(not_loaded(&spec));
     }
@@ -91,7 +94,7 @@ pub fn describe(app: &App, name: &str, version: &str) -> Result<Model, Error> {
         (needs != RequiredInput::FullScene || !of_graph).then_some(input)
     };
     let state = TensorShape { name: STATE, datatype: Datatype::Bytes, shape: vec![1], optional: true };
-    let outputs = outputs::described(uavs, policy.headings as i64, policy.kind == Kind::Checkpoint);
+    let outputs = outputs::shapes(uavs, policy.headings as i64, policy.kind == Kind::Checkpoint);
     Ok(Model {
         name: name.to_owned(),
         versions: versions.iter().map(u64::to_string).collect(),
@@ -100,12 +103,12 @@ pub fn describe(app: &App, name: &str, version: &str) -> Result<Model, Error> {
     })
 }
 
-/// Whether a model can be asked.
+/// Whether a model is loaded.
 ///
 /// # Errors
-/// Its name or version is none that a model can have.
+/// [`Error::Invalid`] if the name or the version does not parse.
 pub fn is_ready(app: &App, name: &str, version: &str) -> Result<bool, Error> {
-    let spec = spec(name, version)?;
+    let spec = policy_spec(name, version)?;
     match policies::get(app, &spec) {
         Ok(described) => Ok(described.loaded),
         Err(Error::NotFound { .. } | Error::Precondition { .. }) => Ok(false),
@@ -113,46 +116,46 @@ pub fn is_ready(app: &App, name: &str, version: &str) -> Result<bool, Error> {
     }
 }
 
-/// All versions of all models, or those that can be asked.
+/// All versions of all models, or only the loaded ones (`ready`).
 ///
 /// # Errors
-/// A repository other than the only one, which has no name.
+/// [`Error::Invalid`] if `repository` is not empty: the only repository has no name.
 pub fn index(app: &App, repository: &str, ready: bool) -> Result<Vec<IndexEntry>, Error> {
     check_repository(repository)?;
     Ok(policies::index(app).into_iter().filter(|entry| entry.ready || !ready).collect())
 }
 
-/// Lets a model be asked again, in all its versions.
+/// Loads all versions of a model.
 ///
 /// # Errors
-/// There is no such model, or parameters that would change it.
+/// [`Error::NotFound`] for an unknown model, [`Error::Invalid`] for parameters, none of which are supported.
 pub async fn load(app: &App, repository: &str, name: &str, parameters: &[&str]) -> Result<(), Error> {
     check_repository(repository)?;
     if let Some(parameter) = parameters.first() {
-        let expected = "no parameters: policies are published, not configured or sent when they are loaded";
+        let expected = "no parameters, because loading does not configure a policy";
         return Err(Invalid::new("parameters", format!("{parameter:?}"), expected).into());
     }
-    policies::load_policy(app, name).await.map_err(in_words_of_names)
+    policies::load_policy(app, name).await.map_err(repository_error)
 }
 
-/// Lets a model not be asked any more; sequences under way go on.
+/// Unloads all versions of a model. Sequences that have started continue.
 ///
 /// # Errors
-/// There is no such model, or unknown parameters.
+/// [`Error::NotFound`] for an unknown model, [`Error::Invalid`] for unknown parameters.
 pub async fn unload(app: &App, repository: &str, name: &str, parameters: &[&str]) -> Result<(), Error> {
     check_repository(repository)?;
     if let Some(parameter) = parameters.iter().find(|name| **name != "unload_dependents") {
-        return Err(Invalid::new("parameters", format!("{parameter:?}"), "unload_dependents or nothing").into());
+        return Err(Invalid::new("parameters", format!("{parameter:?}"), "unload_dependents or no parameter").into());
     }
-    policies::unload_policy(app, name).await.map_err(in_words_of_names)
+    policies::unload_policy(app, name).await.map_err(repository_error)
 }
 
-/// How the index calls it.
+/// The state in the repository index.
 pub fn state(ready: bool) -> &'static str {
     if ready { "READY" } else { "UNAVAILABLE" }
 }
 
-/// How a model's configuration calls a datatype.
+/// The datatype in a model configuration.
 pub fn config_type(datatype: Datatype) -> &'static str {
     match datatype {
         Datatype::Int32 => "TYPE_INT32",
@@ -164,10 +167,14 @@ pub fn config_type(datatype: Datatype) -> &'static str {
 }
 
 fn check_repository(name: &str) -> Result<(), Invalid> {
-    if name.is_empty() { Ok(()) } else { Err(Invalid::new("repository_name", format!("{name:?}"), "nothing: there is one")) }
+    if name.is_empty() {
+        Ok(())
+    } else {
+        Err(Invalid::new("repository_name", format!("{name:?}"), "no value, because the only repository has no name"))
+    }
 }
 
-fn in_words_of_names(error: Error) -> Error {
+fn repository_error(error: Error) -> Error {
     match error {
         Error::NotFound { what: "policy", id } => Error::NotFound { what: "model", id },
         other => other,

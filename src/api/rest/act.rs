@@ -17,6 +17,7 @@ use super::openapi::{BadBody, Conflict, Draining, NotFound};
 use super::schemas;
 use super::wording::{ActReply, Base64};
 use crate::api::convert::response::act_response;
+use crate::invalid::Invalid;
 use crate::service::{App, Error, act as service};
 use crate::wire::v1;
 
@@ -88,13 +89,13 @@ fn message(body: Body) -> Result<v1::ActRequest, Error> {
         (Some(graph), None) => Some(Observation::Graph(graph.into())),
         (None, Some(scene)) => Some(Observation::Scene(scene.into())),
         (None, None) => None,
-        _ => return Err(Error::Schema("graph: one of graph and scene, not both".into())),
+        _ => return Err(Invalid::schema("graph", "graph and scene", "one of graph and scene").into()),
     };
     let memory = match (body.session_id, body.recurrent_state) {
         (Some(id), None) => Some(Memory::SessionId(id)),
         (None, Some(state)) => Some(Memory::RecurrentState(state.0)),
         (None, None) => None,
-        _ => return Err(Error::Schema("session_id: one of session_id and recurrent_state, not both".into())),
+        _ => return Err(Invalid::schema("session_id", "session_id and recurrent_state", "one of them").into()),
     };
     Ok(v1::ActRequest {
         policy: body.policy,

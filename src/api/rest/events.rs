@@ -16,9 +16,9 @@ use utoipa_axum::routes;
 
 use super::extract::{Path, Query};
 use super::openapi::{BadRequest, Draining, NotFound};
+use crate::api::auth::StreamCaller;
 use crate::api::convert::events::EventView;
 use crate::api::errors::log_internal;
-use crate::api::gate::Opener;
 use crate::invalid::Invalid;
 use crate::service::{App, Error, events};
 use crate::store::JobEvent;
@@ -104,8 +104,8 @@ async fn follow(
         return Ok(StatusCode::NO_CONTENT.into_response());
     }
     // Why a stream ends before its job is told to who comes back.
-    let (live, opener) = (app.clone(), Opener::of(&extensions));
-    let shown = move |event| ready(opener.check(&live).and_then(|()| event_of(event)));
+    let (live, caller) = (app.clone(), StreamCaller::new(&extensions));
+    let shown = move |event| ready(caller.check(&live).and_then(|()| event_of(event)));
     let events = watch.events().and_then(shown).inspect_err(log_internal);
     let events = events.map(Result::ok).take_while(|event| ready(event.is_some())).filter_map(ready).map(Ok::<_, Infallible>);
     let heartbeat = KeepAlive::new().interval(app.watchers.heartbeat());

@@ -64,8 +64,10 @@ pub fn media_type(headers: &HeaderMap) -> Option<String> {
 
 /// A body is of another kind than `expected`.
 pub fn unsupported(kind: Option<String>, expected: &str) -> Error {
-    let kind = kind.map_or_else(|| "nothing".to_owned(), |kind| format!("{kind:?}"));
-    Error::MediaType(Invalid::new("content-type", kind, expected).to_string())
+    Error::MediaType(match kind {
+        Some(kind) => Invalid::new("content-type", kind, expected),
+        None => Invalid::missing("content-type", expected),
+    })
 }
 
 /// Reads a body of at most `limit` bytes.
@@ -73,7 +75,8 @@ pub fn unsupported(kind: Option<String>, expected: &str) -> Error {
 /// # Errors
 /// It is larger, or breaks off.
 pub async fn read(request: Request, limit: usize) -> Result<Bytes, Error> {
-    let too_large = || Error::TooLarge(format!("the body is larger than the limit of {limit} bytes"));
+    let too_large =
+        || Error::TooLarge { message: format!("the body is larger than the limit of {limit} bytes"), limit: Some(limit as u64) };
     let announced = announced_size(request.headers());
     let mut body = request.into_body().into_data_stream();
     if announced > limit as u64 {
@@ -110,17 +113,16 @@ async fn discard(mut parts: BodyDataStream) {
 /// Reads a JSON document.
 ///
 /// # Errors
-/// [`Error::Invalid`] where it is not JSON, [`Error::Schema`] with the path where it does not fit `T`.
+/// [`Error::Invalid`] where the body is not JSON or does not match the schema of `T`.
 pub fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, Error> {
     let mut deserializer = serde_json::Deserializer::from_slice(body);
     let document = serde_path_to_error::deserialize(Strict(&mut deserializer)).map_err(|e| {
         let path = e.path().to_string();
         let e = e.into_inner();
         if e.is_data() {
-            let place = if path == "." { String::new() } else { format!("{path}: ") };
-            Error::Schema(format!("{place}{e}"))
+            Invalid::from_parser(if path == "." { "" } else { &path }, &e)
         } else {
-            Invalid::new("body", format!("{} bytes that are not JSON ({e})", body.len()), "a JSON document").into()
+            Invalid::new("body", format!("{} bytes that are not JSON ({e})", body.len()), "a JSON document")
         }
     })?;
     deserializer.end().map_err(|e| Invalid::new("body", format!("more than one document ({e})"), "one JSON document"))?;

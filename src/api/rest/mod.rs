@@ -2,11 +2,11 @@
 //! also those of paths and methods; under `/v2` it is what that protocol wants.
 
 mod act;
-mod envelope;
 mod environments;
 mod events;
 pub mod extract;
 mod jobs;
+mod middleware;
 mod observation;
 mod openapi;
 mod ops;
@@ -25,13 +25,15 @@ use axum::response::IntoResponse;
 use axum::{Extension, Router};
 use utoipa_axum::router::OpenApiRouter;
 
+use super::auth::authorize_rest;
 use super::errors::problem;
-use super::gate;
+use crate::error_code::ErrorCode;
 use crate::service::{App, Error};
+use middleware::Middleware;
 
 /// All of REST. A body larger than `max_body` bytes is refused; `metrics` renders what was counted.
 pub fn router(app: Arc<App>, metrics: fn() -> String, max_body: usize) -> Router {
-    let (gate, shared) = (app.clone(), Arc::new(envelope::Shared::new()));
+    let (auth_app, middleware) = (app.clone(), Arc::new(Middleware::new()));
     // What is not merged here is not in the document.
     let (router, document) = OpenApiRouter::with_openapi(openapi::document())
         .merge(ops::router())
@@ -49,12 +51,12 @@ pub fn router(app: Arc<App>, metrics: fn() -> String, max_body: usize) -> Router
         .fallback(|request: Request| async move { Error::not_found("endpoint", request.uri().path()).into_response() })
         .method_not_allowed_fallback(|request: Request| async move {
             let detail = format!("{} does not answer {}", request.uri().path(), request.method());
-            problem(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", detail)
+            problem(StatusCode::METHOD_NOT_ALLOWED, ErrorCode::MethodNotAllowed, detail)
         })
         .layer(Extension(extract::MaxBody(max_body)))
         .layer(Extension(metrics))
         .layer(Extension(description))
-        .layer(axum::middleware::from_fn(move |request, next| gate::around(gate.clone(), request, next)))
-        .layer(axum::middleware::from_fn(move |request, next| envelope::around(shared.clone(), request, next)))
+        .layer(axum::middleware::from_fn(move |request, next| authorize_rest(auth_app.clone(), request, next)))
+        .layer(axum::middleware::from_fn(move |request, next| middleware.clone().handle(request, next)))
         .with_state(app)
 }

@@ -19,6 +19,7 @@ pub use keyring::{Caller, Keyring};
 pub use scope::{Scope, Scopes};
 
 use super::Error;
+use crate::error_code::ErrorCode;
 use crate::invalid::{Invalid, in_range};
 use crate::store::{self, KeyRecord, Store};
 
@@ -76,9 +77,10 @@ pub struct CreatedKey {
 /// [`Error::Invalid`] when the database is missing and `create` is false, [`Error::Internal`] when it cannot be read.
 pub async fn open_store(data_dir: &Path, create: bool) -> Result<Store, Error> {
     if create {
-        std::fs::create_dir_all(data_dir).map_err(|e| Invalid::new("--data-dir", data_dir.display(), e.to_string()))?;
+        std::fs::create_dir_all(data_dir)
+            .map_err(|e| Invalid::new("--data-dir", data_dir.display(), format!("a directory that can be created ({e})")))?;
     } else if !data_dir.join(store::FILE).exists() {
-        return Err(Invalid::new("--data-dir", data_dir.display(), "the data directory of a server").into());
+        return Err(Invalid::new("--data-dir", data_dir.display(), "a data directory of a server").into());
     }
     Ok(Store::open(data_dir).await?)
 }
@@ -151,7 +153,7 @@ pub async fn rotate(store: &Store, id: &str, grace: Duration, now: Timestamp) ->
     let old = store.keys().await?.into_iter().find(|key| key.id == id).ok_or_else(|| Error::not_found("API key", id))?;
     let not_active = |state| {
         let message = format!("the API key {id} is {state}; create a new one");
-        Error::Precondition { code: "wrong_state", message }
+        Error::Precondition { code: ErrorCode::WrongState, message }
     };
     let state = state(&old, now);
     if state != "active" {
@@ -171,7 +173,7 @@ pub async fn rotate(store: &Store, id: &str, grace: Duration, now: Timestamp) ->
 
 fn after(now: Timestamp, time: Duration, field: &str) -> Result<Timestamp, Invalid> {
     let sum = now.checked_add(time);
-    sum.map_err(|_| Invalid::new(field, format!("{} s", time.as_secs()), "a time that ends before the year 10000"))
+    sum.map_err(|_| Invalid::new(field, format!("{} s", time.as_secs()), "a duration that ends before the year 10000"))
 }
 
 fn state(record: &KeyRecord, now: Timestamp) -> &'static str {

@@ -69,7 +69,7 @@ impl FromStr for Scopes {
         for name in text.split(',').map(str::trim) {
             let found = Scope::ALL.into_iter().find(|scope| scope.name() == name);
             let scope = found.ok_or_else(|| {
-                Invalid::new("scopes", format!("{name:?}"), "one or more of read, act, jobs and admin, separated by commas")
+                Invalid::new("scopes", format!("{name:?}"), "one or more of read, act, jobs, admin, separated by commas")
             })?;
             bits |= Self::bit(scope);
         }

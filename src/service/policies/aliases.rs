@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::{PolicyStores, serialized};
+use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::service::paging::number;
 use crate::service::{App, Error, Page, PageRequest};
@@ -49,7 +50,7 @@ pub async fn set_alias(app: &App, change: AliasChange, version: u64) -> Result<O
         let found = registry.describe(&spec)?;
         if found.about.kind == Kind::Baseline {
             let message = format!("{name} is a baseline, which has one version and no aliases");
-            return Err(Error::Precondition { code: "no_checkpoint", message });
+            return Err(Error::Precondition { code: ErrorCode::NoCheckpoint, message });
         }
         check_expected(&registry, &change)?;
         check_alias(&registry, name, alias)?;
@@ -116,7 +117,8 @@ pub(super) fn check_alias(registry: &Registry, name: &str, alias: &str) -> Resul
     if known.len() < MAX_ALIASES || known.contains_key(alias) {
         return Ok(());
     }
-    Err(Invalid::new("alias", format!("{alias:?}"), format!("at most {MAX_ALIASES} aliases per policy")).into())
+    Err(Invalid::new("alias", format!("{alias:?}"), format!("an existing alias, because a policy has at most {MAX_ALIASES}"))
+        .into())
 }
 
 fn check_expected(registry: &Registry, change: &AliasChange) -> Result<(), Error> {
@@ -125,11 +127,11 @@ fn check_expected(registry: &Registry, change: &AliasChange) -> Result<(), Error
     let Some(expected) = expected.filter(|&expected| expected != now) else { return Ok(()) };
     let target = |version| if version == 0 { "nothing".to_owned() } else { format!("version {version}") };
     let message = format!("{name}@{alias} points to {}; expected {}", target(now), target(expected));
-    Err(Error::Precondition { code: "alias_moved", message })
+    Err(Error::Precondition { code: ErrorCode::AliasMoved, message })
 }
 
 /// The error for an alias to an unloaded version, which would make its callers fail.
 pub(super) fn unloaded(reference: &PolicyRef) -> Error {
     let message = format!("policy {reference} is unloaded; load it before an alias points to it");
-    Error::Precondition { code: "policy_unloaded", message }
+    Error::Precondition { code: ErrorCode::PolicyUnloaded, message }
 }

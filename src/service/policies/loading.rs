@@ -94,7 +94,7 @@ pub async fn unload_policy(app: &App, name: &str) -> Result<(), Error> {
 fn spec_of(name: &str) -> Result<PolicySpec, Invalid> {
     let spec: PolicySpec = name.parse()?;
     if matches!(spec.which, Which::Alias(_)) {
-        return Err(Invalid::new("policy", format!("{name:?}"), "NAME, for all its versions, or NAME:VERSION"));
+        return Err(Invalid::new("policy", format!("{name:?}"), "NAME for all versions, or NAME:VERSION"));
     }
     Ok(spec)
 }

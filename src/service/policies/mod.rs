@@ -15,6 +15,7 @@ pub use publish::{CheckpointSource, PolicyUpload, check_publishable, publish, up
 
 use super::paging::json_bytes;
 use super::{App, Error, Page, PageRequest};
+use crate::error_code::ErrorCode;
 use crate::serving::{Described, Kind, PolicyRef, PolicySpec, Registry};
 use crate::store::Store;
 
@@ -45,7 +46,7 @@ pub async fn export(app: &App, spec: &PolicySpec) -> Result<(PolicyRef, Vec<u8>)
     let PolicyRef { name, version, .. } = &about.reference;
     if about.kind == Kind::Baseline {
         let message = format!("{name} is a baseline, which has no checkpoint to export");
-        return Err(Error::Precondition { code: "no_checkpoint", message });
+        return Err(Error::Precondition { code: ErrorCode::NoCheckpoint, message });
     }
     publish::StoredVersion::read(&app.store, name, *version).await?.checkpoint()
 }

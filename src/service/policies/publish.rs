@@ -45,7 +45,7 @@ pub struct PolicyUpload {
 pub fn check_publishable(name: &str) -> Result<(), Invalid> {
     check_name("name", name)?;
     if baselines::LIST.iter().any(|baseline| baseline.name == name) {
-        return Err(Invalid::new("name", format!("{name:?}"), "a name that is not a baseline's"));
+        return Err(Invalid::new("name", format!("{name:?}"), "a name that no baseline has"));
     }
     Ok(())
 }
@@ -139,7 +139,7 @@ impl ParsedCheckpoint {
     async fn parse(bytes: Vec<u8>) -> Result<Self, Error> {
         let parsed = tokio::task::spawn_blocking(move || {
             let size = bytes.len();
-            let refused = |e| Invalid::new("checkpoint", format!("{size} bytes"), format!("a checkpoint of this program ({e})"));
+            let refused = |e| Invalid::new("checkpoint", format!("{size} bytes"), format!("a checkpoint of Qedgix ({e})"));
             let checkpoint = Checkpoint::from_bytes(&bytes).map_err(refused)?;
             let (policy, digest) = (Arc::new(checkpoint.policy()), Sha256::digest(&bytes).into());
             Ok(Self { checkpoint, policy, bytes, digest })

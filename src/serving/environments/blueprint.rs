@@ -37,8 +37,8 @@ impl Blueprint {
         in_range("count", copies, 1..=MAX_COPIES)?;
         check_seed(seed)?;
         if copies * config.nodes() > MAX_NODES {
-            let value = format!("{copies} with {} UAVs and users each", config.nodes());
-            return Err(Invalid::new("count", value, format!("at most {MAX_NODES} UAVs and users in all copies together")));
+            let value = format!("{copies} copies of {} UAVs and users", config.nodes());
+            return Err(Invalid::new("count", value, format!("at most {MAX_NODES} UAVs and users in all copies")));
         }
         Ok(Self { config, copies, seed, auto_reset })
     }
@@ -52,8 +52,8 @@ impl Blueprint {
         if copies * nodes * (nodes - 1) <= MAX_DETECTIONS {
             return Ok(());
         }
-        let value = format!("true for {copies} copies of {nodes} UAVs and users");
-        let expected = format!("false where more than {MAX_DETECTIONS} pairs of nodes might detect each other");
+        let value = format!("true with {copies} copies of {nodes} UAVs and users");
+        let expected = format!("false, because more than {MAX_DETECTIONS} detections are possible");
         Err(Invalid::new("return_graph", value, expected))
     }
 
@@ -63,7 +63,7 @@ impl Blueprint {
     /// The number of copies or headings is wrong, or a heading index does not exist.
     pub(super) fn headings(&self, actions: &[Vec<u32>]) -> Result<Vec<u8>, Invalid> {
         if actions.len() != self.copies {
-            return Err(Invalid::new("actions", format!("{} copies", actions.len()), format!("{}, one per copy", self.copies)));
+            return Err(Invalid::new("actions", format!("{} entries", actions.len()), format!("{}, one per copy", self.copies)));
         }
         let mut flat = Vec::with_capacity(self.copies * self.config.uavs);
         for (b, headings) in actions.iter().enumerate() {

@@ -11,6 +11,7 @@ use super::blueprint::{Blueprint, check_seed, episode_seed};
 use super::state::{CopyState, Finished, Sight, State};
 use crate::clock::Clock;
 use crate::env::{BatchEnv, EpisodeMetrics};
+use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::serving::Error;
 use crate::serving::table::{Entry, LastUse};
@@ -267,7 +268,7 @@ impl Environment {
         if !repeated && world.env.done() {
             let slots = self.blueprint.config.slots;
             let message = format!("the episode of environment {:?} is over after {slots} slots; Reset begins another", self.id);
-            return Err(Error::precondition("episode_over", message));
+            return Err(Error::precondition(ErrorCode::EpisodeOver, message));
         }
         self.work(move |environment| {
             if !repeated {
@@ -308,7 +309,7 @@ impl Environment {
 
 impl Entry for Environment {
     const WHAT: &'static str = "environment";
-    const EXPIRED: &'static str = "environment_expired";
+    const EXPIRED: ErrorCode = ErrorCode::EnvironmentExpired;
 
     fn id(&self) -> &str {
         &self.id
@@ -324,5 +325,5 @@ fn wrong_step(id: &str, next: u64, step: u64) -> Error {
         0 => format!("step {step} does not follow: environment {id:?} has not flown since its reset; send step 0"),
         _ => format!("step {step} does not follow in environment {id:?}; send {next}, or {} to repeat the last", next - 1),
     };
-    Error::precondition("wrong_step", message)
+    Error::precondition(ErrorCode::WrongStep, message)
 }

@@ -12,6 +12,7 @@ use tokio::sync::{Mutex, MutexGuard};
 
 use super::{Opened, SessionInfo};
 use crate::clock::Clock;
+use crate::error_code::ErrorCode;
 use crate::serving::table::{Entry, LastUse};
 use crate::serving::{Error, Fleet, LoadedPolicy, Outcome, Room, Timings};
 
@@ -216,7 +217,7 @@ impl Session {
 
 impl Entry for Session {
     const WHAT: &'static str = "session";
-    const EXPIRED: &'static str = "session_expired";
+    const EXPIRED: ErrorCode = ErrorCode::SessionExpired;
 
     fn id(&self) -> &str {
         &self.id
@@ -238,7 +239,7 @@ impl State {
         if self.former.contains(&hash(&run_id)) {
             let message =
                 format!("run {run_id:?} of session {id:?} was replaced by run {:?}", self.run_id.as_deref().unwrap_or(""));
-            return Err(Error::precondition("run_fenced", message));
+            return Err(Error::precondition(ErrorCode::RunFenced, message));
         }
         Ok(Some(run_id.to_owned()))
     }
@@ -287,7 +288,7 @@ fn wrong_step(id: &str, steps: u64, step: u64, new_run: bool) -> Error {
         0 => format!("step {step} does not follow: session {id:?} has not flown yet; send step 0"),
         _ => format!("step {step} does not follow in session {id:?}; send {steps}, or {} to repeat the last", steps - 1),
     };
-    Error::precondition("wrong_step", message)
+    Error::precondition(ErrorCode::WrongStep, message)
 }
 
 /// A hash that is the same in every process.

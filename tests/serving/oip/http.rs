@@ -43,7 +43,7 @@ impl Http<'_> {
     async fn refused(&self, path: &str, body: &Value) -> (u16, String, String) {
         let (status, told) = self.json(Method::POST, path, body.clone()).await;
         let text = |name: &str| told[name].as_str().unwrap_or_default().to_owned();
-        (status, text("code"), text("error"))
+        (status, text("code"), text("field"))
     }
 }
 
@@ -120,27 +120,24 @@ async fn binary_data_before_and_after() {
     let (_, answer, after) = http.binary(INFER, &ask(false), &data).await;
     assert_eq!((&answer["outputs"][0]["data"], after.len()), (&json!([3, 3]), 0));
 
-    for (ask, data, begins) in [
-        (ask(true), &data[..19], "inputs[2].parameters.binary_data_size: 4 is not valid; expected a whole number, at most 3"),
-        (ask(true), &[&data[..], &[0]].concat()[..], "body: 1 bytes more"),
-        (slot(json!({})), &data[..], "body: 20 bytes more"),
+    for (ask, data, field, value) in [
+        (ask(true), &data[..19], "inputs[2].parameters.binary_data_size", "4"),
+        (ask(true), &[&data[..], &[0]].concat()[..], "body", "1 further bytes"),
+        (slot(json!({})), &data[..], "body", "20 further bytes"),
     ] {
         let (status, answer, _) = http.binary(INFER, &ask, data).await;
         assert_eq!((status, &answer["code"]), (400, &json!("invalid_argument")));
-        assert!(answer["error"].as_str().unwrap().starts_with(begins), "{answer}");
+        assert_eq!((&answer["field"], &answer["value"]), (&json!(field), &json!(value)), "{answer}");
     }
     let body = slot(json!({})).to_string().into_bytes();
     for length in ["-1", "1e3", "", "99999999999999999999", "100000"] {
         let (status, _, answer) = http.send(Method::POST, INFER, &[(LENGTH, length.into())], body.clone()).await;
         let answer: Value = serde_json::from_slice(&answer).unwrap();
-        assert_eq!(
-            (status, answer["error"].as_str().unwrap().starts_with("Inference-Header-Content-Length: ")),
-            (400, true),
-            "{answer}"
-        );
+        assert_eq!((status, &answer["field"]), (400, &json!("Inference-Header-Content-Length")), "{answer}");
     }
     let (status, _, answer) = http.send(Method::POST, INFER, &[("content-encoding", "gzip".into())], body).await;
-    assert_eq!((status, String::from_utf8(answer).unwrap().contains("Content-Encoding: ")), (400, true));
+    let answer: Value = serde_json::from_slice(&answer).unwrap();
+    assert_eq!((status, &answer["field"]), (400, &json!("Content-Encoding")), "{answer}");
 }
 
 #[tokio::test]
@@ -156,9 +153,8 @@ async fn sequences_over_http_are_those_over_grpc() {
     assert_eq!(heading(json!({"sequence_id": "5", "sequence_end": true})).await, 5);
     let ask = Ask::new("count", As::Raw, false).scene(&narrow(2, 1, 0)).int("sequence_id", 5);
     assert_eq!(indices(client(&server).await.model_infer(ask.request).await.unwrap().get_ref()), [3, 3]);
-    let (status, code, error) = http.refused(INFER, &slot(json!({"sequence_id": "5"}))).await;
+    let (status, code, _) = http.refused(INFER, &slot(json!({"sequence_id": "5"}))).await;
     assert_eq!((status, code.as_str()), (409, "sequence_not_started"));
-    assert_eq!(error, "sequence \"5\" of count is not under way; its first request needs sequence_start");
 }
 
 #[tokio::test]
@@ -211,32 +207,31 @@ async fn errors_in_the_words_of_the_protocol() {
         ask
     };
     let cases = [
-        (with("/inputs/0/data", json!([0.25, 0.5, 0.75])), 400, "uav_positions: 3 values"),
-        (with("/inputs/0/data", json!([[0.25, 0.5, 0.75, 0.5]])), 400, "uav_positions.data: arrays of shape [1, 4]"),
-        (with("/inputs/0/data", json!([[0.25, 0.5], [0.75]])), 400, "uav_positions.data: ragged arrays"),
-        (with("/inputs/0/data", json!([[0.25, 0.5], 0.75, 0.5])), 400, "uav_positions.data: ragged arrays"),
-        (with("/inputs/0/data", json!([0.25, 0.5, 0.75, "x"])), 400, "uav_positions.data: texts"),
+        (with("/inputs/0/data", json!([0.25, 0.5, 0.75])), 400, "uav_positions"),
+        (with("/inputs/0/data", json!([[0.25, 0.5, 0.75, 0.5]])), 400, "uav_positions.data"),
+        (with("/inputs/0/data", json!([[0.25, 0.5], [0.75]])), 400, "uav_positions.data"),
+        (with("/inputs/0/data", json!([[0.25, 0.5], 0.75, 0.5])), 400, "uav_positions.data"),
+        (with("/inputs/0/data", json!([0.25, 0.5, 0.75, "x"])), 400, "uav_positions.data"),
         (with("/inputs/0/data", json!([0.25, 0.5, 0.75, null])), 422, "inputs[0].data"),
         (with("/inputs/0/data", json!([0.25, 0.5, 0.75, true])), 422, "inputs[0].data"),
-        (with("/inputs/0/data", json!(0.25)), 422, "inputs[0].data: a value, expected an array"),
-        (with("/inputs/0/data", Value::Null), 422, "inputs[0].data: nothing"),
-        (with("/inputs/2/data", json!([1e39])), 400, "user_aoi[0]: inf"),
-        (with("/inputs/2/datatype", json!("INT32")), 400, "user_aoi.datatype: \"INT32\""),
-        (with("/inputs/2/datatype", json!("UINT8")), 400, "user_aoi.datatype: \"UINT8\""),
-        (with("/inputs/0/shape", json!([2, 2.5])), 422, "inputs[0].shape[1]: "),
-        (with("/inputs/0", json!({"name": "uav_positions"})), 422, "inputs[0]: missing field `shape`"),
-        (with("/parameters", json!({"step": [1]})), 422, "parameters.step: [1]"),
-        (with("/parameters", json!({"binary_data_output": 1})), 422, "parameters.binary_data_output: 1"),
-        (with("/parameters", json!({"stop": 1})), 400, "parameters: \"stop\""),
-        (with("/id", json!(5)), 422, "id: "),
-        (json!({"inputs": [], "input": []}), 422, "input: unknown field"),
-        (json!([]), 422, "invalid "),
+        (with("/inputs/0/data", json!(0.25)), 422, "inputs[0].data"),
+        (with("/inputs/0/data", Value::Null), 422, "inputs[0].data"),
+        (with("/inputs/2/data", json!([1e39])), 400, "user_aoi[0]"),
+        (with("/inputs/2/datatype", json!("INT32")), 400, "user_aoi.datatype"),
+        (with("/inputs/2/datatype", json!("UINT8")), 400, "user_aoi.datatype"),
+        (with("/inputs/0/shape", json!([2, 2.5])), 422, "inputs[0].shape[1]"),
+        (with("/inputs/0", json!({"name": "uav_positions"})), 422, "inputs[0].shape"),
+        (with("/parameters", json!({"step": [1]})), 422, "parameters.step"),
+        (with("/parameters", json!({"binary_data_output": 1})), 422, "parameters.binary_data_output"),
+        (with("/parameters", json!({"stop": 1})), 400, "parameters"),
+        (with("/id", json!(5)), 422, "id"),
+        (json!({"inputs": [], "input": []}), 422, "input"),
+        (json!([]), 422, "body"),
     ];
-    for (body, status, begins) in cases {
-        let (found, code, error) = http.refused(INFER, &body).await;
-        assert_eq!(found, status, "{body}: {error}");
+    for (body, status, field) in cases {
+        let (found, code, field_found) = http.refused(INFER, &body).await;
+        assert_eq!((found, field_found.as_str()), (status, field), "{body}");
         assert_eq!(code, if status == 400 { "invalid_argument" } else { "invalid_schema" });
-        assert!(error.starts_with(begins), "{begins}, but: {error}");
     }
     let edges = json!({"inputs": [
         {"name": "user_aoi", "datatype": "FP32", "shape": [1], "data": [3]},
@@ -244,7 +239,7 @@ async fn errors_in_the_words_of_the_protocol() {
         {"name": "edge_index", "datatype": "INT32", "shape": [1, 2], "data": [0, 4_294_967_296_u64]},
         {"name": "edge_relative", "datatype": "FP32", "shape": [1, 2], "data": [0, 0.1]},
     ]});
-    assert!(http.refused(INFER, &edges).await.2.starts_with("edge_index.data[1]: 4294967296"));
+    assert_eq!(http.refused(INFER, &edges).await.2, "edge_index.data[1]");
     for (method, path, status, code) in [
         (Method::GET, "/v2/nothing", 404, "not_found"),
         (Method::GET, "/v2/models/count/infer", 405, "method_not_allowed"),
@@ -260,16 +255,10 @@ async fn errors_in_the_words_of_the_protocol() {
         assert!(!told["error"].as_str().unwrap().is_empty());
     }
     assert_eq!(http.refused("/v2/repository/index", &json!({"raedy": true})).await.0, 422);
-    assert!(
-        http.refused("/v2/repository/models/count/load", &json!({"parameters": {"config": "{}"}}))
-            .await
-            .2
-            .starts_with("parameters")
-    );
-    assert_eq!(
-        http.refused("/v2/models/panics/infer", &slot(json!({}))).await,
-        (500, "internal".into(), "internal error".into())
-    );
+    let load = json!({"parameters": {"config": "{}"}});
+    assert_eq!(http.refused("/v2/repository/models/count/load", &load).await.2, "parameters");
+    let panicked = http.refused("/v2/models/panics/infer", &slot(json!({}))).await;
+    assert_eq!((panicked.0, panicked.1.as_str()), (500, "internal"));
     let (status, _, answer) = http.send(Method::POST, INFER, &[], vec![b' '; 20_000_000]).await;
     let answer: Value = serde_json::from_slice(&answer).unwrap();
     assert_eq!((status, &answer["code"]), (413, &json!("too_large")));

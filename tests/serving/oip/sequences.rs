@@ -42,9 +42,8 @@ const NOT_STARTED: (Code, &str) = (Code::FailedPrecondition, "sequence_not_start
 #[tokio::test]
 async fn a_sequence_begins_goes_on_and_ends() {
     let (server, mut client) = counting().await;
-    let (code, reason, message) = fails(&mut client, slot("count", 7)).await;
+    let (code, reason, _) = fails(&mut client, slot("count", 7)).await;
     assert_eq!((code, reason.as_str()), NOT_STARTED);
-    assert_eq!(message, "sequence 7 of count is not under way; its first request needs sequence_start");
     assert_eq!(fly(&mut client, start("count", 7, 2)).await.0, 2);
     assert_eq!(fly(&mut client, slot("count", 7)).await.0, 3);
     assert_eq!(server.app.sessions.len(), 1);
@@ -84,9 +83,8 @@ async fn sequences_are_told_apart() {
 async fn no_session_has_the_name_of_a_sequence() {
     let (server, mut client) = counting().await;
     let mut policies = server.grpc().await;
-    let (code, _, message) = refused(policies.open_session(open("count", "sequence:count:5")).await);
-    assert_eq!(code, Code::InvalidArgument);
-    assert!(message.starts_with("session_id: \"sequence:count:5\""), "{message}");
+    let reserved = policies.open_session(open("count", "sequence:count:5")).await;
+    assert_invalid(reserved, "session_id", "\"sequence:count:5\"");
     policies.open_session(open("count", "5")).await.unwrap();
     assert_eq!(fails(&mut client, slot("count", 5)).await.1, NOT_STARTED.1);
     fly(&mut client, start("count", 5, 0)).await;
@@ -148,19 +146,16 @@ async fn a_start_starts_over_and_a_refused_one_does_not() {
     wrong.request.raw_input_contents[0] = Bytes::from_static(&[255; 16]);
     assert_eq!(fails(&mut client, wrong).await.0, Code::InvalidArgument);
     let four = Ask::new("count", As::Raw, false).scene(&narrow(4, 1, 0)).int("sequence_id", 5).flag("sequence_start");
-    let (_, _, message) = fails(&mut client, four).await;
-    assert!(message.starts_with("uavs: 4"), "{message}");
+    assert_eq!(fails(&mut client, four).await.2, "uavs");
     assert_eq!(fly(&mut client, slot("count", 5)).await.0, 2, "it went on");
     assert_eq!(fly(&mut client, start("count", 5, 7)).await.0, 7);
     assert_eq!(fly(&mut client, slot("count", 5)).await.0, 8);
-    let (_, _, message) = fails(&mut client, slot("count", 5).int("seed", 3)).await;
-    assert!(message.starts_with("seed: 3"), "{message}");
+    assert_eq!(fails(&mut client, slot("count", 5).int("seed", 3)).await.2, "seed");
     let state = slot("count", 5).byte_strings("recurrent_state", &[b"x"]);
-    assert!(fails(&mut client, state).await.2.starts_with("recurrent_state: a tensor"));
-    assert!(fails(&mut client, slot("count", 5).asking(&["recurrent_state"])).await.2.starts_with("outputs[0].name"));
+    assert_eq!(fails(&mut client, state).await.2, "recurrent_state");
+    assert_eq!(fails(&mut client, slot("count", 5).asking(&["recurrent_state"])).await.2, "outputs[0].name");
     let other_ids = Ask::new("count", As::Raw, false).scene(&narrow(2, 1, 0)).int("sequence_id", 5);
-    let (_, _, message) = fails(&mut client, other_ids.byte_strings("uav_ids", &["a", "b"])).await;
-    assert!(message.starts_with("ids of UAVs: "), "{message}");
+    assert_eq!(fails(&mut client, other_ids.byte_strings("uav_ids", &["a", "b"])).await.2, "uavs");
 }
 
 #[tokio::test]
@@ -187,9 +182,8 @@ async fn a_sequence_stays_with_the_version_it_began_with() {
     assert_eq!(fly(&mut client, slot("count", 5)).await, (1, "1".into()));
     assert_eq!(fly(&mut client, slot("count@live", 5)).await, (2, "1".into()));
     assert_eq!(fly(&mut client, slot("count:1", 5)).await, (3, "1".into()));
-    let (code, _, message) = fails(&mut client, slot("count:2", 5)).await;
-    assert_eq!(code, Code::InvalidArgument);
-    assert!(message.starts_with("model_name: count:2 is not valid; expected count:1"), "{message}");
+    let (code, _, field) = fails(&mut client, slot("count:2", 5)).await;
+    assert_eq!((code, field.as_str()), (Code::InvalidArgument, "model_name"));
     assert_eq!(fly(&mut client, start("count@live", 5, 0)).await, (0, "2".into()));
     let mut older = start("count", 6, 0);
     older.request.model_version = "1".into();
@@ -201,9 +195,8 @@ async fn idle_sequences_expire_and_say_so() {
     let (server, mut client) = counting().await;
     fly(&mut client, start("count", 5, 0)).await;
     server.pass(601);
-    let (code, reason, message) = fails(&mut client, slot("count", 5)).await;
+    let (code, reason, _) = fails(&mut client, slot("count", 5)).await;
     assert_eq!((code, reason.as_str()), (Code::FailedPrecondition, "session_expired"));
-    assert!(message.contains("sequence:count:5"), "{message}");
     assert_eq!(fly(&mut client, start("count", 5, 3)).await.0, 3);
 }
 
@@ -215,9 +208,7 @@ async fn an_unloaded_model_is_refused_and_its_sequences_go_on() {
     let load = |name: &str| oip::RepositoryModelLoadRequest { model_name: name.into(), ..Default::default() };
     client.repository_model_unload(unload("count")).await.unwrap();
     for ask in [start("count", 6, 0), start("count:1", 5, 0), slot("count", 0)] {
-        let (code, _, message) = fails(&mut client, ask).await;
-        assert_eq!(code, Code::NotFound);
-        assert!(message.starts_with("no loaded model \"count"), "{message}");
+        assert_eq!(fails(&mut client, ask).await.0, Code::NotFound);
     }
     let ready = |name: &str| oip::ModelReadyRequest { name: name.into(), version: String::new() };
     assert!(!client.model_ready(ready("count")).await.unwrap().into_inner().ready);
@@ -242,10 +233,10 @@ async fn an_unloaded_model_is_refused_and_its_sequences_go_on() {
     assert_eq!(refused(client.repository_model_load(load("nobody")).await).0, Code::NotFound);
     assert_eq!(refused(client.repository_model_unload(unload("nobody")).await).0, Code::NotFound);
     let elsewhere = oip::RepositoryIndexRequest { repository_name: "other".into(), ready: false };
-    assert!(refused(client.repository_index(elsewhere).await).2.starts_with("repository_name: \"other\""));
+    assert_invalid(client.repository_index(elsewhere).await, "repository_name", "\"other\"");
     let mut changed = load("count");
     changed.parameters.insert("config".into(), oip::ModelRepositoryParameter::default());
-    assert!(refused(client.repository_model_load(changed).await).2.starts_with("parameters: \"config\""));
+    assert_invalid(client.repository_model_load(changed).await, "parameters", "\"config\"");
     drop(server);
 }
 

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use bytes::Bytes;
 use prost::Message;
 use prost_types::FileDescriptorSet;
-use qedgix::api::access::{self, Need};
+use qedgix::api::access::{self, Requirement};
 use qedgix::service::keys::Scope;
 use reqwest::Method;
 use serde_json::Value;
@@ -75,9 +75,9 @@ async fn everything_that_is_served_is_in_the_table() {
     assert!(missing.is_empty(), "add them to src/api/access.rs: {missing:#?}");
 }
 
-/// A scope that opens what `need` asks for, and all those that do not.
-fn scopes(need: Need) -> Option<(Scope, Vec<Scope>)> {
-    let Need::Scope(scope) = need else { return None };
+/// The scope that meets the requirement, and all that do not.
+fn scopes(requirement: Requirement) -> Option<(Scope, Vec<Scope>)> {
+    let Requirement::Scope(scope) = requirement else { return None };
     let others = Scope::ALL.into_iter().filter(|other| *other != scope && *other != Scope::Admin);
     Some((scope, others.collect()))
 }
@@ -105,7 +105,7 @@ async fn grpc_goes_by_the_table() {
     for method in grpc_methods() {
         let worker = method.starts_with("qedgix.v1.WorkerService/");
         let (code, message) = grpc(&channel, &method, None).await;
-        let Some((scope, others)) = scopes(access::grpc(&format!("/{method}"))) else {
+        let Some((scope, others)) = scopes(access::grpc_requirement(&format!("/{method}"))) else {
             // Workers are asked for the token of their attempt.
             assert!(!message.starts_with("an API key"), "{method}: {message}");
             assert_eq!(code == Code::Unauthenticated, worker, "{method}: {message}");
@@ -152,7 +152,7 @@ async fn rest_goes_by_the_table() {
     for (verb, route) in rest_routes(&server).await {
         let path = route.split('/').map(|part| if part.starts_with('{') { "x" } else { part }).collect::<Vec<_>>().join("/");
         let (status, asked, text) = rest(&server, &verb, &path, None).await;
-        let Some((scope, others)) = scopes(access::rest(&verb, Some(&route))) else {
+        let Some((scope, others)) = scopes(access::rest_requirement(&verb, Some(&route))) else {
             assert!(!matches!(status, 401 | 403), "{verb} {route}: {text}");
             open.insert(route);
             continue;

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use qedgix::error_code::ErrorCode;
 use qedgix::service::keys;
 use qedgix::wire::v1;
 use tonic::Code;
@@ -128,8 +129,8 @@ async fn rotation_keeps_what_a_key_is_and_ends_the_old_one() {
     assert!(ends.contains(&(&old.info.id, "expired", Some(now + Duration::from_secs(60)))), "{ends:?}");
     assert_eq!(again.info.name, old.info.name);
     let over = keys::rotate(store, &old.info.id, Duration::ZERO, server.app.clock.now()).await;
-    assert_eq!(over.err().unwrap().code(), "wrong_state");
-    assert_eq!(keys::revoke(store, "nobody", now).await.err().unwrap().code(), "not_found");
+    assert_eq!(over.err().unwrap().code(), ErrorCode::WrongState);
+    assert_eq!(keys::revoke(store, "nobody", now).await.err().unwrap().code(), ErrorCode::NotFound);
 }
 
 #[tokio::test]

@@ -3,6 +3,7 @@
 use bytes::Bytes;
 use qedgix::wire::v1;
 use tonic::Code;
+use tonic_types::StatusExt;
 use v1::act_result::Result as Told;
 
 use super::super::harness::*;
@@ -32,13 +33,27 @@ async fn a_key_that_asks_too_often_waits_and_others_do_not() {
     assert_eq!(status.code(), Code::ResourceExhausted);
     assert_eq!(status.metadata().get("retry-after").unwrap(), "2");
     assert_eq!(status.metadata().get("qedgix-code").unwrap(), "resource_exhausted");
-    assert!(status.message().contains("limited to 0.5 requests per second"), "{}", status.message());
+    assert_eq!(status.get_error_details().retry_info().unwrap().retry_delay, Some(std::time::Duration::from_secs(2)));
     assert_eq!(rest(&server, &free).await.0, 200);
     server.pass(1);
     assert_eq!(rest(&server, &slow).await, (429, Some("1".into())));
     server.pass(1);
     assert_eq!(rest(&server, &slow).await.0, 200);
     assert_eq!(rest(&server, &slow).await.0, 429);
+}
+
+#[tokio::test]
+async fn requests_without_the_scope_count_against_the_rate() {
+    let server = Server::start().await;
+    let slow = make(&server, "act", |new| (new.rate, new.burst) = (Some(0.5), Some(2.0))).await.key;
+    let mut client = server.grpc().await;
+    let mut list = async || client.list_policies(signed(&slow, v1::ListPoliciesRequest::default())).await.unwrap_err().code();
+    assert_eq!(rest(&server, &slow).await.0, 403);
+    assert_eq!(list().await, Code::PermissionDenied);
+    assert_eq!(rest(&server, &slow).await, (429, Some("2".into())));
+    assert_eq!(list().await, Code::ResourceExhausted);
+    server.pass(2);
+    assert_eq!(rest(&server, &slow).await.0, 403);
 }
 
 #[tokio::test]

@@ -170,7 +170,7 @@ impl Tensor {
         let datatype = found.ok_or_else(|| self.wrong(".datatype", format!("{:?}", self.datatype), names()))?;
         match self.data.datatype() {
             Some(other) if other != datatype => {
-                Err(self.wrong("", format!("values of {other}"), format!("values of {datatype}, as its datatype says")))
+                Err(self.wrong("", format!("values of {other}"), format!("values of {datatype}, the datatype of the tensor")))
             }
             _ => Ok(datatype),
         }
@@ -180,7 +180,7 @@ impl Tensor {
         if len == count {
             return Ok(());
         }
-        Err(self.wrong("", format!("{len} values"), format!("{count} values, as its shape {:?} says", self.shape)))
+        Err(self.wrong("", format!("{len} values"), format!("{count} values for the shape {:?}", self.shape)))
     }
 
     /// `count` elements of raw values of a fixed size.
@@ -188,7 +188,7 @@ impl Tensor {
         if Some(raw.len()) == count.checked_mul(datatype.size()) {
             return Ok(raw);
         }
-        let expected = format!("{count} values of {} bytes, as its shape {:?} says", datatype.size(), self.shape);
+        let expected = format!("{count} values of {} bytes for the shape {:?}", datatype.size(), self.shape);
         Err(self.wrong("", format!("{} bytes", raw.len()), expected))
     }
 
@@ -255,8 +255,8 @@ impl Tensor {
     fn split(&self, mut raw: Bytes, count: usize) -> Result<Vec<Bytes>, Invalid> {
         let size = raw.len();
         let wrong = |place: usize, left: usize| {
-            let value = format!("{size} bytes, of which {left} are left for element {place}");
-            self.wrong("", value, format!("{count} elements, each after its length in 4 bytes"))
+            let value = format!("{size} bytes, {left} of them for element {place}");
+            self.wrong("", value, format!("{count} elements, each preceded by its length in 4 bytes"))
         };
         // Four bytes are the least that an element takes: nothing is reserved for elements that cannot be there.
         if count.checked_mul(4).is_none_or(|least| least > size) {

@@ -56,7 +56,7 @@ pub fn observation(tensors: &mut Vec<Tensor>) -> Result<Observation, Invalid> {
     };
     let [uav_positions, user_positions, user_aoi, edge_index, edge_relative, uav_count, uav_ids, user_ids] =
         INPUTS.map(|(name, ..)| take(name));
-    let missing = |name: &str, expected: &str| Invalid::new(name, "nothing", expected);
+    let missing = |name: &str, expected: &str| Invalid::missing(name, expected);
     let user_aoi = user_aoi.ok_or_else(|| missing("user_aoi", "the AoI of each user in slots, [N]"))?;
     let users = user_aoi.rows("[N]", &[], MAX_NODES)?;
     let uavs = count_uavs(uav_positions.as_ref(), uav_count.as_ref(), uav_ids.as_ref())?;
@@ -80,7 +80,7 @@ pub fn observation(tensors: &mut Vec<Tensor>) -> Result<Observation, Invalid> {
         (None, None, Some(_)) => return Err(missing("edge_index", "the nodes of each edge, [E, 2]")),
         (None, Some(_), None) => return Err(missing("edge_relative", "the relative coordinates of each edge, [E, 2]")),
         (Some(_), ..) => {
-            let expected = "nothing beside edges: a request is a scene or a graph";
+            let expected = "no value beside edges, because a request has a scene or a graph";
             return Err(Invalid::new("user_positions", "a tensor", expected));
         }
     };
@@ -102,10 +102,10 @@ fn count_uavs(positions: Option<&Tensor>, count: Option<&Tensor>, ids: Option<&T
     ];
     let mut told = told.into_iter().flatten();
     let Some((first, uavs)) = told.next() else {
-        return Err(Invalid::new("uav_positions", "nothing", "the position of each UAV, [M, 2], or uav_count or uav_ids"));
+        return Err(Invalid::missing("uav_positions", "the position of each UAV, [M, 2], or uav_count or uav_ids"));
     };
     match told.find(|&(_, other)| other != uavs) {
-        Some((name, other)) => Err(Invalid::new(name, format!("{other} UAVs"), format!("{uavs}, as {first} says"))),
+        Some((name, other)) => Err(Invalid::new(name, format!("{other} UAVs"), format!("{uavs}, the number in {first}"))),
         None => Ok(uavs),
     }
 }
@@ -198,7 +198,7 @@ fn graph(nodes: &Nodes, own: Option<&[Point]>, ages: &[f32], index: &Tensor, rel
         if let Some(pair) = list.windows(2).find(|pair| pair[0].target == pair[1].target) {
             let (first, again) = (pair[0].place, pair[1].place as usize);
             let ends = format!("{:?}", &ends[2 * again..2 * again + 2]);
-            return Err(Invalid::new(format!("edge_index[{again}]"), ends, format!("another edge than edge {first}")));
+            return Err(Invalid::new(format!("edge_index[{again}]"), ends, format!("an edge that differs from edge {first}")));
         }
     }
     mirror(Graph {

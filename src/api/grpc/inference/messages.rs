@@ -1,4 +1,4 @@
-//! Messages of `GRPCInferenceService` from and to what `api::oip` works with.
+//! Conversions between the messages of `GRPCInferenceService` and the types of `api::oip`.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -6,17 +6,17 @@ use std::time::Duration;
 use bytes::Bytes;
 
 use crate::api::convert::tensors::{Data, Datatype, Tensor, TensorShape};
-use crate::api::oip::{self, Call, Model, Parameter, Reply};
+use crate::api::oip::{self, InferRequest, InferResponse, Model, Parameter};
 use crate::invalid::Invalid;
 use crate::service::policies::IndexEntry;
 use crate::wire::oip as wire;
 use crate::wire::oip::infer_parameter::ParameterChoice;
 
-/// What is asked.
+/// Decodes a request.
 ///
 /// # Errors
-/// Values that are in two places or in none, or parameters that mean something this server does not do.
-pub(super) fn call(request: wire::ModelInferRequest) -> Result<Call, Invalid> {
+/// [`Invalid`] if a tensor has its values twice or not at all, or for unsupported parameters.
+pub(super) fn infer_request(request: wire::ModelInferRequest) -> Result<InferRequest, Invalid> {
     let wire::ModelInferRequest { model_name, model_version, id, parameters, inputs, outputs, raw_input_contents } = request;
     let raw = raw_input_contents;
     if !raw.is_empty() && raw.len() != inputs.len() {
@@ -29,7 +29,7 @@ pub(super) fn call(request: wire::ModelInferRequest) -> Result<Call, Invalid> {
         oip::check_tensor_parameters(&format!("outputs[{i}]"), sent.parameters.keys())?;
         Ok(sent.name)
     });
-    Ok(Call {
+    Ok(InferRequest {
         model: model_name,
         version: model_version,
         id,
@@ -46,7 +46,7 @@ fn parameter((name, value): (String, wire::InferParameter)) -> Result<(String, P
         Some(ParameterChoice::Uint64Param(value)) => Parameter::Uint(value),
         Some(ParameterChoice::DoubleParam(value)) => Parameter::Double(value),
         Some(ParameterChoice::StringParam(value)) => Parameter::Text(value),
-        None => return Err(Invalid::new(format!("parameters.{name}"), "nothing", "a value")),
+        None => return Err(Invalid::missing(format!("parameters.{name}"), "a value")),
     };
     Ok((name, value))
 }
@@ -57,7 +57,7 @@ fn input(i: usize, sent: wire::model_infer_request::InferInputTensor, raw: Optio
     let data = match (raw, contents) {
         (Some(raw), None) => Data::Raw(raw),
         (Some(_), Some(_)) => {
-            let expected = "nothing where raw_input_contents has the values";
+            let expected = "no value, because raw_input_contents has the values";
             return Err(Invalid::new(format!("inputs[{i}].contents"), "values", expected));
         }
         (None, contents) => typed(&datatype, contents.unwrap_or_default()),
@@ -65,7 +65,7 @@ fn input(i: usize, sent: wire::model_infer_request::InferInputTensor, raw: Optio
     Ok(Tensor { name, datatype, shape, data })
 }
 
-/// The values in the field of their datatype; an unknown one is told later, by its tensor's name.
+/// The values of a tensor from the field for its datatype. An unknown datatype is rejected later, with the name of the tensor.
 fn typed(datatype: &str, contents: wire::InferTensorContents) -> Data {
     match Datatype::parse(datatype) {
         Some(Datatype::Int32) => Data::Int32(contents.int_contents),
@@ -77,20 +77,20 @@ fn typed(datatype: &str, contents: wire::InferTensorContents) -> Data {
     }
 }
 
-/// A parameter that is a text.
-pub(super) fn text(value: String) -> wire::InferParameter {
+/// A string parameter.
+pub(super) fn string(value: String) -> wire::InferParameter {
     wire::InferParameter { parameter_choice: Some(ParameterChoice::StringParam(value)) }
 }
 
-/// What tells a client of a stream that no more answers come to its request.
-pub(super) fn final_answer() -> (String, wire::InferParameter) {
+/// The parameter that marks the last response to a request in a stream.
+pub(super) fn final_response() -> (String, wire::InferParameter) {
     let yes = wire::InferParameter { parameter_choice: Some(ParameterChoice::BoolParam(true)) };
     ("triton_final_response".into(), yes)
 }
 
-/// The answer; values are raw, however they came.
-pub(super) fn reply(reply: Reply) -> wire::ModelInferResponse {
-    let Reply { model, version, id, step, digest, outputs } = reply;
+/// Encodes a response. The values are raw, however those of the request were sent.
+pub(super) fn infer_response(response: InferResponse) -> wire::ModelInferResponse {
+    let InferResponse { model, version, id, step, digest, outputs } = response;
     let step = wire::InferParameter { parameter_choice: Some(ParameterChoice::Int64Param(step as i64)) };
     let (outputs, raw_output_contents) = outputs
         .into_iter()
@@ -104,13 +104,13 @@ pub(super) fn reply(reply: Reply) -> wire::ModelInferResponse {
         model_name: model,
         model_version: version.to_string(),
         id,
-        parameters: [("step".to_owned(), step), ("digest".to_owned(), text(digest))].into(),
+        parameters: [("step".to_owned(), step), ("digest".to_owned(), string(digest))].into(),
         outputs,
         raw_output_contents,
     }
 }
 
-/// A model's description.
+/// Encodes the metadata of a model.
 pub(super) fn metadata(model: Model) -> wire::ModelMetadataResponse {
     let tensor = |tensor: TensorShape| wire::model_metadata_response::TensorMetadata {
         name: tensor.name.to_owned(),
@@ -126,7 +126,7 @@ pub(super) fn metadata(model: Model) -> wire::ModelMetadataResponse {
     }
 }
 
-/// A model's configuration; sequences end when idle for `ttl`.
+/// Encodes the configuration of a model. Sequences expire when idle for `ttl`.
 pub(super) fn config(model: Model, ttl: Duration) -> wire::ModelConfig {
     let data_type = |datatype| {
         let known = wire::DataType::from_str_name(oip::config_type(datatype));
@@ -156,7 +156,7 @@ pub(super) fn config(model: Model, ttl: Duration) -> wire::ModelConfig {
     }
 }
 
-/// A line of the index.
+/// Encodes an entry of the repository index.
 pub(super) fn entry(entry: IndexEntry) -> wire::repository_index_response::ModelIndex {
     let IndexEntry { name, version, ready, reason } = entry;
     wire::repository_index_response::ModelIndex {

@@ -1,21 +1,23 @@
-//! `GRPCInferenceService` of the Open Inference Protocol: decode, call one use case, encode.
+//! `GRPCInferenceService` of the Open Inference Protocol.
 
 mod messages;
 
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
 
 use futures::stream::{BoxStream, StreamExt};
 use tonic::{Request, Response, Status, Streaming};
 
-use self::messages::{call, config, final_answer, metadata, reply};
+use self::messages::{config, final_response, infer_request, infer_response, metadata};
 use super::{deadline, stream};
+use crate::api::auth::StreamCaller;
 use crate::api::errors::act_error;
-use crate::api::gate::Opener;
 use crate::api::oip;
 use crate::service::{App, Error};
 use crate::wire::oip as wire;
 use crate::wire::oip::grpc_inference_service_server::{GrpcInferenceService, GrpcInferenceServiceServer};
+use crate::wire::v1::ActError;
 
 /// The service.
 pub fn service(app: Arc<App>) -> GrpcInferenceServiceServer<impl GrpcInferenceService> {
@@ -24,70 +26,73 @@ pub fn service(app: Arc<App>) -> GrpcInferenceServiceServer<impl GrpcInferenceSe
 
 struct Service(Arc<App>);
 
-type Answer<T> = Result<Response<T>, Status>;
+type GrpcResult<T> = Result<Response<T>, Status>;
 
-async fn answer(
+async fn infer(
     app: &App,
     request: wire::ModelInferRequest,
     deadline: Option<Instant>,
 ) -> Result<wire::ModelInferResponse, Error> {
-    Ok(reply(oip::infer(app, call(request)?, deadline).await?))
+    Ok(infer_response(oip::infer(app, infer_request(request)?, deadline).await?))
 }
 
-/// One slot of a stream: answered or refused, also because it comes too soon.
-async fn answer_in_stream(
+/// The response to one request of a stream. `counted` refuses the request if the caller exceeds its rate.
+async fn infer_in_stream(
     app: &App,
     request: wire::ModelInferRequest,
     counted: Result<(), Error>,
     deadline: Option<Instant>,
 ) -> wire::ModelStreamInferResponse {
     let (model_name, id) = (request.model_name.clone(), request.id.clone());
-    let answered = match counted {
-        Ok(()) => answer(app, request, deadline).await,
+    let inferred = match counted {
+        Ok(()) => infer(app, request, deadline).await,
         Err(busy) => Err(busy),
     };
-    let (error_message, mut response) = match answered {
+    let (error_message, mut response) = match inferred {
         Ok(response) => (String::new(), response),
         Err(error) => {
-            let told = act_error(&error);
-            let parameters = [("code".to_owned(), messages::text(told.code))].into();
-            (told.message, wire::ModelInferResponse { model_name, id, parameters, ..Default::default() })
+            let ActError { code, message, field, .. } = act_error(&error);
+            let mut parameters = HashMap::from([("code".to_owned(), messages::string(code))]);
+            if !field.is_empty() {
+                parameters.insert("field".to_owned(), messages::string(field));
+            }
+            (message, wire::ModelInferResponse { model_name, id, parameters, ..Default::default() })
         }
     };
-    let (name, value) = final_answer();
+    let (name, value) = final_response();
     response.parameters.insert(name, value);
     wire::ModelStreamInferResponse { error_message, infer_response: Some(response) }
 }
 
 #[tonic::async_trait]
 impl GrpcInferenceService for Service {
-    async fn server_live(&self, _: Request<wire::ServerLiveRequest>) -> Answer<wire::ServerLiveResponse> {
+    async fn server_live(&self, _: Request<wire::ServerLiveRequest>) -> GrpcResult<wire::ServerLiveResponse> {
         Ok(Response::new(wire::ServerLiveResponse { live: true }))
     }
 
-    async fn server_ready(&self, _: Request<wire::ServerReadyRequest>) -> Answer<wire::ServerReadyResponse> {
+    async fn server_ready(&self, _: Request<wire::ServerReadyRequest>) -> GrpcResult<wire::ServerReadyResponse> {
         Ok(Response::new(wire::ServerReadyResponse { ready: self.0.ready().await.is_ok() }))
     }
 
-    async fn model_ready(&self, request: Request<wire::ModelReadyRequest>) -> Answer<wire::ModelReadyResponse> {
+    async fn model_ready(&self, request: Request<wire::ModelReadyRequest>) -> GrpcResult<wire::ModelReadyResponse> {
         let wire::ModelReadyRequest { name, version } = request.into_inner();
         Ok(Response::new(wire::ModelReadyResponse { ready: oip::is_ready(&self.0, &name, &version)? }))
     }
 
-    async fn server_metadata(&self, _: Request<wire::ServerMetadataRequest>) -> Answer<wire::ServerMetadataResponse> {
+    async fn server_metadata(&self, _: Request<wire::ServerMetadataRequest>) -> GrpcResult<wire::ServerMetadataResponse> {
         let extensions = oip::EXTENSIONS.map(str::to_owned).to_vec();
         let (name, version) = (oip::NAME.to_owned(), oip::VERSION.to_owned());
         Ok(Response::new(wire::ServerMetadataResponse { name, version, extensions }))
     }
 
-    async fn model_metadata(&self, request: Request<wire::ModelMetadataRequest>) -> Answer<wire::ModelMetadataResponse> {
+    async fn model_metadata(&self, request: Request<wire::ModelMetadataRequest>) -> GrpcResult<wire::ModelMetadataResponse> {
         let wire::ModelMetadataRequest { name, version } = request.into_inner();
         Ok(Response::new(metadata(oip::describe(&self.0, &name, &version)?)))
     }
 
-    async fn model_infer(&self, request: Request<wire::ModelInferRequest>) -> Answer<wire::ModelInferResponse> {
+    async fn model_infer(&self, request: Request<wire::ModelInferRequest>) -> GrpcResult<wire::ModelInferResponse> {
         let deadline = deadline(request.extensions());
-        Ok(Response::new(answer(&self.0, request.into_inner(), deadline).await?))
+        Ok(Response::new(infer(&self.0, request.into_inner(), deadline).await?))
     }
 
     type ModelStreamInferStream = BoxStream<'static, Result<wire::ModelStreamInferResponse, Status>>;
@@ -95,25 +100,28 @@ impl GrpcInferenceService for Service {
     async fn model_stream_infer(
         &self,
         request: Request<Streaming<wire::ModelInferRequest>>,
-    ) -> Answer<Self::ModelStreamInferStream> {
-        let (deadline, opener) = (deadline(request.extensions()), Opener::of(request.extensions()));
+    ) -> GrpcResult<Self::ModelStreamInferStream> {
+        let (deadline, caller) = (deadline(request.extensions()), StreamCaller::new(request.extensions()));
         let app = self.0.clone();
         let requests = stream::requests(app.clone(), request.into_inner());
-        // One after another: a sequence's slots follow each other without their steps being told.
+        // One after another, because the slots of a sequence need not have steps.
         let answers = requests.then(move |request| {
-            let (app, counted) = (app.clone(), opener.count(&app));
-            async move { Ok(answer_in_stream(&app, request?, counted?, deadline).await) }
+            let (app, counted) = (app.clone(), caller.count_message(&app));
+            async move { Ok(infer_in_stream(&app, request?, counted?, deadline).await) }
         });
         Ok(Response::new(answers.boxed()))
     }
 
-    async fn model_config(&self, request: Request<wire::ModelConfigRequest>) -> Answer<wire::ModelConfigResponse> {
+    async fn model_config(&self, request: Request<wire::ModelConfigRequest>) -> GrpcResult<wire::ModelConfigResponse> {
         let wire::ModelConfigRequest { name, version } = request.into_inner();
         let model = oip::describe(&self.0, &name, &version)?;
         Ok(Response::new(wire::ModelConfigResponse { config: Some(config(model, self.0.sessions.ttl())) }))
     }
 
-    async fn repository_index(&self, request: Request<wire::RepositoryIndexRequest>) -> Answer<wire::RepositoryIndexResponse> {
+    async fn repository_index(
+        &self,
+        request: Request<wire::RepositoryIndexRequest>,
+    ) -> GrpcResult<wire::RepositoryIndexResponse> {
         let wire::RepositoryIndexRequest { repository_name, ready } = request.into_inner();
         let models = oip::index(&self.0, &repository_name, ready)?.into_iter().map(messages::entry).collect();
         Ok(Response::new(wire::RepositoryIndexResponse { models }))
@@ -122,7 +130,7 @@ impl GrpcInferenceService for Service {
     async fn repository_model_load(
         &self,
         request: Request<wire::RepositoryModelLoadRequest>,
-    ) -> Answer<wire::RepositoryModelLoadResponse> {
+    ) -> GrpcResult<wire::RepositoryModelLoadResponse> {
         let wire::RepositoryModelLoadRequest { repository_name, model_name, parameters } = request.into_inner();
         let parameters: Vec<&str> = parameters.keys().map(String::as_str).collect();
         oip::load(&self.0, &repository_name, &model_name, &parameters).await?;
@@ -132,7 +140,7 @@ impl GrpcInferenceService for Service {
     async fn repository_model_unload(
         &self,
         request: Request<wire::RepositoryModelUnloadRequest>,
-    ) -> Answer<wire::RepositoryModelUnloadResponse> {
+    ) -> GrpcResult<wire::RepositoryModelUnloadResponse> {
         let wire::RepositoryModelUnloadRequest { repository_name, model_name, parameters } = request.into_inner();
         let parameters: Vec<&str> = parameters.keys().map(String::as_str).collect();
         oip::unload(&self.0, &repository_name, &model_name, &parameters).await?;

@@ -1,8 +1,8 @@
-//! `/v2`: the Open Inference Protocol over HTTP, tensors as JSON or as binary data after it.
+//! `/v2`: the Open Inference Protocol over HTTP. Tensors are JSON, or binary data after the JSON.
 
-mod answer;
-mod body;
-mod data;
+mod request;
+mod response;
+mod values;
 
 use std::sync::Arc;
 
@@ -20,9 +20,9 @@ use crate::api::errors::Problem;
 use crate::api::oip;
 use crate::service::{App, Error};
 
-/// Bytes of the JSON before binary data, in requests and answers.
+/// Header with the length of the JSON before the binary data, in requests and responses.
 const HEADER_LENGTH: HeaderName = HeaderName::from_static("inference-header-content-length");
-/// Larger bodies are parsed away from the threads that serve connections.
+/// Larger bodies are parsed on a blocking thread.
 const LARGE: usize = 64 << 10;
 
 type Shared = State<Arc<App>>;
@@ -46,23 +46,30 @@ pub fn router() -> Router<Arc<App>> {
         .route("/v2/repository/models/{model}/unload", post(unload))
 }
 
-/// Whether a path is one of this protocol's, known or not.
-pub fn is_ours(path: &str) -> bool {
+/// Whether a path belongs to `/v2`, known or not.
+pub fn is_v2(path: &str) -> bool {
     path == "/v2" || path.starts_with("/v2/")
 }
 
-/// Says a problem in this protocol's words, `{"error", "code"}`, with the same status.
-pub fn in_our_words(mut response: Response) -> Response {
+/// Converts a problem response to the error format of the protocol: `error` and `code`, and `field`, `value` and `expected` if
+/// the error is about a field. Keeps the status and the headers.
+pub fn convert_problem(mut response: Response) -> Response {
     let Some(problem) = response.extensions_mut().remove::<Problem>() else { return response };
-    let mut ours = (response.status(), Json(json!({"error": problem.detail, "code": problem.code}))).into_response();
-    let (headers, body_of) = (ours.headers_mut(), [axum::http::header::CONTENT_TYPE, axum::http::header::CONTENT_LENGTH]);
+    let mut body = json!({"error": problem.detail, "code": problem.code});
+    for (name, value) in [("field", problem.field), ("value", problem.value), ("expected", problem.expected)] {
+        if let Some(value) = value {
+            body[name] = value.into();
+        }
+    }
+    let mut converted = (response.status(), Json(body)).into_response();
+    let (headers, body_of) = (converted.headers_mut(), [axum::http::header::CONTENT_TYPE, axum::http::header::CONTENT_LENGTH]);
     headers.extend(response.headers().iter().filter(|(name, _)| !body_of.contains(name)).map(|(n, v)| (n.clone(), v.clone())));
-    ours
+    converted
 }
 
-/// A model with or without its version.
+/// Path parameters: a model and optionally its version.
 #[derive(Debug, Deserialize)]
-struct Asked {
+struct ModelPath {
     model: String,
     #[serde(default)]
     version: String,
@@ -81,16 +88,16 @@ async fn ready(State(app): Shared) -> Result<Json<Value>, Error> {
     Ok(Json(json!({"ready": true})))
 }
 
-async fn model_ready(State(app): Shared, Path(asked): Path<Asked>) -> Result<Json<Value>, Error> {
-    if !oip::is_ready(&app, &asked.model, &asked.version)? {
-        // Says what is not ready about it.
-        oip::describe(&app, &asked.model, &asked.version)?;
+async fn model_ready(State(app): Shared, Path(path): Path<ModelPath>) -> Result<Json<Value>, Error> {
+    if !oip::is_ready(&app, &path.model, &path.version)? {
+        // Returns the error if the model does not exist or is not loaded.
+        oip::describe(&app, &path.model, &path.version)?;
     }
-    Ok(Json(json!({"name": asked.model, "ready": true})))
+    Ok(Json(json!({"name": path.model, "ready": true})))
 }
 
-async fn metadata(State(app): Shared, Path(asked): Path<Asked>) -> Result<Json<Value>, Error> {
-    let model = oip::describe(&app, &asked.model, &asked.version)?;
+async fn metadata(State(app): Shared, Path(path): Path<ModelPath>) -> Result<Json<Value>, Error> {
+    let model = oip::describe(&app, &path.model, &path.version)?;
     let tensor = |t: &TensorShape| json!({"name": t.name, "datatype": t.datatype.name(), "shape": t.shape});
     Ok(Json(json!({
         "name": model.name,
@@ -101,8 +108,8 @@ async fn metadata(State(app): Shared, Path(asked): Path<Asked>) -> Result<Json<V
     })))
 }
 
-async fn config(State(app): Shared, Path(asked): Path<Asked>) -> Result<Json<Value>, Error> {
-    let model = oip::describe(&app, &asked.model, &asked.version)?;
+async fn config(State(app): Shared, Path(path): Path<ModelPath>) -> Result<Json<Value>, Error> {
+    let model = oip::describe(&app, &path.model, &path.version)?;
     let output = |t: &TensorShape| json!({"name": t.name, "data_type": oip::config_type(t.datatype), "dims": t.shape});
     let input = |t: &TensorShape| {
         let mut input = output(t);
@@ -122,23 +129,23 @@ async fn config(State(app): Shared, Path(asked): Path<Asked>) -> Result<Json<Val
     })))
 }
 
-async fn infer(State(app): Shared, Path(asked): Path<Asked>, headers: HeaderMap, Raw(body): Raw) -> Result<Response, Error> {
-    let Asked { model, version } = asked;
+async fn infer(State(app): Shared, Path(path): Path<ModelPath>, headers: HeaderMap, Raw(body): Raw) -> Result<Response, Error> {
+    let ModelPath { model, version } = path;
     let large = body.len() > LARGE;
-    let read = move || body::read(&headers, body, model, version);
-    let (call, binary) = if large { tokio::task::spawn_blocking(read).await.map_err(Error::internal)?? } else { read()? };
-    Ok(answer::response(oip::infer(&app, call, None).await?, &binary))
+    let decode = move || request::decode(&headers, body, model, version);
+    let (request, binary) = if large { tokio::task::spawn_blocking(decode).await.map_err(Error::internal)?? } else { decode()? };
+    Ok(response::encode(oip::infer(&app, request, None).await?, &binary))
 }
 
 #[derive(Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Index {
+struct IndexRequest {
     #[serde(default)]
     ready: bool,
 }
 
 async fn index(State(app): Shared, Raw(body): Raw) -> Result<Json<Value>, Error> {
-    let Index { ready } = or_default(&body)?;
+    let IndexRequest { ready } = parse_or_default(&body)?;
     let entry = |entry: crate::service::policies::IndexEntry| {
         json!({
             "name": entry.name,
@@ -152,30 +159,30 @@ async fn index(State(app): Shared, Raw(body): Raw) -> Result<Json<Value>, Error>
 
 #[derive(Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Loading {
+struct RepositoryRequest {
     #[serde(default)]
     parameters: Map<String, Value>,
 }
 
-impl Loading {
-    fn names(&self) -> Vec<&str> {
+impl RepositoryRequest {
+    fn parameter_names(&self) -> Vec<&str> {
         self.parameters.keys().map(String::as_str).collect()
     }
 }
 
 async fn load(State(app): Shared, Path(model): Path<String>, Raw(body): Raw) -> Result<StatusCode, Error> {
-    let loading: Loading = or_default(&body)?;
-    oip::load(&app, "", &model, &loading.names()).await?;
+    let request: RepositoryRequest = parse_or_default(&body)?;
+    oip::load(&app, "", &model, &request.parameter_names()).await?;
     Ok(StatusCode::OK)
 }
 
 async fn unload(State(app): Shared, Path(model): Path<String>, Raw(body): Raw) -> Result<StatusCode, Error> {
-    let loading: Loading = or_default(&body)?;
-    oip::unload(&app, "", &model, &loading.names()).await?;
+    let request: RepositoryRequest = parse_or_default(&body)?;
+    oip::unload(&app, "", &model, &request.parameter_names()).await?;
     Ok(StatusCode::OK)
 }
 
-/// A document that may be left out.
-fn or_default<T: Default + serde::de::DeserializeOwned>(body: &[u8]) -> Result<T, Error> {
+/// Parses a body that may be empty.
+fn parse_or_default<T: Default + serde::de::DeserializeOwned>(body: &[u8]) -> Result<T, Error> {
     if body.is_empty() { Ok(T::default()) } else { parse(body) }
 }

@@ -1,7 +1,7 @@
-//! Counts and times of gRPC calls, under the names that gRPC middlewares share (`grpc_server_handled_total`, ...).
+//! Metrics of gRPC calls, under the names that gRPC middlewares share (`grpc_server_handled_total`, ...).
 //!
-//! Every method of the descriptors built into the program has its handles, made when it is called first and kept: counting
-//! a call allocates and locks nothing. Paths are the caller's; those of no method are counted together.
+//! The metric handles of a method are created at its first call and kept, so that counting neither allocates nor locks.
+//! Paths that are no known method share one set of handles, because clients choose them.
 
 use std::collections::HashMap;
 use std::sync::OnceLock;
@@ -13,7 +13,7 @@ use tonic::Code;
 
 use crate::api::observe::is_quiet;
 
-/// Which sides of a call send more than one message.
+/// Whether client and server send a stream of messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Streams {
     pub(super) client: bool,
@@ -36,14 +36,14 @@ pub(super) struct Method {
     /// `package.Service/Method`.
     pub(super) path: String,
     pub(super) streams: Streams,
-    /// Whether its spans are for debugging only.
+    /// Whether its spans have level DEBUG.
     pub(super) quiet: bool,
     handles: OnceLock<Handles>,
-    /// By code.
+    /// Finished calls by code.
     handled: [OnceLock<Counter>; 17],
 }
 
-/// What is counted of a method, whatever comes out.
+/// The metrics of a method that do not depend on the code.
 pub(super) struct Handles {
     pub(super) started: Counter,
     pub(super) seconds: Histogram,
@@ -81,20 +81,20 @@ impl Method {
     }
 }
 
-/// All methods.
-pub(super) struct Meters {
+/// All methods of the server, and one for unknown paths.
+pub(super) struct Methods {
     methods: Vec<Method>,
     by_path: HashMap<String, usize>,
 }
 
-impl Meters {
-    /// Those of these descriptor sets.
+impl Methods {
+    /// The methods in `descriptors`.
     ///
     /// # Panics
-    /// When one does not decode: they are built into the program.
+    /// If a descriptor set does not decode. The callers pass sets that are built into the program.
     pub(super) fn new(descriptors: &[&[u8]]) -> Self {
         let streams = Streams { client: false, server: false };
-        let mut meters = Self { methods: vec![Method::new("unknown".to_owned(), streams)], by_path: HashMap::new() };
+        let mut all = Self { methods: vec![Method::new("unknown".to_owned(), streams)], by_path: HashMap::new() };
         for set in descriptors {
             let set = FileDescriptorSet::decode(*set).expect(super::BUILT_IN);
             for file in &set.file {
@@ -102,26 +102,26 @@ impl Meters {
                     for method in &service.method {
                         let path = format!("{}.{}/{}", file.package(), service.name(), method.name());
                         let streams = Streams { client: method.client_streaming(), server: method.server_streaming() };
-                        meters.by_path.insert(format!("/{path}"), meters.methods.len());
-                        meters.methods.push(Method::new(path, streams));
+                        all.by_path.insert(format!("/{path}"), all.methods.len());
+                        all.methods.push(Method::new(path, streams));
                     }
                 }
             }
         }
-        meters
+        all
     }
 
-    /// The number of the method called at `path`, as `/package.Service/Method`; 0 is none that is known.
+    /// The number of the method at `path` (`/package.Service/Method`), 0 if there is none.
     pub(super) fn find(&self, path: &str) -> usize {
         self.by_path.get(path).copied().unwrap_or(0)
     }
 
-    pub(super) fn method(&self, number: usize) -> &Method {
+    pub(super) fn get(&self, number: usize) -> &Method {
         &self.methods[number]
     }
 }
 
-/// The code as gRPC middlewares write it in labels.
+/// The code in the spelling that gRPC middlewares use in labels.
 pub(super) fn code_name(code: Code) -> &'static str {
     match code {
         Code::Ok => "OK",
@@ -144,17 +144,17 @@ pub(super) fn code_name(code: Code) -> &'static str {
     }
 }
 
-/// Counts the messages that begin in the pieces of a body: each has a head of 5 bytes, the last 4 its length.
+/// Counts the messages in a body. Each message has a header of 5 bytes, of which the last 4 are its length.
 #[derive(Debug, Default)]
-pub(super) struct Frames {
-    /// Bytes of the message that are still to come.
+pub(super) struct MessageCounter {
+    /// Bytes missing from the current message.
     rest: u64,
-    /// Bytes of the next head that have come, and its length so far.
+    /// Number of header bytes received, and the part of the length in them.
     head: (u8, u32),
 }
 
-impl Frames {
-    /// How many messages' heads end in `piece`, which comes next.
+impl MessageCounter {
+    /// The number of message headers that end in `piece`, the next piece of the body.
     pub(super) fn count(&mut self, mut piece: &[u8]) -> u64 {
         let mut messages = 0;
         loop {
@@ -164,7 +164,7 @@ impl Frames {
             let Some((&byte, after)) = piece.split_first() else { return messages };
             piece = after;
             let (have, length) = self.head;
-            // The first byte tells whether the message is compressed.
+            // The first byte says whether the message is compressed.
             let length = if have == 0 { 0 } else { length << 8 | u32::from(byte) };
             self.head = (have + 1, length);
             if have == 4 {
@@ -180,7 +180,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn messages_are_counted_however_they_are_cut() {
+    fn messages_are_counted_for_any_split_of_the_body() {
         let mut body = Vec::new();
         for length in [0_u32, 3, 300, 0, 1] {
             body.push(0);
@@ -188,24 +188,24 @@ mod tests {
             body.extend(vec![0xff; length as usize]);
         }
         for size in 1..body.len() {
-            let mut frames = Frames::default();
-            assert_eq!(body.chunks(size).map(|piece| frames.count(piece)).sum::<u64>(), 5, "in pieces of {size}");
+            let mut counter = MessageCounter::default();
+            assert_eq!(body.chunks(size).map(|piece| counter.count(piece)).sum::<u64>(), 5, "in pieces of {size}");
         }
-        let mut frames = Frames::default();
-        assert_eq!(frames.count(&[0, 0xff, 0xff, 0xff, 0xff, 1, 2, 3]), 1);
-        assert_eq!(frames.rest, u64::from(u32::MAX) - 3);
+        let mut counter = MessageCounter::default();
+        assert_eq!(counter.count(&[0, 0xff, 0xff, 0xff, 0xff, 1, 2, 3]), 1);
+        assert_eq!(counter.rest, u64::from(u32::MAX) - 3);
     }
 
     #[test]
-    fn every_method_is_known_with_its_kind() {
-        let meters = Meters::new(&[crate::wire::DESCRIPTORS, tonic_health::pb::FILE_DESCRIPTOR_SET]);
-        let kind = |path| meters.method(meters.find(path)).streams.name();
+    fn methods_are_found_with_their_stream_kind() {
+        let methods = Methods::new(&[crate::wire::DESCRIPTORS, tonic_health::pb::FILE_DESCRIPTOR_SET]);
+        let kind = |path| methods.get(methods.find(path)).streams.name();
         assert_eq!(kind("/qedgix.v1.PolicyService/Act"), "unary");
         assert_eq!(kind("/qedgix.v1.PolicyService/ActStream"), "bidi_stream");
         assert_eq!(kind("/qedgix.v1.WorkerService/UploadSnapshot"), "client_stream");
         assert_eq!(kind("/grpc.health.v1.Health/Watch"), "server_stream");
         for path in ["/qedgix.v1.PolicyService/Fly", "/", "", "qedgix.v1.PolicyService/Act"] {
-            assert_eq!(meters.find(path), 0, "{path}");
+            assert_eq!(methods.find(path), 0, "{path}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Values of a tensor in JSON: an array, flat or nested as the shape is.
+//! The values of a tensor in JSON: an array, flat or nested like the shape.
 
 use std::fmt;
 
@@ -8,14 +8,14 @@ use serde::de::{DeserializeSeed, Deserializer, Error, SeqAccess, Visitor};
 use crate::api::convert::tensors::{Data, Datatype};
 use crate::invalid::Invalid;
 
-/// What an array holds, row by row.
+/// The values of an array in row-major order.
 #[derive(Debug, Default)]
 pub(super) struct Values {
     numbers: Vec<Number>,
-    texts: Vec<String>,
-    /// Length of the arrays at each depth.
+    strings: Vec<String>,
+    /// Length of the arrays at each depth, where known.
     sizes: Vec<Option<usize>>,
-    /// Arrays of one depth differ in length, or values in depth.
+    /// Whether arrays of one depth differ in length, or values in depth.
     ragged: bool,
     /// Depth of the values.
     depth: Option<usize>,
@@ -41,10 +41,10 @@ impl Number {
 }
 
 impl Values {
-    /// The values as tensor `name` of this datatype and shape has them. An unknown datatype is told by who knows them.
+    /// The values of tensor `name` in its datatype. An unknown datatype is rejected later.
     ///
     /// # Errors
-    /// Texts among numbers, numbers that do not fit the datatype, or nesting that is not the shape's.
+    /// [`Invalid`] for strings among numbers, numbers out of the range of the datatype, or nesting unlike the shape.
     pub(super) fn into_data(self, name: &str, datatype: &str, shape: &[i64]) -> Result<Data, Invalid> {
         let nested: Vec<i64> = self.sizes.iter().map(|size| size.unwrap_or(0) as i64).collect();
         if self.ragged || nested.len() > 1 && nested != shape {
@@ -52,24 +52,26 @@ impl Values {
             return Err(Invalid::new(format!("{name}.data"), found, format!("a flat array, or arrays of shape {shape:?}")));
         }
         let Some(datatype) = Datatype::parse(datatype) else { return Ok(Data::Raw(bytes::Bytes::new())) };
-        let texts = datatype == Datatype::Bytes;
-        if !(if texts { self.numbers.is_empty() } else { self.texts.is_empty() }) {
-            let (found, expected) = if texts { ("numbers", "texts") } else { ("texts", "numbers") };
-            return Err(Invalid::new(format!("{name}.data"), found, format!("{expected}, as its datatype says")));
+        let strings = datatype == Datatype::Bytes;
+        if !(if strings { self.numbers.is_empty() } else { self.strings.is_empty() }) {
+            let (found, expected) = if strings { ("numbers", "strings") } else { ("strings", "numbers") };
+            return Err(Invalid::new(format!("{name}.data"), found, format!("{expected}, because of its datatype")));
         }
         let numbers = self.numbers;
-        let unfit =
-            |i: usize| Invalid::new(format!("{name}.data[{i}]"), numbers[i].real(), format!("a whole number of {datatype}"));
-        let whole = numbers.iter().enumerate().map(|(i, number)| number.whole().ok_or_else(|| unfit(i)));
+        let out_of_range = |i: usize| {
+            Invalid::new(format!("{name}.data[{i}]"), numbers[i].real(), format!("a whole number in the range of {datatype}"))
+        };
+        let whole = numbers.iter().enumerate().map(|(i, number)| number.whole().ok_or_else(|| out_of_range(i)));
         Ok(match datatype {
             Datatype::Int64 => Data::Int64(whole.collect::<Result<_, _>>()?),
             Datatype::Int32 => {
-                let narrow = |(i, value): (usize, Result<i64, _>)| value.and_then(|v| i32::try_from(v).map_err(|_| unfit(i)));
+                let narrow =
+                    |(i, value): (usize, Result<i64, _>)| value.and_then(|v| i32::try_from(v).map_err(|_| out_of_range(i)));
                 Data::Int32(whole.enumerate().map(narrow).collect::<Result<_, _>>()?)
             }
             Datatype::Fp32 => Data::Fp32(numbers.iter().map(|number| number.real() as f32).collect()),
             Datatype::Fp64 => Data::Fp64(numbers.iter().map(|number| number.real()).collect()),
-            Datatype::Bytes => Data::Bytes(self.texts.into_iter().map(Into::into).collect()),
+            Datatype::Bytes => Data::Bytes(self.strings.into_iter().map(Into::into).collect()),
         })
     }
 }
@@ -82,7 +84,7 @@ impl<'de> Deserialize<'de> for Values {
     }
 }
 
-/// Reads what stands at one depth: an array, or below the first one a value.
+/// Reads an array, or below the outermost array a value.
 struct Level<'a> {
     values: &'a mut Values,
     depth: usize,
@@ -91,7 +93,7 @@ struct Level<'a> {
 impl Level<'_> {
     fn leaf<E: Error>(&mut self) -> Result<(), E> {
         if self.depth == 0 {
-            return Err(E::custom("a value, expected an array of values"));
+            return Err(E::custom("a value, expected an array"));
         }
         self.values.ragged |= *self.values.depth.get_or_insert(self.depth) != self.depth;
         Ok(())
@@ -116,7 +118,7 @@ impl<'de> Visitor<'de> for Level<'_> {
     type Value = ();
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("arrays of numbers or of texts")
+        f.write_str("an array of numbers or of strings")
     }
 
     fn visit_i64<E: Error>(self, value: i64) -> Result<(), E> {
@@ -133,7 +135,7 @@ impl<'de> Visitor<'de> for Level<'_> {
 
     fn visit_str<E: Error>(mut self, value: &str) -> Result<(), E> {
         self.leaf()?;
-        self.values.texts.push(value.to_owned());
+        self.values.strings.push(value.to_owned());
         Ok(())
     }
 
@@ -147,7 +149,7 @@ impl<'de> Visitor<'de> for Level<'_> {
             size += 1;
         }
         values.ragged |= *values.sizes[depth].get_or_insert(size) != size;
-        // Values stand in the innermost arrays.
+        // All values are in the innermost arrays.
         values.ragged |= values.depth.is_some_and(|at| at != values.sizes.len());
         Ok(())
     }

@@ -1,4 +1,4 @@
-//! Answers to requests for inference: JSON, and binary data after it where it was asked for.
+//! Responses to inference requests: JSON, followed by the binary data of the outputs for which the request selects it.
 
 use axum::http::{HeaderValue, header};
 use axum::response::{IntoResponse, Response};
@@ -8,9 +8,9 @@ use bytes::{BufMut, Bytes, BytesMut};
 use serde::Serialize;
 
 use super::HEADER_LENGTH;
-use super::body::Binary;
+use super::request::BinaryOutputs;
 use crate::api::convert::tensors::{Data, Tensor};
-use crate::api::oip::Reply;
+use crate::api::oip::InferResponse;
 use crate::service::Error;
 
 #[derive(Serialize)]
@@ -35,17 +35,17 @@ struct Output {
     datatype: String,
     shape: Vec<i64>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    parameters: Option<Size>,
+    parameters: Option<BinarySize>,
     #[serde(skip_serializing_if = "Option::is_none")]
     data: Option<Values>,
 }
 
 #[derive(Serialize)]
-struct Size {
+struct BinarySize {
     binary_data_size: usize,
 }
 
-/// What is not finite is null: JSON has no word for it.
+/// The values of a tensor. Numbers that are not finite become `null`, because JSON has none.
 #[derive(Serialize)]
 #[serde(untagged)]
 enum Values {
@@ -53,7 +53,7 @@ enum Values {
     Int64(Vec<i64>),
     Fp32(Vec<f32>),
     Fp64(Vec<f64>),
-    /// In base64: they are no text.
+    /// In base64, because the bytes need not be UTF-8.
     Bytes(Vec<String>),
 }
 
@@ -71,17 +71,17 @@ impl From<Data> for Values {
     }
 }
 
-/// The answer, with `binary` outputs after the JSON.
-pub(super) fn response(reply: Reply, binary: &Binary) -> Response {
-    let Reply { model, version, id, step, digest, outputs } = reply;
-    let mut after = Vec::new();
+/// Encodes a response.
+pub(super) fn encode(response: InferResponse, binary: &BinaryOutputs) -> Response {
+    let InferResponse { model, version, id, step, digest, outputs } = response;
+    let mut binary_data = Vec::new();
     let outputs = outputs.into_iter().enumerate().map(|(i, Tensor { name, datatype, shape, data })| {
-        if !binary.asked.get(i).copied().unwrap_or(binary.default) {
+        if !binary.requested.get(i).copied().unwrap_or(binary.default) {
             return Output { name, datatype, shape, parameters: None, data: Some(data.into()) };
         }
         let raw = data.into_raw();
-        let parameters = Some(Size { binary_data_size: raw.len() });
-        after.push(raw);
+        let parameters = Some(BinarySize { binary_data_size: raw.len() });
+        binary_data.push(raw);
         Output { name, datatype, shape, parameters, data: None }
     });
     let outputs = outputs.collect();
@@ -91,12 +91,12 @@ pub(super) fn response(reply: Reply, binary: &Binary) -> Response {
         Ok(json) => json,
         Err(error) => return Error::internal(error).into_response(),
     };
-    if after.is_empty() {
+    if binary_data.is_empty() {
         return ([(header::CONTENT_TYPE, HeaderValue::from_static("application/json"))], json).into_response();
     }
-    let mut body = BytesMut::with_capacity(json.len() + after.iter().map(Bytes::len).sum::<usize>());
+    let mut body = BytesMut::with_capacity(json.len() + binary_data.iter().map(Bytes::len).sum::<usize>());
     body.put_slice(&json);
-    after.into_iter().for_each(|raw| body.put(raw));
+    binary_data.into_iter().for_each(|raw| body.put(raw));
     let kind = HeaderValue::from_static("application/octet-stream");
     ([(header::CONTENT_TYPE, kind), (HEADER_LENGTH, json.len().into())], body.freeze()).into_response()
 }

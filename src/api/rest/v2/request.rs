@@ -1,5 +1,4 @@
-//! The body of a request for inference: JSON, then the binary data of the tensors that have a `binary_data_size`, in their
-//! order.
+//! Inference requests: JSON, followed by the binary data of the inputs that have a `binary_data_size`, in their order.
 
 use axum::http::{HeaderMap, header};
 use bytes::Bytes;
@@ -7,9 +6,9 @@ use serde::Deserialize;
 use serde_json::{Map, Value};
 
 use super::HEADER_LENGTH;
-use super::data::Values;
+use super::values::Values;
 use crate::api::convert::tensors::{Data, Tensor};
-use crate::api::oip::{Call, Parameter, check_tensor_parameters};
+use crate::api::oip::{InferRequest, Parameter, check_tensor_parameters};
 use crate::api::rest::extract::parse;
 use crate::invalid::Invalid;
 use crate::service::Error;
@@ -45,52 +44,58 @@ struct Output {
     parameters: Map<String, Value>,
 }
 
-/// Which outputs are answered in binary.
+/// The outputs that the response has as binary data.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) struct Binary {
-    /// Of those asked for, in their order.
-    pub(super) asked: Vec<bool>,
-    /// Of all, where none was asked for.
+pub(super) struct BinaryOutputs {
+    /// For each requested output.
+    pub(super) requested: Vec<bool>,
+    /// For all outputs, if none is requested.
     pub(super) default: bool,
 }
 
-/// Reads a body.
+/// Decodes a request.
 ///
 /// # Errors
-/// It is no request, or its parts do not fit together.
-pub(super) fn read(headers: &HeaderMap, mut body: Bytes, model: String, version: String) -> Result<(Call, Binary), Error> {
+/// [`Error::Invalid`] if the body does not match its schema, or if its JSON and its binary data do not agree.
+pub(super) fn decode(
+    headers: &HeaderMap,
+    mut body: Bytes,
+    model: String,
+    version: String,
+) -> Result<(InferRequest, BinaryOutputs), Error> {
     if let Some(encoding) = headers.get(header::CONTENT_ENCODING).filter(|encoding| *encoding != "identity") {
         return Err(Invalid::new("Content-Encoding", format!("{encoding:?}"), "identity").into());
     }
-    let json = body.split_to(json_length(headers, body.len())?);
-    let sent: Body = parse(&json)?;
-    let mut parameters = sent.parameters;
+    let text = body.split_to(json_length(headers, body.len())?);
+    let json: Body = parse(&text)?;
+    let mut parameters = json.parameters;
     let default = flag("parameters.binary_data_output", parameters.remove("binary_data_output"))?.unwrap_or(false);
-    let mut outputs = Vec::with_capacity(sent.outputs.len());
-    let mut asked = Vec::with_capacity(sent.outputs.len());
-    for (i, mut output) in sent.outputs.into_iter().enumerate() {
+    let mut outputs = Vec::with_capacity(json.outputs.len());
+    let mut requested = Vec::with_capacity(json.outputs.len());
+    for (i, mut output) in json.outputs.into_iter().enumerate() {
         check_tensor_parameters(&format!("outputs[{i}]"), output.parameters.keys())?;
         let binary = output.parameters.remove("binary_data");
-        asked.push(flag(&format!("outputs[{i}].parameters.binary_data"), binary)?.unwrap_or(default));
+        requested.push(flag(&format!("outputs[{i}].parameters.binary_data"), binary)?.unwrap_or(default));
         outputs.push(output.name);
     }
-    let mut inputs = Vec::with_capacity(sent.inputs.len());
-    for (i, input) in sent.inputs.into_iter().enumerate() {
+    let mut inputs = Vec::with_capacity(json.inputs.len());
+    for (i, input) in json.inputs.into_iter().enumerate() {
         inputs.push(tensor(i, input, &mut body)?);
     }
     if !body.is_empty() {
-        let expected = "nothing after the binary data that the inputs announce";
-        return Err(Invalid::new("body", format!("{} bytes more", body.len()), expected).into());
+        let expected = "no bytes after the binary data of the inputs";
+        return Err(Invalid::new("body", format!("{} further bytes", body.len()), expected).into());
     }
     let parameters = parameters.into_iter().map(parameter).collect::<Result<_, _>>()?;
-    Ok((Call { model, version, id: sent.id, parameters, inputs, outputs }, Binary { asked, default }))
+    let request = InferRequest { model, version, id: json.id, parameters, inputs, outputs };
+    Ok((request, BinaryOutputs { requested, default }))
 }
 
-/// How much of a body of `size` bytes is JSON.
+/// The length of the JSON in a body of `size` bytes.
 fn json_length(headers: &HeaderMap, size: usize) -> Result<usize, Invalid> {
     let Some(value) = headers.get(HEADER_LENGTH) else { return Ok(size) };
     let length = value.to_str().ok().and_then(|text| text.parse().ok()).filter(|&length: &usize| length <= size);
-    let expected = || format!("a whole number, at most {size}, the bytes of the body");
+    let expected = || format!("a whole number, at most {size}, the length of the body");
     length.ok_or_else(|| Invalid::new("Inference-Header-Content-Length", format!("{value:?}"), expected()))
 }
 
@@ -103,7 +108,7 @@ fn flag(field: &str, value: Option<Value>) -> Result<Option<bool>, Invalid> {
 }
 
 fn parameter((name, value): (String, Value)) -> Result<(String, Parameter), Invalid> {
-    let read = match &value {
+    let parsed = match &value {
         Value::Bool(flag) => Some(Parameter::Bool(*flag)),
         Value::String(text) => Some(Parameter::Text(text.clone())),
         Value::Number(number) => {
@@ -112,30 +117,30 @@ fn parameter((name, value): (String, Value)) -> Result<(String, Parameter), Inva
         }
         _ => None,
     };
-    let expected = "true, false, a number or a text";
-    let read = read.ok_or_else(|| Invalid::schema(format!("parameters.{name}"), value, expected))?;
-    Ok((name, read))
+    let expected = "true, false, a number or a string";
+    let parsed = parsed.ok_or_else(|| Invalid::schema(format!("parameters.{name}"), value, expected))?;
+    Ok((name, parsed))
 }
 
-/// The tensor of an input, whose binary data is taken from the front of `rest`.
+/// The tensor of an input. Its binary data, if any, is split off the front of `rest`.
 fn tensor(i: usize, input: Input, rest: &mut Bytes) -> Result<Tensor, Invalid> {
     let Input { name, shape, datatype, mut parameters, data } = input;
     check_tensor_parameters(&format!("inputs[{i}]"), parameters.keys())?;
     let data = match (parameters.remove("binary_data_size"), data) {
         (None, Some(values)) => values.into_data(&name, &datatype, &shape)?,
         (None, None) => {
-            let expected = "its values as data, or their binary_data_size";
-            return Err(Invalid::schema(format!("inputs[{i}].data"), "nothing", expected));
+            let expected = "the values, or a binary_data_size";
+            return Err(Invalid::missing_field(format!("inputs[{i}].data"), expected));
         }
         (Some(size), None) => {
             let fits = size.as_u64().and_then(|size| usize::try_from(size).ok()).filter(|&size| size <= rest.len());
-            let expected = || format!("a whole number, at most {}, the bytes that are left", rest.len());
+            let expected = || format!("a whole number, at most {}, the remaining bytes", rest.len());
             let field = || format!("inputs[{i}].parameters.binary_data_size");
             let size = fits.ok_or_else(|| Invalid::new(field(), &size, expected()))?;
             Data::Raw(rest.split_to(size))
         }
         (Some(_), Some(_)) => {
-            let expected = "nothing beside a binary_data_size";
+            let expected = "no value, because binary_data_size is set";
             return Err(Invalid::schema(format!("inputs[{i}].data"), "values", expected));
         }
     };

@@ -1,0 +1,141 @@
+//! The outermost middleware of gRPC. It applies the caller's deadline, assigns the request id, opens the span, catches
+//! panics, gives every error status a code of the product, and logs and counts the call.
+//!
+//! A call ends when its last byte is sent, with the status in its trailers, or as cancelled if the client leaves before.
+
+use std::convert::Infallible;
+use std::error::Error as _;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Instant;
+
+use axum::http::{Request, Response};
+use pin_project_lite::pin_project;
+use tokio::time::Sleep;
+use tokio_util::sync::CancellationToken;
+use tonic::Status;
+use tonic::body::Body;
+use tower::Service;
+
+use super::call::{Call, CallContext, RequestBody, ResponseBody, with_code};
+use super::deadline::{Deadline, read_deadline};
+use super::metrics::Methods;
+use crate::api::observe::{LogLimiter, REQUEST_ID, RequestIds, span};
+use crate::service::Error;
+
+/// Services with this middleware.
+#[derive(Clone)]
+pub struct Middleware<S> {
+    inner: S,
+    context: Arc<CallContext>,
+}
+
+impl<S> Middleware<S> {
+    /// Wraps services whose methods are in `descriptors`. Streams from clients end when `closing` is cancelled.
+    pub(super) fn new(inner: S, descriptors: &[&[u8]], closing: CancellationToken) -> Self {
+        let (methods, ids, log_limiter) = (Methods::new(descriptors), RequestIds::new(), LogLimiter::new());
+        Self { inner, context: Arc::new(CallContext { methods, ids, log_limiter, closing }) }
+    }
+}
+
+impl<S> Service<Request<Body>> for Middleware<S>
+where
+    S: Service<Request<Body>, Response = Response<Body>, Error = Infallible>,
+{
+    type Response = Response<ResponseBody>;
+    type Error = Infallible;
+    type Future = ResponseFuture<S::Future>;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Infallible>> {
+        self.inner.poll_ready(context)
+    }
+
+    fn call(&mut self, request: Request<Body>) -> Self::Future {
+        let mut request = read_deadline(request);
+        let deadline = request.extensions().get::<Deadline>().map(|deadline| deadline.0);
+        let number = self.context.methods.find(request.uri().path());
+        let method = self.context.methods.get(number);
+        let id = self.context.ids.for_request(request.headers());
+        let span = span(&method.path, method.quiet, &id, request.headers());
+        let call = Call::begin(self.context.clone(), number, id, span);
+        method.handles().started.increment(1);
+        if method.streams.client {
+            request = request.map(|body| Body::new(RequestBody::new(body, self.context.clone(), number)));
+        } else {
+            method.handles().received.increment(1);
+        }
+        let work = call.span().in_scope(|| self.inner.call(request));
+        ResponseFuture { work, deadline, sleep: None, call: Some(call) }
+    }
+}
+
+pin_project! {
+    /// The head of the response to a call, or the error if the deadline passes first.
+    pub struct ResponseFuture<F> {
+        #[pin]
+        work: F,
+        deadline: Option<Instant>,
+        #[pin]
+        sleep: Option<Sleep>,
+        // Moved to the body of the response.
+        call: Option<Call>,
+    }
+}
+
+impl<F> Future for ResponseFuture<F>
+where
+    F: Future<Output = Result<Response<Body>, Infallible>>,
+{
+    type Output = Result<Response<ResponseBody>, Infallible>;
+
+    fn poll(self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Self::Output> {
+        let mut this = self.project();
+        let Some(call) = this.call else { return Poll::Pending };
+        // No work starts after the deadline.
+        if this.deadline.is_some_and(|deadline| deadline <= Instant::now()) {
+            return Poll::Ready(Ok(respond(deadline_exceeded(), this.call)));
+        }
+        let inside = call.span().enter();
+        let polled = catch_unwind(AssertUnwindSafe(|| this.work.poll(context)));
+        drop(inside);
+        let response = match polled {
+            Ok(Poll::Ready(Ok(response))) => response,
+            Ok(Poll::Pending) => {
+                let Some(deadline) = *this.deadline else { return Poll::Pending };
+                if this.sleep.is_none() {
+                    this.sleep.set(Some(tokio::time::sleep_until(deadline.into())));
+                }
+                match this.sleep.as_mut().as_pin_mut().map(|sleep| sleep.poll(context)) {
+                    Some(Poll::Ready(())) => deadline_exceeded(),
+                    _ => return Poll::Pending,
+                }
+            }
+            Err(_) => Status::from(Error::internal("a handler panicked")).into_http(),
+        };
+        Poll::Ready(Ok(respond(response, this.call)))
+    }
+}
+
+fn deadline_exceeded() -> Response<Body> {
+    Status::from(Error::Deadline("before the response was ready")).into_http()
+}
+
+/// The response as it is sent. A response that is only a status ends the call; any other ends it with its last byte.
+fn respond(response: Response<Body>, call: &mut Option<Call>) -> Response<ResponseBody> {
+    let mut call = call.take().expect("a future that is ready is not polled again");
+    // tonic reports an unknown method in the headers only.
+    let in_headers = || Status::from_header_map(response.headers());
+    let status = response.extensions().get::<Status>().cloned().or_else(in_headers);
+    let replaced = status.as_ref().and_then(with_code);
+    if let Some(status) = replaced.as_ref().or(status.as_ref()) {
+        match status.source() {
+            Some(cause) => call.end(status.code(), &cause),
+            None => call.end(status.code(), &status.message()),
+        }
+    }
+    let mut response = replaced.map(Status::into_http).unwrap_or(response);
+    response.headers_mut().insert(REQUEST_ID, call.id().header());
+    response.map(|body| ResponseBody::new(body, call))
+}
