@@ -142,7 +142,7 @@ async fn a_rotation_that_fails_leaves_no_new_key() {
     let mut other = <sqlx::SqliteConnection as sqlx::Connection>::connect(&database).await.unwrap();
     let full = "CREATE TRIGGER full BEFORE UPDATE OF expires_at ON api_keys BEGIN SELECT RAISE(ABORT, 'disk full'); END";
     sqlx::query(full).execute(&mut other).await.unwrap();
-    assert_eq!(keys::rotate(store, &old.key, Duration::ZERO, now).await.err().unwrap().code(), "internal");
+    assert_eq!(keys::rotate(store, &old.key, Duration::ZERO, now).await.err().unwrap().code(), ErrorCode::Internal);
     let list = keys::list(store, now).await.unwrap();
     assert_eq!(list.iter().map(|key| (&key.id, key.state)).collect::<Vec<_>>(), [(&old.info.id, "active")]);
     // A key that was revoked after it was read is not replaced either.
