@@ -13,12 +13,12 @@
 //! | [`experiment`] | many runs and what they say together |
 //! | [`learner`] | replay, rollout, update, training, evaluation |
 //! | [`checkpoint`] | parameters to and from safetensors |
-//! | [`recipe`] | what a training run is made of: algorithm, preset, resolved configuration |
+//! | [`train_config`] | what a training run is made of: algorithm, preset, resolved configuration |
 //! | [`policy`] | observations, agents, mixers, baselines |
-//! | [`figure`] | data to SVG |
+//! | [`plot`] | numbers to SVG |
 //! | [`nn`], [`env`] | mathematics; physics |
 //! | [`clock`], [`draining`] | wall and monotonic time; the flag of shutdown |
-//! | [`invalid`], [`error_code`], [`rng`] | errors of input; codes of errors; random streams |
+//! | [`invalid`], [`error_code`], [`rng`], [`files`] | errors of input; codes of errors; random streams; atomic writes of files |
 //!
 //! Read `env`, then `policy`, then `learner`; then `service` and what it calls.
 
@@ -31,17 +31,18 @@ pub mod draining;
 pub mod env;
 pub mod error_code;
 pub mod experiment;
-pub mod figure;
+pub mod files;
 pub mod invalid;
 pub mod jobs;
 pub mod learner;
 pub mod nn;
+pub mod plot;
 pub mod policy;
-pub mod recipe;
 pub mod rng;
 pub mod server;
 pub mod service;
 pub mod serving;
 pub mod store;
 pub mod telemetry;
+pub mod train_config;
 pub mod wire;

@@ -10,7 +10,6 @@ mod tls;
 
 use std::fs::{File, TryLockError};
 use std::future::Future;
-use std::io::Write;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -31,6 +30,7 @@ use crate::api::{grpc, rest};
 use crate::clock::Clock;
 use crate::config::Config;
 use crate::draining::Draining;
+use crate::files;
 use crate::invalid::Invalid;
 use crate::jobs::{LocalProcess, Scheduler, SchedulerConfig};
 use crate::service::keys::{Keyring, Rate};
@@ -164,15 +164,9 @@ impl DataDir {
 
     /// Writes `endpoints.json` atomically.
     fn write_endpoints(&self, endpoints: Endpoints) -> Result<(), Error> {
-        let (path, part) = (self.path.join(ENDPOINTS), self.path.join(".endpoints.json.part"));
+        let path = self.path.join(ENDPOINTS);
         let text = serde_json::to_string(&endpoints).expect("addresses are plain data") + "\n";
-        let write = || {
-            let mut file = File::create(&part)?;
-            file.write_all(text.as_bytes())?;
-            file.sync_all()?;
-            std::fs::rename(&part, &path)
-        };
-        write().map_err(|cause| Error::File { path, cause })
+        files::write_atomic(&path, text.as_bytes()).map_err(|cause| Error::File { path, cause })
     }
 
     fn remove_endpoints(&self) {

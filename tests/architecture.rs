@@ -10,18 +10,19 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("invalid", &[]),
     ("error_code", &[]),
     ("rng", &[]),
+    ("files", &[]),
     ("wire", &[]),
     ("nn", &["invalid", "rng"]),
     ("env", &["invalid", "rng"]),
-    ("figure", &["env", "invalid"]),
+    ("plot", &["env", "invalid"]),
     ("policy", &["env", "nn", "invalid", "rng"]),
-    ("recipe", &["policy", "env", "invalid"]),
-    ("checkpoint", &["recipe", "policy", "env", "nn", "invalid"]),
-    ("learner", &["checkpoint", "recipe", "policy", "env", "nn", "invalid", "rng"]),
-    ("experiment", &["learner", "checkpoint", "recipe", "figure", "policy", "env", "invalid", "rng"]),
-    ("store", &["recipe", "invalid"]),
-    ("jobs", &["clock", "draining", "store", "checkpoint", "recipe", "learner", "policy", "env", "invalid", "rng", "wire"]),
-    ("serving", &["clock", "checkpoint", "recipe", "learner", "policy", "env", "invalid", "error_code", "rng"]),
+    ("train_config", &["policy", "env", "invalid"]),
+    ("checkpoint", &["train_config", "policy", "env", "nn", "invalid"]),
+    ("learner", &["checkpoint", "train_config", "policy", "env", "nn", "invalid", "rng"]),
+    ("experiment", &["learner", "checkpoint", "train_config", "plot", "policy", "env", "invalid", "rng"]),
+    ("store", &["train_config", "invalid"]),
+    ("jobs", &["clock", "draining", "store", "checkpoint", "train_config", "learner", "policy", "env", "invalid", "rng", "wire"]),
+    ("serving", &["clock", "checkpoint", "train_config", "learner", "policy", "env", "invalid", "error_code", "rng"]),
     (
         "service",
         &[
@@ -31,7 +32,7 @@ const LAYERS: &[(&str, &[&str])] = &[
             "serving",
             "store",
             "checkpoint",
-            "recipe",
+            "train_config",
             "learner",
             "policy",
             "env",
@@ -50,7 +51,7 @@ const LAYERS: &[(&str, &[&str])] = &[
             "serving",
             "store",
             "checkpoint",
-            "recipe",
+            "train_config",
             "learner",
             "policy",
             "env",
@@ -61,7 +62,10 @@ const LAYERS: &[(&str, &[&str])] = &[
     ),
     ("telemetry", &[]),
     ("config", &["service", "jobs", "serving", "invalid"]),
-    ("server", &["clock", "draining", "api", "service", "jobs", "serving", "store", "config", "telemetry", "wire", "invalid"]),
+    (
+        "server",
+        &["clock", "draining", "api", "service", "jobs", "serving", "store", "config", "telemetry", "wire", "invalid", "files"],
+    ),
     (
         "cli",
         &[
@@ -74,15 +78,16 @@ const LAYERS: &[(&str, &[&str])] = &[
             "serving",
             "experiment",
             "checkpoint",
-            "recipe",
+            "train_config",
             "learner",
-            "figure",
+            "plot",
             "policy",
             "env",
             "nn",
             "invalid",
             "error_code",
             "rng",
+            "files",
             "wire",
         ],
     ),
@@ -91,7 +96,7 @@ const LAYERS: &[(&str, &[&str])] = &[
 /// What the pure layers never touch.
 const IMPURE: &[&str] =
     &["tokio", "tonic", "axum", "sqlx", "std::fs", "std::net", "std::process", "std::time", "SystemTime", "rand::rng("];
-const PURE: &[&str] = &["invalid", "error_code", "rng", "nn", "env", "policy", "learner", "checkpoint", "figure", "experiment"];
+const PURE: &[&str] = &["invalid", "error_code", "rng", "nn", "env", "policy", "learner", "checkpoint", "plot", "experiment"];
 
 fn sources(dir: &Path) -> Vec<PathBuf> {
     let mut found = Vec::new();

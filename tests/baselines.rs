@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use qedgix::env::{EnvConfig, EpisodeMetrics, Point};
-use qedgix::learner::{difference, evaluate, layouts};
+use qedgix::learner::{difference, evaluate, layout_list};
 use qedgix::policy::baselines::{self, EnvParams, LIST};
 use qedgix::policy::{FleetStep, Policy, RequiredInput, Slot};
 
@@ -12,7 +12,7 @@ fn policy(name: &str) -> Arc<dyn Policy> {
 }
 
 fn flown(name: &str, env: &EnvConfig, episodes: usize) -> Vec<EpisodeMetrics> {
-    evaluate(&*policy(name), env, &layouts("eval-v1").unwrap().seeds(episodes), 1).unwrap()
+    evaluate(&*policy(name), env, &layout_list("eval-v1").unwrap().seeds(episodes), 1).unwrap()
 }
 
 fn mean(episodes: &[EpisodeMetrics]) -> f64 {
@@ -101,7 +101,7 @@ fn tours_of_large_fleets_are_planned_too() {
 #[test]
 fn the_same_seeds_fly_the_same_episodes_on_any_number_of_threads() {
     let env = EnvConfig { user_speed: 0.01, ..EnvConfig::default() };
-    let seeds = layouts("valid-v1").unwrap().seeds(20);
+    let seeds = layout_list("valid-v1").unwrap().seeds(20);
     for b in LIST {
         let one = evaluate(&*policy(b.name), &env, &seeds, 1).unwrap();
         assert_eq!(one, evaluate(&*policy(b.name), &env, &seeds, 3).unwrap(), "{}", b.name);

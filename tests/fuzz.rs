@@ -18,10 +18,10 @@ use qedgix::checkpoint::{Checkpoint, layout};
 use qedgix::clock::Clock;
 use qedgix::config::Config;
 use qedgix::policy::{FleetStep, Policy, Slot};
-use qedgix::recipe::{Algorithm, Preset, TrainConfig};
 use qedgix::server::{self, DataDir};
 use qedgix::service::App;
 use qedgix::telemetry;
+use qedgix::train_config::{Algorithm, Preset, TrainConfig};
 use qedgix::wire::{oip, v1};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
@@ -273,15 +273,15 @@ impl Subject {
         let health = grpc::Health::new(app.draining.clone(), CancellationToken::new());
         let services = grpc::services(&app, &health, LARGEST, CancellationToken::new());
         let grpc = ServiceBuilder::new().map_response(|r: Response<_>| r.map(Body::new)).service(services);
-        let mut recipe = TrainConfig::preset(Algorithm::Vdn, Preset::Practical);
-        recipe.environment.reward_scale = Some(1.0);
-        let weights = (0..layout(&recipe).len()).map(|i| (i % 7) as f32 * 0.01).collect();
+        let mut config = TrainConfig::preset(Algorithm::Vdn, Preset::Practical);
+        config.environment.reward_scale = Some(1.0);
+        let weights = (0..layout(&config).len()).map(|i| (i % 7) as f32 * 0.01).collect();
         let points = |n: usize| (0..n).map(|i| [0.1 * i as f64, 0.2]).collect::<Vec<_>>();
         Self {
             rest: rest::router(app.clone(), telemetry::render_metrics, LARGEST),
             grpc: BoxCloneSyncService::new(grpc),
             app,
-            checkpoint: Checkpoint::new(recipe, 1, None, weights).unwrap().to_bytes(),
+            checkpoint: Checkpoint::new(config, 1, None, weights).unwrap().to_bytes(),
             slot: Slot::from_scene(&points(3), &points(5), &[1.0; 5], 0.28),
         }
     }

@@ -10,7 +10,7 @@ use std::process::ExitCode;
 use std::str::FromStr;
 
 use qedgix::learner::Episodes;
-use qedgix::learner::objective::{Objective, Returns, Trace};
+use qedgix::learner::loss::{Loss, TdLambda, Trace};
 use qedgix::nn::Adam;
 use qedgix::policy::mixer::MixerKind;
 use qedgix::policy::{
@@ -65,7 +65,7 @@ struct Config {
     agent: AgentConfig,
     dims: Dims,
     mixing: MixerKind,
-    returns: Returns,
+    td_lambda: TdLambda,
     batch: usize,
     learning_rate: f64,
     clip: f64,
@@ -134,7 +134,7 @@ impl Config {
                 "vdn" => MixerKind::Vdn,
                 _ => return unknown("mixer"),
             },
-            returns: Returns { gamma: real("gamma")?, lambda: real("td_lambda")? },
+            td_lambda: TdLambda { gamma: real("gamma")?, lambda: real("td_lambda")? },
             batch: count("batch")?,
             learning_rate: real("lr")?,
             clip: real("clip")?,
@@ -224,9 +224,9 @@ fn check(file: &Path) -> Outcome<String> {
     };
     check_features(&config, &episodes, &mut tensors, &mut report)?;
 
-    let Config { agent, dims, mixing, returns, .. } = config;
-    let mut objective = Objective::<f32>::new(agent, dims, mixing, returns, 1);
-    let layout = objective.layout().clone();
+    let Config { agent, dims, mixing, td_lambda, .. } = config;
+    let mut loss = Loss::<f32>::new(agent, dims, mixing, td_lambda, 1);
+    let layout = loss.layout().clone();
     let mut flat = |prefix: &str| -> Outcome<Vec<f32>> {
         let mut values = Vec::with_capacity(layout.len());
         for p in layout.parameters() {
@@ -237,20 +237,20 @@ fn check(file: &Path) -> Outcome<String> {
     let (mut online, target, grads, after) = (flat("")?, flat("target_")?, flat("grad.")?, flat("after.")?);
 
     let mut trace = Trace::default();
-    let figures = objective.evaluate(&online, &target, &episodes, Some(&mut trace));
+    let metrics = loss.evaluate(&online, &target, &episodes, Some(&mut trace));
     for (name, ours, shape) in [
         ("out.q", &trace.q[..], &[b, k + 1, m, actions][..]),
         ("out.q_tot", &trace.q_tot, &[b, k]),
         ("out.target", &trace.target, &[b, k]),
-        ("out.loss", &[figures.loss as f32], &[1]),
-        ("out.grad_norm", &[figures.grad_norm as f32], &[1]),
+        ("out.loss", &[metrics.loss as f32], &[1]),
+        ("out.grad_norm", &[metrics.grad_norm as f32], &[1]),
     ] {
         report.compare(name, ours, &tensors.f32(name, shape)?, EXACT);
     }
-    Adam::new(online.len()).step(&mut online, objective.gradient(), config.learning_rate, (figures.grad_norm, config.clip));
+    Adam::new(online.len()).step(&mut online, loss.gradient(), config.learning_rate, (metrics.grad_norm, config.clip));
     for p in layout.parameters() {
         let range = p.range.clone();
-        report.compare(&format!("grad.{}", p.name), &objective.gradient()[range.clone()], &grads[range.clone()], EXACT);
+        report.compare(&format!("grad.{}", p.name), &loss.gradient()[range.clone()], &grads[range.clone()], EXACT);
         report.compare(&format!("after.{}", p.name), &online[range.clone()], &after[range], AFTER);
     }
 

@@ -2,7 +2,7 @@
 
 mod sample;
 
-use qedgix::learner::objective::{Objective, Returns};
+use qedgix::learner::loss::{Loss, TdLambda};
 use qedgix::nn::{
     Batch, Graph, GraphLayer, Gru, HIDDEN, LayerCache, LayerScratch, Linear, Mlp, MlpCache, ParameterLayout, Weights,
 };
@@ -246,15 +246,15 @@ fn whole_loss() {
     ];
     for (name, agent, mixing) in cases {
         let dims = Dims { uavs: 3, users: 4, actions: 9, detection_range: 0.28, slots: 3 };
-        let returns = Returns { gamma: 0.95, lambda: 0.6 };
-        let mut objective = Objective::<f64>::new(agent, dims, mixing, returns, 1);
-        let layout = objective.layout().clone();
+        let td_lambda = TdLambda { gamma: 0.95, lambda: 0.6 };
+        let mut loss = Loss::<f64>::new(agent, dims, mixing, td_lambda, 1);
+        let layout = loss.layout().clone();
         let online: Vec<f64> = layout.initialise(&mut rng::stream(1, "online", 0));
         let target: Vec<f64> = layout.initialise(&mut rng::stream(1, "target", 0));
         let episodes = episodes(&dims, 2, 3);
-        objective.evaluate(&online, &target, &episodes, None);
-        let gradient = objective.gradient().to_vec();
+        loss.evaluate(&online, &target, &episodes, None);
+        let gradient = loss.gradient().to_vec();
         let ranges: Vec<_> = layout.parameters().iter().map(|p| (p.name.clone(), p.range.clone())).collect();
-        check(name, &ranges, &online, &gradient, |online| objective.evaluate(online, &target, &episodes, None).loss);
+        check(name, &ranges, &online, &gradient, |online| loss.evaluate(online, &target, &episodes, None).loss);
     }
 }

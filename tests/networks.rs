@@ -3,7 +3,7 @@
 mod sample;
 
 use qedgix::env::Point;
-use qedgix::learner::objective::{Objective, Returns, Trace};
+use qedgix::learner::loss::{Loss, TdLambda, Trace};
 use qedgix::learner::{Algorithm, Learner, Preset, TrainConfig};
 use qedgix::nn::{Batch, Graph, GraphLayer, HIDDEN, LayerCache, ParameterLayout, Rows, Weights};
 use qedgix::policy::mixer::{Mixer, MixerCache, MixerKind};
@@ -143,11 +143,11 @@ fn actor_policy_and_update_see_the_same_values() {
         let dims = Dims { slots: 6, ..DIMS };
         let (m, n, slots) = (dims.uavs, dims.users, dims.slots);
         let ep = episodes(&dims, 2, 8);
-        let returns = Returns { gamma: 0.99, lambda: 0.6 };
-        let mut objective = Objective::<f32>::new(config, dims, MixerKind::Vdn, returns, 1);
-        let params = parameters(objective.layout(), 3);
+        let td_lambda = TdLambda { gamma: 0.99, lambda: 0.6 };
+        let mut loss = Loss::<f32>::new(config, dims, MixerKind::Vdn, td_lambda, 1);
+        let params = parameters(loss.layout(), 3);
         let mut trace = Trace::default();
-        objective.evaluate(&params, &params, &ep, Some(&mut trace));
+        loss.evaluate(&params, &params, &ep, Some(&mut trace));
 
         let agent = Agent::new(config, dims);
         let policy = LearnedPolicy::new(config, dims, params.clone()).expect("as many as the layout says");

@@ -8,7 +8,7 @@ use std::sync::atomic::Ordering;
 
 use qedgix::env::{BatchEnv, EnvConfig, EpisodeMetrics, Layout};
 use qedgix::learner::{
-    Algorithm, Event, Learner, Preset, Rollout, SnapshotError, Symmetry, TrainConfig, Trainer, evaluate, layouts,
+    Algorithm, Event, Learner, Preset, Rollout, SnapshotError, Symmetry, TrainConfig, Trainer, evaluate, layout_list,
 };
 
 /// A run of a few iterations that meets everything: updates, target copies, a full ring, evaluations.
@@ -59,7 +59,7 @@ fn events_come_in_order_and_end() {
     assert!(trainer.finished() && trainer.next().is_none());
     assert_eq!(events.last(), Some(&Event::Finished { step: 1200 }));
     let evaluations: Vec<u64> =
-        events.iter().filter_map(|e| if let Event::Evaluation { step, .. } = e { Some(*step) } else { None }).collect();
+        events.iter().filter_map(|e| if let Event::Evaluation(e) = e { Some(e.step) } else { None }).collect();
     assert_eq!(evaluations, [0, 280, 520, 760, 1000, 1200], "after the iterations that reach 250, 500, ...");
     let iterations: Vec<_> = events.iter().filter_map(|e| if let Event::Iteration(i) = e { Some(*i) } else { None }).collect();
     assert_eq!(iterations.len(), 30);
@@ -82,14 +82,14 @@ fn the_best_weights_are_kept_and_fly_as_they_were_evaluated() {
     assert!(trainer.best().unwrap().is_none());
     let mut lowest = f64::INFINITY;
     for event in trainer.by_ref() {
-        if let Event::Evaluation { metrics, .. } = event {
-            lowest = lowest.min(metrics.mean_aoi);
+        if let Event::Evaluation(e) = event {
+            lowest = lowest.min(e.metrics.mean_aoi);
         }
     }
     let best = trainer.best().unwrap().unwrap();
     assert_eq!(best.metrics().unwrap().mean_aoi, lowest);
     assert_eq!(trainer.best_evaluation().unwrap().step, best.step());
-    let seeds = layouts("valid-v1").unwrap().seeds(6);
+    let seeds = layout_list("valid-v1").unwrap().seeds(6);
     let flown = evaluate(&best.policy(), &best.config().environment, &seeds, 1).unwrap();
     assert_eq!(EpisodeMetrics::mean(&flown), *best.metrics().unwrap());
     let last = trainer.checkpoint().unwrap();

@@ -1,59 +1,60 @@
-//! Why bytes are not a checkpoint that can be used.
+//! Errors of checkpoints.
 
+use super::format::{FORMAT, LARGEST, VERSION};
 use crate::invalid::Invalid;
 
-/// What is wrong with a checkpoint.
+/// Why bytes are not a usable checkpoint.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum Error {
-    /// Truncated, damaged, or something else altogether.
+    /// The bytes are truncated or damaged, or are not a safetensors file.
     #[error("not a safetensors file: {0}")]
     Container(String),
-    /// A safetensors file of another program.
-    #[error("not a checkpoint of this program: metadata `format` is {found:?}; expected {:?}", super::FORMAT)]
+    /// The safetensors file was not written by this program.
+    #[error("not a checkpoint of this program: metadata `format` is {found:?}; expected {:?}", FORMAT)]
     Format {
-        /// What the file says, if anything.
+        /// The value in the file, if any.
         found: Option<String>,
     },
-    /// A checkpoint of another version of the format.
-    #[error("checkpoint version {found:?} cannot be read; expected {:?}", super::VERSION)]
+    /// The checkpoint has another version of the format.
+    #[error("checkpoint version {found:?} cannot be read; expected {:?}", VERSION)]
     Version {
-        /// What the file says, if anything.
+        /// The value in the file, if any.
         found: Option<String>,
     },
-    /// A metadata entry that is missing or does not parse.
+    /// A metadata entry is missing or cannot be parsed.
     #[error("metadata `{field}`: {reason}")]
     Metadata {
-        /// Which entry.
+        /// Name of the entry.
         field: &'static str,
-        /// What is wrong with it.
+        /// The reason.
         reason: String,
     },
-    /// The configuration parses but cannot be.
+    /// The configuration is invalid.
     #[error("metadata `config`: {0}")]
     Config(#[from] Invalid),
-    /// A parameter that the configuration asks for.
+    /// A parameter of the configuration is missing.
     #[error("tensor `{name}` is missing")]
     Missing {
         /// Its name.
         name: String,
     },
-    /// A tensor that the configuration knows nothing of.
-    #[error("tensor `{name}` is no parameter of this configuration")]
+    /// A tensor is not a parameter of the configuration.
+    #[error("tensor `{name}` is not a parameter of this configuration")]
     Unexpected {
         /// Its name.
         name: String,
     },
-    /// A parameter of another size.
+    /// A parameter has another shape.
     #[error("tensor `{name}` has shape {found:?}; expected {expected:?}")]
     Shape {
         /// Its name.
         name: String,
         /// The shape in the file.
         found: Vec<usize>,
-        /// The shape that the configuration gives it.
+        /// The shape in the configuration.
         expected: Vec<usize>,
     },
-    /// A parameter of another type.
+    /// A parameter has another type.
     #[error("tensor `{name}` has type {found}; expected F32")]
     Type {
         /// Its name.
@@ -61,8 +62,8 @@ pub enum Error {
         /// The type in the file.
         found: String,
     },
-    /// A value that no training leaves behind.
-    #[error("tensor `{name}`: value {index} is {found}; expected a number from -{max} to {max}", max = super::LARGEST)]
+    /// A value is not finite or too large.
+    #[error("tensor `{name}`: value {index} is {found}; expected a number from -{max} to {max}", max = LARGEST)]
     Value {
         /// The tensor's name.
         name: String,

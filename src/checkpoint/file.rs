@@ -1,8 +1,8 @@
-//! The safetensors container: named f32 tensors and string metadata. Knows nothing of what they mean.
+//! The safetensors container: named f32 tensors and string metadata.
 //!
-//! Written here rather than by the crate, whose metadata has the order of a hash map: the same content must give the same
-//! bytes, because files are known by their digest. Read here, because files come from anywhere: a name that is there twice is
-//! an error, sums of offsets cannot overflow, and messages say which tensor is wrong.
+//! The `safetensors` crate is not used. It writes metadata in the order of a hash map, but the same content must give the same
+//! bytes, because files are identified by their digest. The reader here rejects duplicate names, checks offsets without overflow,
+//! and names the invalid tensor, because files come from untrusted sources.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -11,15 +11,16 @@ use serde::de::{Error as _, MapAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 use serde_json::{Map, Value, json};
 
-use super::Error;
+use super::error::Error;
+use super::format::LARGEST;
 
-/// Where a header keeps what is no tensor.
+/// The entry of the header that holds the metadata.
 const METADATA: &str = "__metadata__";
 
 /// A named f32 tensor, row-major.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tensor {
-    /// Name, as in the golden files: `agent.fc.weight`.
+    /// Name, as `agent.fc.weight`.
     pub name: String,
     /// Shape.
     pub shape: Vec<usize>,
@@ -27,11 +28,11 @@ pub struct Tensor {
     pub values: Vec<f32>,
 }
 
-/// The bytes of a file; the same for the same content, whatever the order of `tensors`.
+/// The bytes of a file. The order of `tensors` does not matter: the same content gives the same bytes.
 pub(super) fn write(metadata: &BTreeMap<&str, String>, tensors: &[Tensor]) -> Vec<u8> {
     let mut sorted: Vec<&Tensor> = tensors.iter().collect();
     sorted.sort_by(|a, b| a.name.cmp(&b.name));
-    // serde_json's map is ordered by key, whatever the names.
+    // The map of serde_json is ordered by key.
     let mut header = Map::new();
     header.insert(METADATA.into(), json!(metadata));
     let mut end = 0;
@@ -51,22 +52,22 @@ pub(super) fn write(metadata: &BTreeMap<&str, String>, tensors: &[Tensor]) -> Ve
     bytes
 }
 
-/// Most bytes of a header: a configuration with a place for each of the most UAVs and users there may be, several times over.
+/// Largest header in bytes: several times the largest configuration, which has a position for each UAV and user.
 const LARGEST_HEADER: u64 = 16 << 20;
 
-/// Metadata and tensors of a file, sorted by name. Only finite values of sensible size pass. What is read takes a small
-/// multiple of the bytes that are there, whatever they announce.
+/// Metadata and tensors of a file, sorted by name. Values that are not finite or too large are rejected. Memory is bounded by a
+/// small multiple of the length of `bytes`, whatever sizes the header states.
 pub(super) fn read(bytes: &[u8]) -> Result<(BTreeMap<String, String>, Vec<Tensor>), Error> {
     let container = |reason: String| Error::Container(reason);
-    let Some((announced, rest)) = bytes.split_first_chunk() else {
+    let Some((header_len, rest)) = bytes.split_first_chunk() else {
         return Err(container(format!("{} bytes, less than the length of a header", bytes.len())));
     };
-    let announced = u64::from_le_bytes(*announced);
-    if announced > LARGEST_HEADER {
-        return Err(container(format!("a header of {announced} bytes; at most {LARGEST_HEADER} are read")));
+    let header_len = u64::from_le_bytes(*header_len);
+    if header_len > LARGEST_HEADER {
+        return Err(container(format!("a header of {header_len} bytes; at most {LARGEST_HEADER} are read")));
     }
-    let Some((header, data)) = rest.split_at_checked(announced as usize) else {
-        return Err(container(format!("a header of {announced} bytes in a file of {}", bytes.len())));
+    let Some((header, data)) = rest.split_at_checked(header_len as usize) else {
+        return Err(container(format!("a header of {header_len} bytes in a file of {}", bytes.len())));
     };
     let header: Header = serde_json::from_slice(header).map_err(|e| container(format!("its header: {e}")))?;
     let mut entries: Vec<(String, Entry)> = header.tensors.into_iter().collect();
@@ -90,7 +91,7 @@ pub(super) fn read(bytes: &[u8]) -> Result<(BTreeMap<String, String>, Vec<Tensor
             return Err(container(format!("tensor `{name}` of shape {shape:?} has {} bytes", values.len())));
         }
         let values: Vec<f32> = values.chunks_exact(4).map(|x| f32::from_le_bytes([x[0], x[1], x[2], x[3]])).collect();
-        if let Some(index) = values.iter().position(|x| x.is_nan() || x.abs() > super::LARGEST) {
+        if let Some(index) = values.iter().position(|x| x.is_nan() || x.abs() > LARGEST) {
             return Err(Error::Value { name, index, found: values[index] });
         }
         end = to;
@@ -131,15 +132,15 @@ impl<'de> Deserialize<'de> for Header {
             fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Header, A::Error> {
                 let mut header = Header::default();
                 while let Some(name) = map.next_key::<String>()? {
-                    let again = if name == METADATA {
+                    let duplicate = if name == METADATA {
                         let before = std::mem::replace(&mut header.metadata, map.next_value()?);
                         !before.is_empty()
                     } else {
                         header.tensors.insert(name.clone(), map.next_value()?).is_some()
                     };
-                    // Whichever counted, somebody else would read another file.
-                    if again {
-                        return Err(A::Error::custom(format!("{name:?} is there twice")));
+                    // Other readers may use the other entry.
+                    if duplicate {
+                        return Err(A::Error::custom(format!("{name:?} occurs twice")));
                     }
                 }
                 Ok(header)

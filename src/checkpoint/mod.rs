@@ -7,6 +7,7 @@
 
 mod error;
 mod file;
+mod format;
 
 use std::collections::BTreeMap;
 
@@ -14,20 +15,14 @@ use sha2::{Digest, Sha256};
 
 pub use error::Error;
 pub use file::Tensor;
+pub use format::{FORMAT, LARGEST, VERSION};
 
 use crate::env::EpisodeMetrics;
 use crate::invalid::Invalid;
 use crate::nn::ParameterLayout;
 use crate::policy::mixer::Mixer;
 use crate::policy::{Agent, LearnedPolicy};
-use crate::recipe::TrainConfig;
-
-/// `format` of every checkpoint.
-pub const FORMAT: &str = "qedgix-checkpoint";
-/// `version` of the checkpoints written and read here.
-pub const VERSION: &str = "1";
-/// Largest magnitude of a parameter: far above what training leaves behind, far below where sums overflow.
-pub const LARGEST: f32 = 1e6;
+use crate::train_config::TrainConfig;
 
 /// Parameters with what they were trained as.
 #[derive(Clone, Debug, PartialEq)]

@@ -1,84 +1,86 @@
-//! Policies flown on the same layouts, and what can be said about them: summaries, paired differences, gaps to references.
+//! Policies evaluated on the same layouts: summaries, paired differences, gaps to reference policies.
 
 use serde_json::{Value, json};
 
 use crate::env::EnvConfig;
-use crate::learner::{Difference, Disturbance, Layouts, Summary, Survey, difference, summarize};
+use crate::learner::{Difference, Disturbance, LayoutList, Summary, TracedEvaluation, difference, summarize};
 
-/// A policy and its flights.
-pub struct Flown {
-    /// As it was asked for.
+/// A policy and its evaluation.
+pub struct PolicyEvaluation {
+    /// The name given on the command line.
     pub name: String,
-    /// Whether it flew only to be compared with.
+    /// Whether it was added for comparison and not requested.
     pub reference: bool,
-    /// Means over layouts.
+    /// Statistics over layouts.
     pub summary: Summary,
-    /// The flights; through a server only the figures of the episodes are known.
-    pub survey: Survey,
+    /// The evaluation; through a server, it has the metrics of the episodes only.
+    pub evaluation: TracedEvaluation,
 }
 
-impl Flown {
+impl PolicyEvaluation {
+    /// Summarizes an evaluation.
+    ///
     /// # Errors
     /// There are no episodes.
-    pub fn new(name: &str, reference: bool, survey: Survey) -> anyhow::Result<Self> {
-        Ok(Self { name: name.to_owned(), reference, summary: summarize(&survey.episodes)?, survey })
+    pub fn new(name: &str, reference: bool, evaluation: TracedEvaluation) -> anyhow::Result<Self> {
+        Ok(Self { name: name.to_owned(), reference, summary: summarize(&evaluation.episodes)?, evaluation })
     }
 }
 
-/// An evaluation.
+/// An evaluation of several policies.
 pub struct Comparison {
     /// The list of layouts.
-    pub layouts: Layouts,
-    /// How many of them, from the first.
+    pub layouts: LayoutList,
+    /// Number of layouts, from the first.
     pub episodes: usize,
-    /// The environment; `hover` is as each policy needs it.
+    /// The environment, except for `hover`, which depends on the policy.
     pub env: EnvConfig,
-    /// What went wrong on purpose.
+    /// The disturbance.
     pub disturbance: Disturbance,
-    /// The policies, as they were asked for; references last.
-    pub flown: Vec<Flown>,
+    /// The policies in the order of the command line, then the references.
+    pub policies: Vec<PolicyEvaluation>,
 }
 
-/// Two policies and first minus second.
-pub type Pair<'a> = (&'a Flown, &'a Flown, Difference);
+/// Two policies and the difference first minus second.
+pub type Pair<'a> = (&'a PolicyEvaluation, &'a PolicyEvaluation, Difference);
 
 impl Comparison {
-    /// What policies are measured against (spec 7): the reference planner, and the rule that knows no more than they do.
+    /// Policies to compare with (docs/model.md, "Evaluation"): a planner with full information, and rules with local information.
     pub const REFERENCES: [&'static str; 2] = ["tour", "sweep"];
 
     /// The policies, the best first.
-    pub fn best_first(&self) -> Vec<&Flown> {
-        let mut flown: Vec<&Flown> = self.flown.iter().collect();
-        flown.sort_by(|a, b| a.summary.mean_aoi.mean.total_cmp(&b.summary.mean_aoi.mean));
-        flown
+    pub fn best_first(&self) -> Vec<&PolicyEvaluation> {
+        let mut policies: Vec<&PolicyEvaluation> = self.policies.iter().collect();
+        policies.sort_by(|a, b| a.summary.mean_aoi.mean.total_cmp(&b.summary.mean_aoi.mean));
+        policies
     }
 
-    /// Every pair of the policies that were asked for.
+    /// Every pair of requested policies.
     ///
     /// # Errors
-    /// Policies flew different numbers of layouts.
+    /// Two policies have different numbers of episodes.
     pub fn pairs(&self) -> anyhow::Result<Vec<Pair<'_>>> {
-        let asked: Vec<&Flown> = self.flown.iter().filter(|f| !f.reference).collect();
+        let requested: Vec<&PolicyEvaluation> = self.policies.iter().filter(|f| !f.reference).collect();
         let mut pairs = Vec::new();
-        for (i, first) in asked.iter().enumerate() {
-            for second in &asked[i + 1..] {
-                pairs.push((*first, *second, difference(&first.survey.episodes, &second.survey.episodes)?));
+        for (i, first) in requested.iter().enumerate() {
+            for second in &requested[i + 1..] {
+                pairs.push((*first, *second, difference(&first.evaluation.episodes, &second.evaluation.episodes)?));
             }
         }
         Ok(pairs)
     }
 
-    /// Every policy, the best first, minus the reference called `name`, itself among them; none when that did not fly.
+    /// Every policy minus the policy `name`, the best first, including `name` itself; empty if `name` was not evaluated.
     ///
     /// # Errors
-    /// Policies flew different numbers of layouts.
+    /// Two policies have different numbers of episodes.
     pub fn gaps(&self, name: &str) -> anyhow::Result<Vec<Pair<'_>>> {
-        let Some(reference) = self.flown.iter().find(|f| f.name == name) else { return Ok(Vec::new()) };
-        let flown = self.best_first().into_iter();
-        flown.map(|f| Ok((f, reference, difference(&f.survey.episodes, &reference.survey.episodes)?))).collect()
+        let Some(reference) = self.policies.iter().find(|f| f.name == name) else { return Ok(Vec::new()) };
+        let policies = self.best_first().into_iter();
+        policies.map(|f| Ok((f, reference, difference(&f.evaluation.episodes, &reference.evaluation.episodes)?))).collect()
     }
 
-    /// What was flown, in one line.
+    /// The conditions of the evaluation in one line.
     pub fn conditions(&self) -> String {
         let Self { env, disturbance, .. } = self;
         let mut parts = vec![
@@ -87,21 +89,21 @@ impl Comparison {
             format!("{} users", env.users),
             format!("{} slots", env.slots),
         ];
-        parts.extend(disturbance.lose.map(|loss| format!("UAV {} lost from slot {} on", loss.uav, loss.slot)));
+        parts.extend(disturbance.lose.map(|lost| format!("UAV {} lost from slot {} on", lost.uav, lost.slot)));
         if disturbance.position_noise > 0.0 {
-            parts.push(format!("positions seen with an error of {}", disturbance.position_noise));
+            parts.push(format!("observed positions with an error of {}", disturbance.position_noise));
         }
         parts.join(", ")
     }
 
-    /// Everything as JSON.
+    /// The evaluation as JSON.
     ///
     /// # Errors
-    /// Policies flew different numbers of layouts.
+    /// Two policies have different numbers of episodes.
     pub fn json(&self) -> anyhow::Result<Value> {
         let rows = |reference: bool| -> Vec<Value> {
-            let flown = self.flown.iter().filter(|f| f.reference == reference);
-            flown.map(|f| json!({"policy": f.name, "summary": f.summary})).collect()
+            let policies = self.policies.iter().filter(|f| f.reference == reference);
+            policies.map(|f| json!({"policy": f.name, "summary": f.summary})).collect()
         };
         let pairs = self.pairs()?;
         let pairs = pairs.iter().map(|(a, b, d)| json!({"first": a.name, "second": b.name, "difference": d}));

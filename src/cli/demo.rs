@@ -16,7 +16,7 @@ use super::output::outln;
 use super::run_args::all_cores;
 use super::{act_client, progress, table, train};
 use crate::env::EnvConfig;
-use crate::learner::{Algorithm, Summary, difference, layouts, summarize};
+use crate::learner::{Algorithm, Summary, difference, layout_list, summarize};
 use crate::policy::baselines;
 use crate::serving::bundled;
 
@@ -68,7 +68,7 @@ async fn story(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
 
     let here = ConnectArgs::default();
     let env = EnvConfig::default();
-    let seeds = layouts("eval-v1")?.seeds(args.episodes);
+    let seeds = layout_list("eval-v1")?.seeds(args.episodes);
     outln!(
         "1. {} UAVs collect the data of {} users, {} slots, {} layouts; every slot is one gRPC Act",
         env.uavs,
@@ -108,7 +108,7 @@ async fn story(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
     outln!("\n3. Its checkpoint, policy {policy}, served by the same Act")?;
     flight.fly(policy).await?;
 
-    outln!("\nMean AoI in slots; lower is fresher\n{}", table::of_policies(&flight.rows))?;
+    outln!("\nMean AoI in slots; lower is fresher\n{}", table::policy_table(&flight.rows))?;
     if let [(first, trained), .., (last, fresh)] = &flight.flown[..] {
         let d = difference(fresh, trained)?.mean_aoi;
         outln!("{last} minus {first} on the same layouts: {:+.2} (95 % interval {:+.2} to {:+.2})", d.mean, d.low, d.high)?;

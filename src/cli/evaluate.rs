@@ -1,4 +1,4 @@
-//! `qedgix evaluate`: policies side by side on frozen layouts (spec 7), here or through a server's `Act`.
+//! `qedgix evaluate`: compares policies on frozen layouts, in this process or through `Act` of a server.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -6,13 +6,13 @@ use std::sync::Arc;
 use anyhow::{Context, ensure};
 use clap::Args;
 
-use super::comparison::{Comparison, Flown};
+use super::comparison::{Comparison, PolicyEvaluation};
 use super::connect::ConnectArgs;
 use super::output::outln;
 use super::{act_client, progress, report, run_args::all_cores, table};
 use crate::checkpoint::Checkpoint;
 use crate::env::EnvConfig;
-use crate::learner::{Disturbance, Layouts, Loss, Survey, Track, layouts, survey};
+use crate::learner::{Disturbance, LayoutList, LostUav, TracedEvaluation, Trajectory, evaluate_traced, layout_list};
 use crate::policy::{Policy, baselines};
 use crate::serving::bundled;
 
@@ -23,19 +23,19 @@ use crate::serving::bundled;
   qedgix evaluate --policy qedgix --policy sweep --report report      # then open report/index.html
   qedgix evaluate --policy sweep --policy my-job:1 --server 127.0.0.1:50051 --episodes 16
 
-How a policy does where it was not trained:
+Conditions that differ from training:
   qedgix evaluate --policy policy.safetensors --policy sweep --uavs 4 --users 8 --json
   qedgix evaluate --policy qedgix --policy sweep --detection-range 0.2 --user-speed 0.01
-  qedgix evaluate --policy qedgix --policy sweep --lose-uav 1@20      # UAV 1 of 0, 1, 2 is gone from slot 20 on
+  qedgix evaluate --policy qedgix --policy sweep --lose-uav 1@20      # UAV 1 of 0, 1, 2 is lost from slot 20 on
   qedgix evaluate --policy qedgix --policy sweep --position-noise 0.02")]
 pub struct EvaluateArgs {
-    /// A checkpoint file, a bundled policy or a baseline; with --server, any policy it serves. May be repeated
+    /// A checkpoint file, a bundled policy or a baseline; with --server, a policy of the server. May be repeated
     #[arg(long, required = true, env = "QEDGIX_POLICY", value_delimiter = ',')]
     policy: Vec<String>,
     /// Frozen list of layouts
     #[arg(long, env = "QEDGIX_LAYOUTS", default_value = "eval-v1")]
     layouts: String,
-    /// How many of them, from the first [default: 256, or fewer where the list is shorter]
+    /// Number of layouts, from the first of the list; all if the list has fewer
     #[arg(long, env = "QEDGIX_EPISODES", default_value_t = 256)]
     episodes: usize,
     /// Number of UAVs
@@ -50,30 +50,30 @@ pub struct EvaluateArgs {
     /// Detection range, in units of the square's side
     #[arg(long, env = "QEDGIX_DETECTION_RANGE", default_value_t = 0.28)]
     detection_range: f64,
-    /// Range within which data is collected, in units of the square's side
+    /// Transmission range, in units of the square's side
     #[arg(long, env = "QEDGIX_TRANSMISSION_RANGE", default_value_t = 0.12)]
     transmission_range: f64,
-    /// Distance that users walk per slot, in units of the square's side; 0: they stay
+    /// Distance that users move per slot, in units of the square's side; 0: users stay
     #[arg(long, env = "QEDGIX_USER_SPEED", default_value_t = 0.0)]
     user_speed: f64,
-    /// Loses a UAV (counted from 0) from a slot on: it neither moves, collects, sees nor is seen
-    #[arg(long, env = "QEDGIX_LOSE_UAV", value_name = "UAV@SLOT", value_parser = loss)]
-    lose_uav: Option<Loss>,
-    /// Standard deviation of the error in every coordinate that policies see, in units of the square's side
+    /// Index of a UAV (from 0) that is lost from a slot on: it does not move, collect or detect, and is not detected
+    #[arg(long, env = "QEDGIX_LOSE_UAV", value_name = "UAV@SLOT", value_parser = lost_uav)]
+    lose_uav: Option<LostUav>,
+    /// Standard deviation of the error of each observed coordinate, in units of the square's side
     #[arg(long, env = "QEDGIX_POSITION_NOISE", value_name = "SIGMA", default_value_t = 0.0)]
     position_noise: f64,
     /// Threads [default: all cores]
     #[arg(long, env = "QEDGIX_THREADS")]
     threads: Option<usize>,
-    /// Fly through gRPC Act of the server at HOST:PORT
+    /// Evaluate through gRPC Act of the server at HOST:PORT
     #[arg(long, env = "QEDGIX_SERVER", value_name = "HOST:PORT")]
     server: Option<String>,
     #[command(flatten)]
     connect: ConnectArgs,
-    /// Write a report with tables and figures into this directory: index.html, report.md, report.json, *.svg
+    /// Write a report with tables and plots into this directory: index.html, report.md, report.json, *.svg
     #[arg(long, env = "QEDGIX_REPORT", value_name = "DIR")]
     report: Option<PathBuf>,
-    /// Layout whose flights the report draws, counted from 0
+    /// Index of the layout (from 0) whose trajectories the report shows
     #[arg(long, env = "QEDGIX_REPORT_LAYOUT", value_name = "N", default_value_t = 0)]
     report_layout: usize,
     /// Print JSON
@@ -84,14 +84,16 @@ pub struct EvaluateArgs {
 /// Runs the command.
 ///
 /// # Errors
-/// An unknown policy or list, a policy that does not fit, a server that refuses, a directory that cannot be written.
+/// An unknown policy or list, a policy that does not fit the environment, an error of the server, a directory that cannot be
+/// written.
 pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
     let (list, seeds, env) = check(&args)?;
     let disturbance = args.disturbance();
-    // Gaps are told where there is room for them.
-    let asked = |name: &str| args.policy.iter().any(|p| p == name);
+    // The gaps to references are in the JSON and in the report only.
+    let requested = |name: &str| args.policy.iter().any(|p| p == name);
     let references: &[&str] = if args.json || args.report.is_some() { &Comparison::REFERENCES } else { &[] };
-    let references = references.iter().copied().filter(|name| !asked(name) && baselines::by_name(name, (&env).into()).is_some());
+    let references =
+        references.iter().copied().filter(|name| !requested(name) && baselines::by_name(name, (&env).into()).is_some());
     let names: Vec<(&str, bool)> =
         args.policy.iter().map(|name| (name.as_str(), false)).chain(references.map(|name| (name, true))).collect();
 
@@ -100,28 +102,28 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
         None => None,
     };
     let bar = progress::bar(names.len() as u64, "policies");
-    let mut flown = Vec::new();
+    let mut evaluations = Vec::new();
     for (name, reference) in names {
         bar.set_message(name.to_owned());
-        let survey = match &mut server {
+        let evaluation = match &mut server {
             Some(server) if !reference => {
                 let episodes = act_client::run_episodes(server, name, &env, &seeds).await?;
-                Survey { episodes, aoi: Vec::new(), track: Track::default() }
+                TracedEvaluation { episodes, aoi: Vec::new(), trajectory: Trajectory::default() }
             }
             _ => {
                 let policy = open(name, &env)?;
                 let env = EnvConfig { hover: policy.actions() > EnvConfig::COMPASS, ..env.clone() };
                 let threads = args.threads.unwrap_or_else(all_cores);
-                survey(policy.as_ref(), &env, &seeds, args.report_layout, &disturbance, threads)
+                evaluate_traced(policy.as_ref(), &env, &seeds, args.report_layout, &disturbance, threads)
                     .with_context(|| format!("policy {name}"))?
             }
         };
-        flown.push(Flown::new(name, reference, survey)?);
+        evaluations.push(PolicyEvaluation::new(name, reference, evaluation)?);
         bar.inc(1);
     }
     bar.finish_and_clear();
 
-    let comparison = Comparison { layouts: list, episodes: seeds.len(), env, disturbance, flown };
+    let comparison = Comparison { layouts: list, episodes: seeds.len(), env, disturbance, policies: evaluations };
     if let Some(directory) = &args.report {
         report::write(directory, &comparison, &args.command_line())
             .with_context(|| format!("writing the report to {}", directory.display()))?;
@@ -131,16 +133,16 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
         return Ok(());
     }
     outln!("{}; AoI in slots", comparison.conditions())?;
-    let asked = comparison.flown.iter().filter(|f| !f.reference);
-    outln!("{}", table::of_policies(&asked.map(|f| (f.name.clone(), f.summary)).collect::<Vec<_>>()))?;
+    let requested = comparison.policies.iter().filter(|f| !f.reference);
+    outln!("{}", table::policy_table(&requested.map(|f| (f.name.clone(), f.summary)).collect::<Vec<_>>()))?;
     if let Some(directory) = &args.report {
         outln!("Report: {}", directory.join("index.html").display())?;
     }
     Ok(())
 }
 
-/// What the flags ask for, before anything is flown.
-fn check(args: &EvaluateArgs) -> anyhow::Result<(Layouts, Vec<u64>, EnvConfig)> {
+/// The list of layouts, the seeds and the environment of the flags, checked.
+fn check(args: &EvaluateArgs) -> anyhow::Result<(LayoutList, Vec<u64>, EnvConfig)> {
     let env = EnvConfig {
         uavs: args.uavs,
         users: args.users,
@@ -153,7 +155,7 @@ fn check(args: &EvaluateArgs) -> anyhow::Result<(Layouts, Vec<u64>, EnvConfig)> 
     env.validate()?;
     args.disturbance().validate(&env)?;
     ensure!(args.episodes > 0, "--episodes: got 0, expected at least 1");
-    let list = layouts(&args.layouts)?;
+    let list = layout_list(&args.layouts)?;
     let seeds = list.seeds(args.episodes);
     ensure!(
         args.report_layout < seeds.len(),
@@ -161,11 +163,10 @@ fn check(args: &EvaluateArgs) -> anyhow::Result<(Layouts, Vec<u64>, EnvConfig)> 
         args.report_layout,
         seeds.len() - 1
     );
-    let here = args.report.is_some() || args.disturbance() != Disturbance::default();
+    let local_only = args.report.is_some() || args.disturbance() != Disturbance::default();
     ensure!(
-        args.server.is_none() || !here,
-        "--report, --lose-uav and --position-noise are for policies that fly here: files, bundled policies and baselines; \
-         leave out --server"
+        args.server.is_none() || !local_only,
+        "--report, --lose-uav and --position-noise work for files, bundled policies and baselines only; leave out --server"
     );
     Ok((list, seeds, env))
 }
@@ -175,9 +176,9 @@ impl EvaluateArgs {
         Disturbance { lose: self.lose_uav, position_noise: self.position_noise }
     }
 
-    /// The command that repeats this evaluation: what was typed, and what came from environment variables.
+    /// The command that repeats this evaluation, including values from environment variables.
     fn command_line(&self) -> String {
-        let usual = EnvConfig::default();
+        let default = EnvConfig::default();
         let mut words = vec!["qedgix evaluate".to_owned()];
         let mut add = |flag: &str, value: String| words.push(format!("--{flag} {}", quoted(&value)));
         for policy in &self.policy {
@@ -185,24 +186,24 @@ impl EvaluateArgs {
         }
         add("layouts", self.layouts.clone());
         add("episodes", self.episodes.to_string());
-        for (flag, value, usual) in
-            [("uavs", self.uavs, usual.uavs), ("users", self.users, usual.users), ("slots", self.slots, usual.slots)]
+        for (flag, value, default) in
+            [("uavs", self.uavs, default.uavs), ("users", self.users, default.users), ("slots", self.slots, default.slots)]
         {
-            if value != usual {
+            if value != default {
                 add(flag, value.to_string());
             }
         }
-        for (flag, value, usual) in [
-            ("detection-range", self.detection_range, usual.detection_range),
-            ("transmission-range", self.transmission_range, usual.transmission_range),
-            ("user-speed", self.user_speed, usual.user_speed),
+        for (flag, value, default) in [
+            ("detection-range", self.detection_range, default.detection_range),
+            ("transmission-range", self.transmission_range, default.transmission_range),
+            ("user-speed", self.user_speed, default.user_speed),
             ("position-noise", self.position_noise, 0.0),
         ] {
-            if value != usual {
+            if value != default {
                 add(flag, value.to_string());
             }
         }
-        if let Some(Loss { uav, slot }) = self.lose_uav {
+        if let Some(LostUav { uav, slot }) = self.lose_uav {
             add("lose-uav", format!("{uav}@{slot}"));
         }
         if self.report_layout > 0 {
@@ -216,22 +217,22 @@ impl EvaluateArgs {
 }
 
 /// `UAV@SLOT`, both counted from 0.
-fn loss(text: &str) -> Result<Loss, String> {
+fn lost_uav(text: &str) -> Result<LostUav, String> {
     let parts = text.split_once('@').and_then(|(uav, slot)| Some((uav.parse().ok()?, slot.parse().ok()?)));
     let (uav, slot) = parts.ok_or("expected UAV@SLOT, two whole numbers counted from 0, as in 1@20")?;
-    Ok(Loss { uav, slot })
+    Ok(LostUav { uav, slot })
 }
 
-/// `word` as a shell takes it for one word.
+/// `word` quoted for a shell.
 fn quoted(word: &str) -> String {
     let plain = |c: char| c.is_ascii_alphanumeric() || "_-./:@=+%".contains(c);
     if !word.is_empty() && word.chars().all(plain) { word.to_owned() } else { format!("'{}'", word.replace('\'', "'\\''")) }
 }
 
-/// A policy by what it is called on the command line: a file, a bundled policy or a baseline.
+/// The policy with this name on the command line: a file, a bundled policy or a baseline.
 ///
 /// # Errors
-/// No such thing, or a file that is no checkpoint.
+/// The name is none of these, or the file is not a checkpoint.
 pub fn open(name: &str, env: &EnvConfig) -> anyhow::Result<Arc<dyn Policy>> {
     if let Some(policy) = baselines::by_name(name, env.into()) {
         return Ok(policy);
@@ -243,7 +244,7 @@ pub fn open(name: &str, env: &EnvConfig) -> anyhow::Result<Arc<dyn Policy>> {
             format!("{name} is neither a checkpoint file nor one of {}", known.collect::<Vec<_>>().join(", "))
         })?,
     };
-    let checkpoint = Checkpoint::from_bytes(&bytes).with_context(|| format!("{name} is no checkpoint"))?;
+    let checkpoint = Checkpoint::from_bytes(&bytes).with_context(|| format!("{name} is not a checkpoint"))?;
     Ok(Arc::new(checkpoint.policy()))
 }
 
@@ -264,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_flags_are_named() {
+    fn errors_name_the_flag() {
         for (words, hint) in [
             (vec!["--lose-uav", "1"], "UAV@SLOT"),
             (vec!["--lose-uav", "one@3"], "UAV@SLOT"),
@@ -286,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn the_command_line_repeats_itself() {
+    fn the_command_line_contains_the_flags() {
         let words = ["--policy", "it's mine.safetensors", "--uavs", "4", "--lose-uav", "1@20", "--position-noise", "0.02"];
         let line = parse(&words).expect("flags parse").command_line();
         assert_eq!(

@@ -1,27 +1,23 @@
-//! Files that are there whole or not at all, so that an interruption leaves nothing half written.
+//! Reading and writing files, with errors that name the file.
 
 use std::fs;
 use std::path::Path;
 
 use anyhow::Context;
 
-/// Writes a file whole or not at all.
+/// Writes a file atomically ([`crate::files::write_atomic`]).
 ///
 /// # Errors
 /// The file cannot be written.
-pub fn write_whole(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
-    let mut partial = path.as_os_str().to_owned();
-    partial.push(".partial");
-    fs::write(&partial, bytes)
-        .and_then(|()| fs::rename(&partial, path))
-        .with_context(|| format!("cannot write {}", path.display()))
+pub fn write_atomic(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    crate::files::write_atomic(path, bytes).with_context(|| format!("cannot write {}", path.display()))
 }
 
-/// Reads a file that may be absent.
+/// Reads a file; `None` if it does not exist.
 ///
 /// # Errors
-/// The file is there and cannot be read.
-pub fn read_if_there(path: &Path) -> anyhow::Result<Option<Vec<u8>>> {
+/// The file exists and cannot be read.
+pub fn read_if_exists(path: &Path) -> anyhow::Result<Option<Vec<u8>>> {
     match fs::read(path) {
         Ok(bytes) => Ok(Some(bytes)),
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),

@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 
 use super::client::Client;
 use super::connect::ConnectArgs;
-use super::files::write_whole;
+use super::files::write_atomic;
 use super::output::outln;
 use super::table;
 use crate::checkpoint::digest;
@@ -145,7 +145,7 @@ pub async fn run(args: PoliciesArgs) -> anyhow::Result<()> {
         Command::Alias(Alias::List { name }) => {
             let response = client.get(&path(&[&name, "aliases"])).await?;
             let rows = items(&response, "aliases").map(|a| [text(&a["alias"]), text(&a["version"])]);
-            let table = table::of_rows(["alias", "version"], rows);
+            let table = table::text_table(["alias", "version"], rows);
             (response, table)
         }
         Command::Alias(Alias::Set { name, alias, version, expected }) => {
@@ -167,7 +167,7 @@ pub async fn run(args: PoliciesArgs) -> anyhow::Result<()> {
             let response = client.get(&(path(&[&name, "history"]) + &filter)).await?;
             let moves = items(&response, "history");
             let rows = moves.map(|m| ["at", "alias", "previous", "version", "by"].map(|field| text(&m[field])));
-            let table = table::of_rows(["at", "alias", "from", "to", "by"], rows);
+            let table = table::text_table(["at", "alias", "from", "to", "by"], rows);
             (response, table)
         }
         Command::Load { policy } => details(client.post(&path(&[&policy, "load"]), &Value::Null).await?),
@@ -203,7 +203,7 @@ async fn list(client: &Client) -> anyhow::Result<(Value, String)> {
         ]
     });
     let header = ["policy", "newest", "kind", "loaded", "aliases", "UAVs", "users", "mean AoI"];
-    let table = table::of_rows(header, rows);
+    let table = table::text_table(header, rows);
     Ok((json!({"policies": all}), table))
 }
 
@@ -221,7 +221,7 @@ fn details(policy: Value) -> (Value, String) {
     for (metric, value) in policy["metrics"].as_object().into_iter().flatten() {
         rows.push([metric.clone(), text(value)]);
     }
-    let table = table::of_rows(["", ""], rows);
+    let table = table::text_table(["", ""], rows);
     (policy, table)
 }
 
@@ -236,7 +236,7 @@ async fn export(client: &Client, policy: &str, out: Option<PathBuf>) -> anyhow::
         "{policy}: the downloaded bytes do not have the digest of {name}:{version}"
     );
     let out = out.unwrap_or_else(|| format!("{name}-{version}.safetensors").into());
-    write_whole(&out, &bytes)?;
+    write_atomic(&out, &bytes)?;
     let text = format!("wrote {name}:{version} ({} bytes) to {}", bytes.len(), out.display());
     Ok((json!({"policy": format!("{name}:{version}"), "digest": sha256, "file": out, "size": bytes.len()}), text))
 }

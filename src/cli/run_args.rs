@@ -1,4 +1,4 @@
-//! The flags that describe a training run, shared by `train`, `bench` and their remote forms.
+//! The flags that describe a training run, shared by `train` and `bench`.
 
 use anyhow::{Context, bail};
 use clap::Args;
@@ -7,7 +7,7 @@ use serde_json::{Map, Value, json};
 
 use crate::learner::{Algorithm, Preset, TrainConfig};
 
-/// What to train; everything not given comes from the preset.
+/// The training run; values that are not given come from the preset.
 #[derive(Args, Clone, Debug)]
 pub struct RunArgs {
     /// qedgix, qmix, vdn, iql, agggnn or rgcn
@@ -37,10 +37,10 @@ pub struct RunArgs {
 }
 
 impl RunArgs {
-    /// The sections `environment` and `training` with what the flags override.
+    /// The sections `environment` and `training` with the fields that flags override.
     ///
     /// # Errors
-    /// A `--set` that is not `environment.FIELD=VALUE` or `training.FIELD=VALUE`.
+    /// A `--set` is neither `environment.FIELD=VALUE` nor `training.FIELD=VALUE`.
     pub fn sections(&self) -> anyhow::Result<(Map<String, Value>, Map<String, Value>)> {
         let mut environment = Map::new();
         let mut training = Map::new();
@@ -56,16 +56,16 @@ impl RunArgs {
         Ok((environment, training))
     }
 
-    /// The whole configuration, checked.
+    /// The resolved configuration.
     ///
     /// # Errors
-    /// A field that is unknown, of the wrong type or out of range.
+    /// A field is unknown, of the wrong type or out of range.
     pub fn resolve(&self) -> anyhow::Result<TrainConfig> {
         let (environment, training) = self.sections()?;
         Ok(TrainConfig::resolve(self.algorithm, self.preset, &environment, &training, self.seed)?)
     }
 
-    /// The job that asks a server for this run.
+    /// The body of a request that submits this run as a job.
     ///
     /// # Errors
     /// As [`RunArgs::sections`].
@@ -87,14 +87,14 @@ impl RunArgs {
     }
 }
 
-/// Puts items `environment.FIELD=VALUE` and `training.FIELD=VALUE` into these sections.
+/// Inserts items `environment.FIELD=VALUE` and `training.FIELD=VALUE` into the sections.
 ///
 /// # Errors
-/// The first item that is neither.
+/// An item is neither of these.
 pub fn set(items: &[String], environment: &mut Map<String, Value>, training: &mut Map<String, Value>) -> anyhow::Result<()> {
     for item in items {
         let (path, text) = item.split_once('=').with_context(|| format!("--set {item}: expected SECTION.FIELD=VALUE"))?;
-        // Bare words are strings, so that `training.mixer=qmix` needs no quotes.
+        // Text that is not JSON is a string, so that `training.mixer=qmix` needs no quotes.
         let value = serde_json::from_str(text).unwrap_or_else(|_| Value::String(text.to_owned()));
         match path.split_once('.') {
             Some(("environment", field)) => environment.insert(field.to_owned(), value),
@@ -105,15 +105,15 @@ pub fn set(items: &[String], environment: &mut Map<String, Value>, training: &mu
     Ok(())
 }
 
-/// Parses a name as the configuration files spell it.
+/// Parses a name as configuration files spell it.
 ///
 /// # Errors
-/// The names that exist.
+/// The name is unknown; the error lists the known names.
 pub fn named<T: DeserializeOwned>(text: &str) -> Result<T, String> {
     serde_json::from_value(Value::String(text.to_owned())).map_err(|e| e.to_string())
 }
 
-/// Threads to use when none are named: all cores.
+/// The default number of threads: all cores.
 pub fn all_cores() -> usize {
     std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
 }
@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_flags_are_named() {
+    fn errors_name_the_field() {
         for (words, hint) in [
             (vec!["--set", "training.batch"], "SECTION.FIELD=VALUE"),
             (vec!["--set", "learning.batch=3"], "learning.batch"),

@@ -1,27 +1,19 @@
-//! Tables and little pictures for terminals.
+//! Tables and sparklines for terminals.
 
 use comfy_table::{CellAlignment, Table, presets};
 
+use crate::experiment::metric_cells;
 use crate::learner::Summary;
 
-/// Policies side by side, best first. AoI is in slots.
-pub fn of_policies(rows: &[(String, Summary)]) -> Table {
+/// A table of policies, the best first. AoI is in slots.
+pub fn policy_table(rows: &[(String, Summary)]) -> Table {
     let mut rows: Vec<_> = rows.iter().collect();
     rows.sort_by(|a, b| a.1.mean_aoi.mean.total_cmp(&b.1.mean_aoi.mean));
     let mut table = Table::new();
     table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
     table.set_header(["policy", "mean AoI", "95 % interval", "p95", "peak", "coverage", "fairness"]);
     for (name, summary) in rows {
-        let m = &summary.mean;
-        table.add_row([
-            name.clone(),
-            format!("{:.2}", summary.mean_aoi.mean),
-            format!("{:.2} to {:.2}", summary.mean_aoi.low, summary.mean_aoi.high),
-            format!("{:.1}", m.p95_aoi),
-            format!("{:.1}", m.peak_aoi),
-            format!("{:.1} %", 100.0 * m.coverage),
-            format!("{:.2}", m.fairness),
-        ]);
+        table.add_row(std::iter::once(name.clone()).chain(metric_cells(&summary.mean_aoi, &summary.mean)));
     }
     for column in table.column_iter_mut().skip(1) {
         column.set_cell_alignment(CellAlignment::Right);
@@ -29,18 +21,18 @@ pub fn of_policies(rows: &[(String, Summary)]) -> Table {
     table
 }
 
-/// A table of words; its first row is a header, unless all of it is empty.
-pub fn of_rows<const N: usize>(header: [&str; N], rows: impl IntoIterator<Item = [String; N]>) -> String {
+/// A table with a header; without one if all its cells are empty.
+pub fn text_table<const N: usize>(header: [&str; N], rows: impl IntoIterator<Item = [String; N]>) -> String {
     let mut table = Table::new();
     table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
-    if header.iter().any(|word| !word.is_empty()) {
+    if header.iter().any(|cell| !cell.is_empty()) {
         table.set_header(header);
     }
     table.add_rows(rows);
     table.to_string()
 }
 
-/// A learning curve in one line of at most 40 characters, lowest value lowest.
+/// A curve as a line of at most 40 characters.
 pub fn sparkline(values: &[f64]) -> String {
     const WIDTH: usize = 40;
     let values: Vec<f64> = if values.len() > WIDTH {

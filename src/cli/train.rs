@@ -1,4 +1,4 @@
-//! `qedgix train`: a training run here, or as a job of a server.
+//! `qedgix train`: a training run in this process, or as a job of a server.
 
 use std::fs;
 use std::io::Write as _;
@@ -11,44 +11,44 @@ use serde_json::Value;
 
 use super::client::Client;
 use super::connect::ConnectArgs;
-use super::files::write_whole;
+use super::files::write_atomic;
 use super::output::{errln, outln};
 use super::run_args::{RunArgs, all_cores};
 use super::{progress, table};
 use crate::checkpoint::Checkpoint;
-use crate::learner::{Event, Summary, TrainConfig, Trainer, evaluate, layouts, summarize};
+use crate::learner::{Evaluation, Event, Summary, TrainConfig, Trainer, evaluate, layout_list, summarize};
 
 /// Flags of `train`.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   qedgix train --algorithm qmix --steps 400000 --out qmix.safetensors
   qedgix train --uavs 4 --users 8 --set training.learning_rate=5e-4 --metrics curve.csv
-  qedgix train --steps 250000 --snapshot run.snapshot           # stop with ctrl-c ...
-  qedgix train --resume run.snapshot --snapshot run.snapshot    # ... and go on, to the same bits
+  qedgix train --steps 250000 --snapshot run.snapshot           # ctrl-c stops the run ...
+  qedgix train --resume run.snapshot --snapshot run.snapshot    # ... and this resumes it, with the same result
   qedgix train --algorithm qedgix --server 127.0.0.1:8080 --name my-policy
-  QEDGIX_API_KEY=... qedgix train --server https://uavs.example:8080 --ca-cert ca.pem    # a key with the scopes read and jobs")]
+  QEDGIX_API_KEY=... qedgix train --server https://uavs.example:8080 --ca-cert ca.pem    # a key with the scopes `read` and `jobs`")]
 pub struct TrainArgs {
     #[command(flatten)]
     run: RunArgs,
-    /// Threads; they change the speed, never the result [default: all cores]
+    /// Number of threads; it does not change the result [default: all cores]
     #[arg(long, env = "QEDGIX_THREADS")]
     threads: Option<usize>,
-    /// Where the best checkpoint goes
+    /// File for the best checkpoint
     #[arg(long, env = "QEDGIX_OUT", default_value = "policy.safetensors")]
     out: PathBuf,
-    /// Writes the curve as CSV: step, name, value
+    /// File for the metrics as CSV: step, name, value
     #[arg(long, env = "QEDGIX_METRICS")]
     metrics: Option<PathBuf>,
-    /// Keeps the state of the run in this file: written at evaluations, and when stopped with ctrl-c
+    /// File for snapshots, written at every evaluation and when ctrl-c stops the run
     #[arg(long, env = "QEDGIX_SNAPSHOT")]
     snapshot: Option<PathBuf>,
-    /// Goes on from a snapshot; the configuration is the snapshot's
+    /// Resumes the run of this snapshot, with the configuration of the snapshot
     #[arg(long, env = "QEDGIX_RESUME", conflicts_with = "server")]
     resume: Option<PathBuf>,
-    /// Submits the run as a job to the server at HOST:PORT (REST) and follows it
+    /// Submits the run as a job to the server at HOST:PORT (REST) and waits for its end
     #[arg(long, env = "QEDGIX_SERVER", value_name = "HOST:PORT")]
     server: Option<String>,
-    /// Name of the job, and of the policy that it becomes
+    /// Name of the job and of the policy that it publishes
     #[arg(long, env = "QEDGIX_NAME", requires = "server")]
     name: Option<String>,
     #[command(flatten)]
@@ -58,7 +58,7 @@ pub struct TrainArgs {
 /// Runs the command.
 ///
 /// # Errors
-/// A configuration that is wrong, a file that cannot be read or written, a job that fails.
+/// The configuration is invalid, a file cannot be read or written, or the job fails.
 pub async fn run(args: TrainArgs) -> anyhow::Result<()> {
     let threads = args.threads.unwrap_or_else(all_cores);
     if let Some(address) = &args.server {
@@ -80,10 +80,10 @@ pub async fn run(args: TrainArgs) -> anyhow::Result<()> {
 /// Submits a job, shows its progress until it ends, and returns it.
 ///
 /// # Errors
-/// The job is refused or fails.
+/// The server rejects the job, or the job fails.
 pub async fn submit(client: &Client, job: &Value) -> anyhow::Result<Value> {
     let accepted = client.post("/v1/jobs", job).await?;
-    let id = accepted["id"].as_str().context("the server's answer has no job id")?;
+    let id = accepted["id"].as_str().context("the response of the server has no job id")?;
     let bar = progress::bar(accepted["progress"]["steps"].as_u64().unwrap_or(0), "steps");
     let ended = client
         .wait_for_job(id, |job| {
@@ -95,7 +95,7 @@ pub async fn submit(client: &Client, job: &Value) -> anyhow::Result<Value> {
     ended
 }
 
-/// The run that the flags ask for, at its beginning or where its snapshot left it.
+/// The run of the flags: a new one, or the one of `--resume`.
 fn start(args: &TrainArgs, threads: usize) -> anyhow::Result<Trainer> {
     let Some(path) = &args.resume else { return Ok(Trainer::new(args.run.resolve()?, threads)?) };
     let bytes = fs::read(path).with_context(|| format!("--resume {}", path.display()))?;
@@ -105,7 +105,7 @@ fn start(args: &TrainArgs, threads: usize) -> anyhow::Result<Trainer> {
 fn train(args: &TrainArgs, mut trainer: Trainer, threads: usize) -> anyhow::Result<()> {
     let config = trainer.config().clone();
     errln!("{}", serde_json::to_string(&config)?);
-    let mut curve = args.metrics.as_deref().map(|path| Curve::open(path, args.resume.is_some())).transpose()?;
+    let mut curve = args.metrics.as_deref().map(|path| CurveWriter::open(path, args.resume.is_some())).transpose()?;
     let bar = progress::bar(config.training.steps, "steps");
     let mut evaluations = Vec::new();
     let mut finished = false;
@@ -118,17 +118,17 @@ fn train(args: &TrainArgs, mut trainer: Trainer, threads: usize) -> anyhow::Resu
                 bar.set_position(i.step.min(config.training.steps));
                 bar.set_message(format!("epsilon {:.2}, train {:.1}", i.epsilon, i.mean_aoi));
             }
-            Event::Evaluation { step, metrics } => {
+            Event::Evaluation(Evaluation { step, metrics }) => {
                 evaluations.push(metrics.mean_aoi);
                 let line = format!("step {step:>8}  mean AoI {:6.2}  {}", metrics.mean_aoi, table::sparkline(&evaluations));
-                // Where nobody sees the bar, the line is the progress.
+                // Without a terminal there is no bar.
                 if bar.is_hidden() {
                     errln!("{line}");
                 } else {
                     bar.println(line);
                 }
                 if let Some(path) = &args.snapshot {
-                    write_whole(path, &trainer.snapshot())?;
+                    write_atomic(path, &trainer.snapshot())?;
                 }
             }
             Event::Diverged { step } => {
@@ -139,30 +139,30 @@ fn train(args: &TrainArgs, mut trainer: Trainer, threads: usize) -> anyhow::Resu
     }
     bar.finish_and_clear();
     if !finished {
-        let Some(path) = &args.snapshot else { bail!("stopped; without --snapshot nothing is kept") };
-        write_whole(path, &trainer.snapshot())?;
-        outln!("stopped; go on with --resume {}", path.display())?;
+        let Some(path) = &args.snapshot else { bail!("stopped; without --snapshot, the run is lost") };
+        write_atomic(path, &trainer.snapshot())?;
+        outln!("stopped; resume with --resume {}", path.display())?;
         return Ok(());
     }
     let best = trainer.best()?.context("a finished run has been evaluated")?;
     report(&config, &best, &args.out, threads)
 }
 
-/// Writes the checkpoint and flies it on eval-v1.
+/// Writes the checkpoint and prints its evaluation on eval-v1.
 fn report(config: &TrainConfig, checkpoint: &Checkpoint, out: &Path, threads: usize) -> anyhow::Result<()> {
-    write_whole(out, &checkpoint.to_bytes())?;
-    let list = layouts("eval-v1")?;
+    write_atomic(out, &checkpoint.to_bytes())?;
+    let list = layout_list("eval-v1")?;
     let episodes = evaluate(&checkpoint.policy(), &config.environment, &list.seeds(256), threads)?;
     let rows: Vec<(String, Summary)> = vec![(out.display().to_string(), summarize(&episodes)?)];
     outln!("best weights by validation, from step {}; on {}:", checkpoint.step(), list.name)?;
-    outln!("{}", table::of_policies(&rows))?;
+    outln!("{}", table::policy_table(&rows))?;
     Ok(())
 }
 
-/// A training curve as CSV.
-struct Curve(std::io::BufWriter<fs::File>);
+/// Writes metrics as CSV.
+struct CurveWriter(std::io::BufWriter<fs::File>);
 
-impl Curve {
+impl CurveWriter {
     fn open(path: &Path, append: bool) -> anyhow::Result<Self> {
         let file = fs::OpenOptions::new().create(true).write(true).append(append).truncate(!append).open(path);
         let file = file.with_context(|| format!("cannot write {}", path.display()))?;
@@ -178,8 +178,8 @@ impl Curve {
         for (step, name, value) in event.rows() {
             writeln!(self.0, "{step},{name},{value}")?;
         }
-        // A curve is watched while it grows.
-        if matches!(event, Event::Evaluation { .. } | Event::Finished { .. }) {
+        // The file can be read while training runs.
+        if matches!(event, Event::Evaluation(_) | Event::Finished { .. }) {
             self.0.flush()?;
         }
         Ok(())

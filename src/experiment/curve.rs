@@ -1,32 +1,32 @@
-//! The curve of a run as rows (step, name, value), in the order they came and without repetition, so that a run that goes on
-//! from an older snapshot leaves the same curve as one that never stopped.
+//! The training curve of a run as rows (step, name, value), in the order of arrival. Rows that a resumed run computes again are
+//! ignored, so its curve equals that of a run without interruption.
 
 use std::collections::{BTreeMap, HashSet};
 use std::fmt::Write;
 
 use crate::invalid::Invalid;
 
-/// Rows of a training curve.
+/// A training curve.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Curve {
+pub struct TrainingCurve {
     rows: Vec<(u64, String, f64)>,
     known: HashSet<(u64, String)>,
 }
 
 const HEADER: &str = "step,name,value";
 
-impl Curve {
-    /// Adds a row, if it is new.
+impl TrainingCurve {
+    /// Adds a row, unless the curve has a row of this step and name.
     pub fn push(&mut self, step: u64, name: &str, value: f64) {
         if self.known.insert((step, name.to_owned())) {
             self.rows.push((step, name.to_owned(), value));
         }
     }
 
-    /// Reads what [`Curve::csv`] wrote.
+    /// Parses the output of [`TrainingCurve::csv`].
     ///
     /// # Errors
-    /// The line that is no row.
+    /// [`Invalid`] for the first line that is not a row.
     pub fn parse(csv: &str) -> Result<Self, Invalid> {
         let mut curve = Self::default();
         for (i, line) in csv.lines().enumerate().skip(1) {
@@ -38,13 +38,13 @@ impl Curve {
         Ok(curve)
     }
 
-    /// Forgets what came after `step`.
+    /// Removes the rows after `step`.
     pub fn truncate(&mut self, step: u64) {
         self.rows.retain(|row| row.0 <= step);
         self.known.retain(|key| key.0 <= step);
     }
 
-    /// The rows as a file.
+    /// The rows as CSV.
     pub fn csv(&self) -> String {
         let mut text = format!("{HEADER}\n");
         for (step, name, value) in &self.rows {
@@ -64,18 +64,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_curve_comes_back_and_repeats_no_row() {
-        let mut curve = Curve::default();
+    fn a_parsed_curve_is_equal_and_ignores_repeated_rows() {
+        let mut curve = TrainingCurve::default();
         curve.push(0, "eval/mean_aoi", 38.123_456_789_012_3);
         curve.push(640, "loss", 1e-12);
         curve.push(1280, "loss", 2.0);
-        let mut again = Curve::parse(&curve.csv()).unwrap();
-        assert_eq!(again, curve);
-        again.truncate(640);
-        again.push(640, "loss", 1e-12);
-        again.push(1280, "loss", 2.0);
-        assert_eq!(again.csv(), curve.csv());
+        let mut parsed = TrainingCurve::parse(&curve.csv()).unwrap();
+        assert_eq!(parsed, curve);
+        parsed.truncate(640);
+        parsed.push(640, "loss", 1e-12);
+        parsed.push(1280, "loss", 2.0);
+        assert_eq!(parsed.csv(), curve.csv());
         assert_eq!(curve.values("loss").len(), 2);
-        assert!(Curve::parse("step,name,value\n1,loss").unwrap_err().to_string().contains("line 2"));
+        assert!(TrainingCurve::parse("step,name,value\n1,loss").unwrap_err().to_string().contains("line 2"));
     }
 }

@@ -1,51 +1,22 @@
-//! An experiment: which runs a file asks for, and what their results say together. Runs and files are the command line's.
+//! An experiment: many training runs described by a TOML document, and the summary of their results.
 //!
-//! [`Experiment::resolve`] turns a document into runs, [`Outcome`] is what a finished run leaves, and [`report`] turns all
-//! outcomes into numbers, tables and figures. The same outcomes give the same bytes: no clock, no files, no threads here.
+//! [`Experiment::resolve`] turns a document into runs, [`RunResult`] is the result of one run, and [`ExperimentSummary::new`]
+//! summarizes all results as numbers; [`readme`] and [`plots`] present them. The same results give the same bytes. Running and
+//! writing files is done in `cli`.
 
-mod charts;
 mod curve;
-mod document;
 mod plan;
+mod plots;
+mod run_result;
+mod settings;
 mod statistics;
 mod summary;
 mod tables;
 
-use serde::{Deserialize, Serialize};
-
-use crate::env::EpisodeMetrics;
-
-pub use charts::figures;
-pub use curve::Curve;
-pub use document::Overrides;
-pub use plan::{Experiment, Figure, Point, Run};
-pub use summary::{Compared, Reference, Report, Row, report};
-pub use tables::readme;
-
-/// Weights flown on the frozen layouts of an experiment.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Flown {
-    /// Environment steps that the weights were trained for.
-    pub step: u64,
-    /// Figures on each layout, in the order of the list.
-    pub episodes: Vec<EpisodeMetrics>,
-}
-
-/// What a finished run leaves.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Outcome {
-    /// The list of layouts that was flown.
-    pub layouts: String,
-    /// Environment steps of the run.
-    pub steps: u64,
-    /// Whether it ended early because a weight left the range of sensible numbers.
-    pub diverged: bool,
-    /// The weights that were best on the validation layouts.
-    pub best: Flown,
-    /// The last weights; none of a run that diverged.
-    pub last: Option<Flown>,
-    /// Seconds that training took, all attempts together.
-    pub seconds: f64,
-}
+pub use curve::TrainingCurve;
+pub use plan::{Experiment, PlotKind, Run, SweepPoint};
+pub use plots::plots;
+pub use run_result::{EvaluatedWeights, RunResult};
+pub use settings::Overrides;
+pub use summary::{BaselineSummary, ExperimentSummary, PairedDifference, SeriesSummary};
+pub use tables::{difference_cells, metric_cells, readme};

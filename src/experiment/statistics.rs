@@ -1,14 +1,15 @@
-//! Intervals that account for seeds and for layouts: values (S, L), every seed's policy on every layout.
+//! Bootstrap intervals over seeds and layouts, from values (S, L): the policy of each seed on each layout.
 //!
-//! Both are drawn anew for each resample, crossed (the "pigeonhole" bootstrap): a layout that is hard for one seed is hard
-//! for all, so resampling single values would promise too narrow an interval. With one seed, only layouts are drawn.
+//! Each resample draws seeds and layouts independently and combines them (the "pigeonhole" bootstrap). A layout that is difficult
+//! for one seed is difficult for all, so resampling single values would give too narrow an interval. With one seed, only layouts
+//! are resampled, and the interval excludes seed variance.
 
 use rand::RngExt;
 
 use crate::learner::Interval;
 use crate::rng;
 
-/// Mean of all values with its 95 % interval. Rows are seeds, and equally long.
+/// Mean of all values with its 95 % interval. A row holds the values of a seed; rows are equally long.
 pub(super) fn interval(values: &[Vec<f64>]) -> Interval {
     let (seeds, layouts) = (values.len(), values.first().map_or(0, Vec::len));
     if seeds == 0 || layouts == 0 {
@@ -26,7 +27,7 @@ pub(super) fn interval(values: &[Vec<f64>]) -> Interval {
     })
 }
 
-/// First minus second, value by value; the shorter one's seeds.
+/// First minus second, value by value, for the seeds that both have.
 pub(super) fn minus(first: &[Vec<f64>], second: &[Vec<f64>]) -> Vec<Vec<f64>> {
     let row = |(a, b): (&Vec<f64>, &Vec<f64>)| a.iter().zip(b).map(|(a, b)| a - b).collect();
     first.iter().zip(second).map(row).collect()
@@ -37,7 +38,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn seeds_that_differ_widen_the_interval() {
+    fn different_seeds_widen_the_interval() {
         let layout = |l: usize| 10.0 + (l % 7) as f64;
         let alike: Vec<Vec<f64>> = (0..4).map(|_| (0..100).map(layout).collect()).collect();
         let apart: Vec<Vec<f64>> = (0..4).map(|s| (0..100).map(|l| layout(l) + 2.0 * s as f64 - 3.0).collect()).collect();
@@ -48,7 +49,7 @@ mod tests {
     }
 
     #[test]
-    fn what_layouts_share_cancels_in_a_difference() {
+    fn effects_of_layouts_cancel_in_a_difference() {
         let first: Vec<Vec<f64>> = vec![(0..50).map(f64::from).collect(); 2];
         let second: Vec<Vec<f64>> = first.iter().map(|row| row.iter().map(|x| x + 1.0).collect()).collect();
         let d = interval(&minus(&first, &second));

@@ -1,85 +1,59 @@
-//! The results of an experiment for people: a Markdown page.
+//! The results of an experiment as a Markdown page.
 
 use std::fmt::Write;
 
-use super::{Experiment, Report};
+use super::{Experiment, ExperimentSummary};
+use crate::env::EpisodeMetrics;
 use crate::learner::Interval;
 
-/// The page. `figures` are the names of the SVG files beside it.
-pub fn readme(experiment: &Experiment, report: &Report, command: &str, figures: &[String]) -> String {
-    let mut page = Page(format!("# {}\n", report.title));
+/// The page. `plots` are the names of the SVG files beside it.
+pub fn readme(experiment: &Experiment, summary: &ExperimentSummary, command: &str, plots: &[String]) -> String {
+    let mut page = Page(format!("# {}\n", summary.title));
     page.line(&format!(
-        "Mean AoI in slots, lower is fresher, on {} layouts of `{}`; the best weights by validation. Intervals are 95 %, by bootstrap",
-        report.episodes, report.layouts
+        "Mean AoI in slots (lower is better) on {} layouts of `{}`, with the weights that are best on the validation layouts.",
+        summary.episodes, summary.layouts
     ));
-    page.0.push_str("over seeds and layouts. Repeated, or continued after an interruption, by\n");
+    page.0.push_str(if summary.seeds.len() == 1 {
+        "Intervals are 95 % bootstrap intervals over layouts; there is one seed, so they exclude seed variance.\n"
+    } else {
+        "Intervals are 95 % bootstrap intervals over seeds and layouts.\n"
+    });
+    page.line("This command repeats the experiment, and resumes it after an interruption:");
     page.line(&format!("```sh\n{command}\n```"));
-    for figure in figures {
-        page.line(&format!("![{figure}]({figure})"));
+    for plot in plots {
+        page.line(&format!("![{plot}]({plot})"));
     }
-    // A column of empty names says nothing.
+    // Without names, the column of points is left out.
     let points = experiment.points.iter().any(|point| !point.name.is_empty());
     page.line("## Learned policies");
-    let seeds: Vec<String> = report.seeds.iter().map(|seed| format!("seed {seed}")).collect();
+    let seeds: Vec<String> = summary.seeds.iter().map(|seed| format!("seed {seed}")).collect();
     let header = ["point", "series", "mean AoI", "95 % interval", "last weights", "p95", "peak", "coverage", "fairness"];
     page.head(points, header.into_iter().chain(seeds.iter().map(String::as_str)));
-    for row in &report.rows {
+    for row in &summary.rows {
         let last = row.last_mean_aoi.map_or("diverged".to_owned(), |last| format!("{:.2}", last.mean));
-        let m = &row.mean;
-        let cells = [
-            row.point.clone(),
-            row.series.clone(),
-            format!("{:.2}", row.mean_aoi.mean),
-            range(&row.mean_aoi),
-            last,
-            format!("{:.1}", m.p95_aoi),
-            format!("{:.1}", m.peak_aoi),
-            format!("{:.1} %", 100.0 * m.coverage),
-            format!("{:.2}", m.fairness),
-        ];
-        page.row(points, cells.into_iter().chain(row.per_seed.iter().map(|aoi| format!("{aoi:.2}"))));
+        let [aoi, interval, others @ ..] = metric_cells(&row.mean_aoi, &row.mean);
+        let cells = [row.point.clone(), row.series.clone(), aoi, interval, last];
+        page.row(points, cells.into_iter().chain(others).chain(row.per_seed.iter().map(|aoi| format!("{aoi:.2}"))));
     }
-    if !report.baselines.is_empty() {
+    if !summary.baselines.is_empty() {
         page.line("## Baselines on the same layouts");
         page.head(points, ["point", "policy", "mean AoI", "95 % interval", "p95", "peak", "coverage", "fairness"]);
-        for b in &report.baselines {
-            let m = &b.mean;
-            page.row(
-                points,
-                [
-                    b.point.clone(),
-                    b.name.clone(),
-                    format!("{:.2}", b.mean_aoi.mean),
-                    range(&b.mean_aoi),
-                    format!("{:.1}", m.p95_aoi),
-                    format!("{:.1}", m.peak_aoi),
-                    format!("{:.1} %", 100.0 * m.coverage),
-                    format!("{:.2}", m.fairness),
-                ],
-            );
+        for b in &summary.baselines {
+            page.row(points, [b.point.clone(), b.name.clone()].into_iter().chain(metric_cells(&b.mean_aoi, &b.mean)));
         }
     }
-    if !report.differences.is_empty() {
+    if !summary.differences.is_empty() {
         page.line("## Differences on the same layouts and seeds");
-        page.line("First minus second: negative where the first keeps data fresher.");
+        page.line("First minus second; a negative difference means that the first is better.");
         page.head(points, ["point", "first", "second", "difference", "95 % interval", "first is better"]);
-        for d in &report.differences {
-            page.row(
-                points,
-                [
-                    d.point.clone(),
-                    d.first.clone(),
-                    d.second.clone(),
-                    format!("{:+.2}", d.mean_aoi.mean),
-                    format!("{:+.2} to {:+.2}", d.mean_aoi.low, d.mean_aoi.high),
-                    format!("{:.0} %", 100.0 * d.wins),
-                ],
-            );
+        for d in &summary.differences {
+            let names = [d.point.clone(), d.first.clone(), d.second.clone()];
+            page.row(points, names.into_iter().chain(difference_cells(&d.mean_aoi, d.wins)));
         }
     }
     page.line("## Runs");
     page.head(points, ["point", "series", "seed", "steps", "best step", "best", "last", "folder"]);
-    for run in &report.runs {
+    for run in &summary.runs {
         page.row(
             points,
             [
@@ -97,20 +71,33 @@ pub fn readme(experiment: &Experiment, report: &Report, command: &str, figures: 
     page.0
 }
 
-fn range(interval: &Interval) -> String {
-    format!("{:.2} to {:.2}", interval.low, interval.high)
+/// Table cells: mean AoI, its interval, p95 AoI, peak AoI, coverage, fairness.
+pub fn metric_cells(mean_aoi: &Interval, mean: &EpisodeMetrics) -> [String; 6] {
+    [
+        format!("{:.2}", mean_aoi.mean),
+        format!("{:.2} to {:.2}", mean_aoi.low, mean_aoi.high),
+        format!("{:.1}", mean.p95_aoi),
+        format!("{:.1}", mean.peak_aoi),
+        format!("{:.1} %", 100.0 * mean.coverage),
+        format!("{:.2}", mean.fairness),
+    ]
 }
 
-/// Markdown as it grows.
+/// Table cells: difference of mean AoI, its interval, share of layouts on which the first is better.
+pub fn difference_cells(mean_aoi: &Interval, wins: f64) -> [String; 3] {
+    [format!("{:+.2}", mean_aoi.mean), format!("{:+.2} to {:+.2}", mean_aoi.low, mean_aoi.high), format!("{:.0} %", 100.0 * wins)]
+}
+
+/// The Markdown text so far.
 struct Page(String);
 
 impl Page {
-    /// A paragraph, a heading, a picture.
+    /// Adds a paragraph, a heading or a picture.
     fn line(&mut self, text: &str) {
         writeln!(self.0, "\n{text}").expect("a string takes what is written");
     }
 
-    /// The head of a table.
+    /// Adds the head of a table.
     fn head<T: AsRef<str>>(&mut self, points: bool, cells: impl IntoIterator<Item = T>) {
         let cells: Vec<T> = cells.into_iter().collect();
         let columns = cells.len();
@@ -119,7 +106,7 @@ impl Page {
         self.row(points, std::iter::repeat_n("---", columns));
     }
 
-    /// A row of a table; the first cell, the point, only where there are points.
+    /// Adds a row of a table. The first cell, the point, is left out if there are no points.
     fn row<T: AsRef<str>>(&mut self, points: bool, cells: impl IntoIterator<Item = T>) {
         let cells: Vec<String> =
             cells.into_iter().skip(usize::from(!points)).map(|cell| cell.as_ref().replace('|', "\\|")).collect();

@@ -235,8 +235,8 @@ mod tests {
     use crate::clock::{Clock, ManualClock};
     use crate::draining::Draining;
     use crate::jobs::{Executor, SchedulerConfig};
-    use crate::recipe::{Algorithm, Preset, TrainConfig};
     use crate::store::{JobId, JobKind, JobSpec, NewJob, Store};
+    use crate::train_config::{Algorithm, Preset, TrainConfig};
 
     /// Starts workers that run until they are killed.
     struct Endless;

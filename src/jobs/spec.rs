@@ -7,8 +7,8 @@ use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 
 use crate::invalid::{Invalid, expectation, in_range};
-use crate::recipe::{Algorithm, EXACT, Preset, TrainConfig, integral};
 use crate::store::{JobKind, JobSpec};
+use crate::train_config::{Algorithm, EXACT, Preset, TrainConfig, integral};
 
 /// The fields of a job request.
 pub const FIELDS: [&str; 10] =

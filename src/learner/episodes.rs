@@ -1,23 +1,24 @@
-//! Episodes in their compact form (spec 5): what replay holds and an update reads. Features are recomputed, never stored.
+//! Episodes in compact form, as replay holds and updates read them (docs/model.md, "Replay"). Observations are recomputed, never
+//! stored.
 
 use crate::env::EnvConfig;
 
-/// A batch of B episodes of equal size, structure of arrays. Positions are f32: what is stored is exactly what was seen.
+/// A batch of B episodes of equal size, as a structure of arrays. Positions are f32, as in the environment.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Episodes {
-    /// B.
+    /// Number of episodes B.
     pub len: usize,
-    /// M, N, K.
+    /// Number of UAVs M.
     pub uavs: usize,
-    /// N.
+    /// Number of users N.
     pub users: usize,
-    /// K.
+    /// Slots per episode K.
     pub slots: usize,
     /// (B, K+1, M, 2) UAV positions.
     pub uav_xy: Vec<f32>,
-    /// (B, S, N, 2) user positions; S = 1 when users stay, K+1 when they move.
+    /// (B, S, N, 2) user positions; S = 1 if users stay, K+1 if they move.
     pub user_xy: Vec<f32>,
-    /// Whether users move: S = K+1.
+    /// Whether users move.
     pub users_move: bool,
     /// (B, K+1, N) AoI in slots.
     pub aoi: Vec<f32>,
@@ -29,7 +30,7 @@ pub struct Episodes {
     pub token: Vec<f32>,
 }
 
-/// A symmetry of the square: mirrored left to right or not, then turned by quarters counter-clockwise.
+/// A symmetry of the square: optionally mirrored left to right, then rotated counter-clockwise by quarter turns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Symmetry {
     mirror: bool,
@@ -37,15 +38,15 @@ pub struct Symmetry {
 }
 
 impl Symmetry {
-    /// How many there are.
+    /// Number of symmetries.
     pub const COUNT: u8 = 8;
 
-    /// Symmetry number 0 (the identity) to 7.
+    /// The symmetry with number `i`, from 0 (the identity) to 7.
     pub fn number(i: u8) -> Self {
         Self { mirror: i & 4 != 0, quarters: i & 3 }
     }
 
-    /// Where a point of the square goes.
+    /// The image of a point.
     fn point(self, [x, y]: [f32; 2]) -> [f32; 2] {
         let x = if self.mirror { 1.0 - x } else { x };
         match self.quarters {
@@ -56,7 +57,7 @@ impl Symmetry {
         }
     }
 
-    /// What a heading becomes; hovering stays.
+    /// The image of a heading; hovering is unchanged.
     fn heading(self, h: u8) -> u8 {
         const COMPASS: u8 = EnvConfig::COMPASS as u8;
         if h >= COMPASS {
@@ -68,10 +69,10 @@ impl Symmetry {
 }
 
 impl Episodes {
-    /// Turns and mirrors each episode by its own symmetry: what another fleet in a square laid otherwise would have flown.
+    /// Rotates and mirrors positions and headings of each episode by its symmetry.
     ///
     /// # Panics
-    /// When there is not one symmetry per episode.
+    /// If there is not one symmetry per episode.
     pub fn transform(&mut self, symmetries: &[Symmetry]) {
         assert_eq!(symmetries.len(), self.len, "one symmetry per episode");
         let points = |xy: &mut [f32], s: Symmetry| {
@@ -93,11 +94,11 @@ mod tests {
     use crate::env::DIRECTIONS;
 
     #[test]
-    fn headings_turn_with_the_square() {
+    fn headings_rotate_with_positions() {
         let middle = [0.5, 0.5];
         for s in (0..Symmetry::COUNT).map(Symmetry::number) {
             assert_eq!(s.point(middle), middle);
-            assert_eq!(s.heading(8), 8, "hovering stays");
+            assert_eq!(s.heading(8), 8, "hovering is unchanged");
             for (h, d) in DIRECTIONS.iter().take(EnvConfig::COMPASS).enumerate() {
                 let moved = s.point([0.5 + 0.25 * d[0] as f32, 0.5 + 0.25 * d[1] as f32]);
                 let d = DIRECTIONS[s.heading(h as u8) as usize];

@@ -1,115 +1,204 @@
-//! How policies are judged (spec 7): frozen layouts, every policy on the same ones, paired differences, bootstrap intervals.
-//! How they are flown is in `flight`.
+//! Evaluates policies on layouts (docs/model.md, "Evaluation") and records what reports show.
+//!
+//! Checkpoints and baselines run through the same [`Policy`] trait. The episodes of a thread are stepped together. Layouts are
+//! independent, so the number of threads changes no bit.
 
-use rand::RngExt;
-use serde::{Deserialize, Serialize};
+use super::disturbance::Disturbance;
+use crate::env::{BatchEnv, EnvConfig, EpisodeMetrics, Point, points};
+use crate::invalid::{Invalid, in_range};
+use crate::policy::{FleetStep, Policy, Slot};
 
-use crate::env::EpisodeMetrics;
-use crate::invalid::Invalid;
-use crate::rng;
-
-/// A named, frozen list of layouts.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Layouts {
-    /// Its name.
-    pub name: &'static str,
-    /// Seed of its first episode; the others follow.
-    pub first: u64,
-    /// Number of episodes.
-    pub episodes: u64,
-}
-
-impl Layouts {
-    /// The first `episodes` seeds of the list (all, when it has fewer).
-    pub fn seeds(&self, episodes: usize) -> Vec<u64> {
-        (self.first..self.first + self.episodes.min(episodes as u64)).collect()
-    }
-}
-
-/// All lists: what policies are reported on, and what training chooses its best weights by. They share no seed with each
-/// other, nor with training, whose seeds have the top bit set.
-pub const LAYOUTS: [Layouts; 2] =
-    [Layouts { name: "eval-v1", first: 10_000, episodes: 256 }, Layouts { name: "valid-v1", first: 20_000, episodes: 4096 }];
-
-/// The list called `name`.
+/// Runs `policy` on the episodes with these seeds, split among `threads`. Returns the metrics in the order of `seeds`. A policy
+/// with fewer actions than the environment uses the first ones.
 ///
 /// # Errors
-/// An unknown name.
-pub fn layouts(name: &str) -> Result<Layouts, Invalid> {
-    let known = || LAYOUTS.map(|l| l.name).join(" or ");
-    LAYOUTS.into_iter().find(|l| l.name == name).ok_or_else(|| Invalid::new("layouts", format!("{name:?}"), known()))
+/// The environment is invalid, or the policy does not fit it.
+pub fn evaluate(policy: &dyn Policy, env: &EnvConfig, seeds: &[u64], threads: usize) -> Result<Vec<EpisodeMetrics>, Invalid> {
+    let parts = run_parallel(policy, env, seeds, threads, &Disturbance::default(), |_| ())?;
+    Ok(parts.into_iter().flat_map(|(metrics, ())| metrics).collect())
 }
 
-/// A mean with its 95 % bootstrap interval.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Interval {
-    /// Mean.
-    pub mean: f64,
-    /// 2.5th percentile of the resampled means.
-    pub low: f64,
-    /// 97.5th percentile of the resampled means.
-    pub high: f64,
+/// Metrics of a policy on layouts, with the curve and the trajectory that a report shows.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TracedEvaluation {
+    /// Metrics of each episode, in the order of the seeds.
+    pub episodes: Vec<EpisodeMetrics>,
+    /// Mean AoI over users and layouts in slots 0..=K, in slots.
+    pub aoi: Vec<f64>,
+    /// One episode, slot by slot.
+    pub trajectory: Trajectory,
 }
 
-impl Interval {
-    /// The percentile bootstrap: `mean` between the percentiles of what `resample` returns, call after call.
-    pub fn of_resamples(mean: f64, mut resample: impl FnMut() -> f64) -> Self {
-        const RESAMPLES: usize = 2000;
-        let mut means: Vec<f64> = (0..RESAMPLES).map(|_| resample()).collect();
-        means.sort_by(f64::total_cmp);
-        Self { mean, low: means[RESAMPLES / 40 - 1], high: means[RESAMPLES - RESAMPLES / 40] }
-    }
+/// True positions and AoI in slots 0..=K of one episode. Positions are in units of the square's side.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Trajectory {
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Per UAV its positions.
+    pub uavs: Vec<Vec<Point>>,
+    /// Per user its positions.
+    pub users: Vec<Vec<Point>>,
+    /// Per user its AoI, in slots.
+    pub aoi: Vec<Vec<f32>>,
 }
 
-/// What a report says about a policy on a list of layouts.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Summary {
-    /// Number of layouts.
-    pub episodes: usize,
-    /// Mean AoI with its interval, in slots.
-    pub mean_aoi: Interval,
-    /// Mean of every figure over the layouts.
-    pub mean: EpisodeMetrics,
-}
-
-/// How two policies differ on the same layouts: first minus second, negative where the first keeps data fresher.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Difference {
-    /// Mean difference of mean AoI with its interval, in slots.
-    pub mean_aoi: Interval,
-    /// Share of layouts on which the first is better.
-    pub wins: f64,
-}
-
-/// Means over layouts; the interval's resampling is seeded, so a report can be repeated.
+/// As [`evaluate`], under a disturbance, with a trace. `traced` is the index of the seed whose trajectory is kept.
 ///
 /// # Errors
-/// There are no episodes.
-pub fn summarize(episodes: &[EpisodeMetrics]) -> Result<Summary, Invalid> {
-    let aoi: Vec<f64> = episodes.iter().map(|e| e.mean_aoi).collect();
-    Ok(Summary { episodes: episodes.len(), mean_aoi: bootstrap(&aoi)?, mean: EpisodeMetrics::mean(episodes) })
-}
-
-/// The paired difference of two policies flown on the same layouts in the same order.
-///
-/// # Errors
-/// There are no episodes, or not equally many.
-pub fn difference(first: &[EpisodeMetrics], second: &[EpisodeMetrics]) -> Result<Difference, Invalid> {
-    if first.len() != second.len() {
-        return Err(Invalid::new("episodes", second.len(), format!("{}, the number of the other policy", first.len())));
-    }
-    let aoi: Vec<f64> = first.iter().zip(second).map(|(a, b)| a.mean_aoi - b.mean_aoi).collect();
-    let wins = aoi.iter().filter(|&&d| d < 0.0).count() as f64 / aoi.len().max(1) as f64;
-    Ok(Difference { mean_aoi: bootstrap(&aoi)?, wins })
-}
-
-/// Percentile bootstrap of the mean.
-fn bootstrap(values: &[f64]) -> Result<Interval, Invalid> {
-    if values.is_empty() {
+/// The environment or the disturbance is invalid, the policy does not fit it, or `traced` is not an index into `seeds`.
+pub fn evaluate_traced(
+    policy: &dyn Policy,
+    env: &EnvConfig,
+    seeds: &[u64],
+    traced: usize,
+    disturbance: &Disturbance,
+    threads: usize,
+) -> Result<TracedEvaluation, Invalid> {
+    if seeds.is_empty() {
         return Err(Invalid::new("episodes", 0, "at least 1"));
     }
-    let n = values.len();
-    let mut rng = rng::stream(0, "bootstrap", 0);
-    let mean = values.iter().sum::<f64>() / n as f64;
-    Ok(Interval::of_resamples(mean, || (0..n).map(|_| values[rng.random_range(0..n)]).sum::<f64>() / n as f64))
+    in_range("traced", traced, 0..=seeds.len() - 1)?;
+    let recorder = |seeds_before: usize| Recorder { traced: traced.checked_sub(seeds_before), ..Recorder::default() };
+    let parts = run_parallel(policy, env, seeds, threads, disturbance, recorder)?;
+    let mut evaluation =
+        TracedEvaluation { episodes: Vec::new(), aoi: vec![0.0; env.slots + 1], trajectory: Trajectory::default() };
+    for (metrics, recorder) in parts {
+        // Layout by layout, so that the order of the sum does not depend on the number of threads.
+        for b in 0..metrics.len() {
+            evaluation.aoi.iter_mut().zip(&recorder.aoi).for_each(|(sum, slot)| *sum += slot[b]);
+        }
+        evaluation.episodes.extend(metrics);
+        if !recorder.trajectory.uavs.is_empty() {
+            evaluation.trajectory = Trajectory { seed: seeds[traced], ..recorder.trajectory };
+        }
+    }
+    evaluation.aoi.iter_mut().for_each(|sum| *sum /= seeds.len() as f64);
+    Ok(evaluation)
+}
+
+/// Is called with a batch of episodes in each of the slots 0..=K.
+trait Observer {
+    fn observe(&mut self, env: &BatchEnv);
+}
+
+impl Observer for () {
+    fn observe(&mut self, _env: &BatchEnv) {}
+}
+
+/// Records one thread's episodes.
+#[derive(Default)]
+struct Recorder {
+    /// Index of the episode whose trajectory is kept, from this thread's first; absent when the index is before it.
+    traced: Option<usize>,
+    /// Per slot the mean AoI of each episode.
+    aoi: Vec<Vec<f64>>,
+    trajectory: Trajectory,
+}
+
+impl Observer for Recorder {
+    fn observe(&mut self, env: &BatchEnv) {
+        self.aoi.push((0..env.copies()).map(|b| env.mean_aoi(b)).collect());
+        let (m, n) = (env.config().uavs, env.config().users);
+        let Some(b) = self.traced.filter(|&b| b < env.copies()) else { return };
+        let trajectory = &mut self.trajectory;
+        trajectory.uavs.resize(m, Vec::new());
+        trajectory.users.resize(n, Vec::new());
+        trajectory.aoi.resize(n, Vec::new());
+        for (path, at) in trajectory.uavs.iter_mut().zip(points(&env.uav_xy()[b * m * 2..][..m * 2])) {
+            path.push(at);
+        }
+        for (path, at) in trajectory.users.iter_mut().zip(points(&env.user_xy()[b * n * 2..][..n * 2])) {
+            path.push(at);
+        }
+        for (ages, &age) in trajectory.aoi.iter_mut().zip(&env.aoi()[b * n..(b + 1) * n]) {
+            ages.push(age);
+        }
+    }
+}
+
+/// Runs all `seeds`, one share per thread, and returns the shares in order, each with its observer. `observer` makes an observer
+/// from the number of seeds before the share.
+fn run_parallel<O: Observer + Send>(
+    policy: &dyn Policy,
+    env: &EnvConfig,
+    seeds: &[u64],
+    threads: usize,
+    disturbance: &Disturbance,
+    observer: impl Fn(usize) -> O + Sync,
+) -> Result<Vec<(Vec<EpisodeMetrics>, O)>, Invalid> {
+    env.validate()?;
+    disturbance.validate(env)?;
+    policy.check_fleet(env.uavs, env.users)?;
+    if policy.actions() > env.headings() {
+        let expected = format!("at most {}, the headings of the environment", env.headings());
+        return Err(Invalid::new("policy.actions", policy.actions(), expected));
+    }
+    let share = seeds.len().div_ceil(threads.max(1)).max(1);
+    let run_share = |(i, seeds): (usize, &[u64])| {
+        let mut observer = observer(i * share);
+        run(policy, env, seeds, disturbance, &mut observer).map(|metrics| (metrics, observer))
+    };
+    if seeds.len() <= share {
+        return seeds.chunks(share).enumerate().map(run_share).collect();
+    }
+    let run_share = &run_share;
+    std::thread::scope(|scope| {
+        let threads: Vec<_> = seeds.chunks(share).enumerate().map(|part| scope.spawn(move || run_share(part))).collect();
+        threads.into_iter().map(|t| t.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))).collect()
+    })
+}
+
+/// Runs all `seeds` on this thread.
+fn run(
+    policy: &dyn Policy,
+    config: &EnvConfig,
+    seeds: &[u64],
+    disturbance: &Disturbance,
+    observer: &mut impl Observer,
+) -> Result<Vec<EpisodeMetrics>, Invalid> {
+    let (m, n) = (config.uavs, config.users);
+    let mut env = BatchEnv::new(config, seeds.len())?;
+    env.reset(seeds);
+    let width = policy.memory_len(m, n);
+    let mut memory = vec![0.0; width * seeds.len()];
+    let mut memories = split(&mut memory, width, seeds.len());
+    for (memory, &seed) in memories.iter_mut().zip(seeds) {
+        policy.start(m, n, seed, memory);
+    }
+    let mut slots = vec![Slot::default(); seeds.len()];
+    let mut headings = vec![0; seeds.len() * m];
+    let (mut uavs, mut users): (Vec<Point>, Vec<Point>) = (Vec::with_capacity(m), Vec::with_capacity(n));
+    observer.observe(&env);
+    while !env.done() {
+        let step = env.slot();
+        if let Some(uav) = disturbance.lost(step) {
+            env.ground(uav);
+        }
+        for ((b, slot), &seed) in slots.iter_mut().enumerate().zip(seeds) {
+            uavs.clear();
+            uavs.extend(points(&env.uav_xy()[b * m * 2..][..m * 2]));
+            users.clear();
+            users.extend(points(&env.user_xy()[b * n * 2..][..n * 2]));
+            disturbance.distort(config, seed, step, &mut uavs, &mut users);
+            slot.set_scene(&uavs, &users, &env.aoi()[b * n..(b + 1) * n], config.detection_range);
+        }
+        let mut steps: Vec<FleetStep<'_>> = slots
+            .iter()
+            .zip(&mut memories)
+            .zip(headings.chunks_exact_mut(m))
+            .map(|((slot, memory), headings)| FleetStep { slot, step: step as u64, memory, headings, q_values: None })
+            .collect();
+        policy.act(&mut steps);
+        env.step(&headings);
+        observer.observe(&env);
+    }
+    Ok((0..seeds.len()).map(|b| env.metrics(b)).collect())
+}
+
+/// `all` cut into `count` memories of `width`, which may be 0.
+fn split(all: &mut [f32], width: usize, count: usize) -> Vec<&mut [f32]> {
+    if width == 0 {
+        return (0..count).map(|_| Default::default()).collect();
+    }
+    all.chunks_exact_mut(width).collect()
 }

@@ -1,32 +1,39 @@
-//! What a training run tells as it goes. No clock here: whoever listens adds the time.
+//! The events that a training run yields. They carry no time; the consumer adds it.
+
+use serde::{Deserialize, Serialize};
 
 use crate::env::EpisodeMetrics;
 
-/// One thing that happened in training. `step` counts environment slots since the beginning.
+/// An event of a training run. `step` is the number of environment steps made.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Event {
     /// Episodes were collected and the networks updated.
     Iteration(Iteration),
-    /// The greedy policy flew the evaluation layouts.
-    Evaluation {
-        /// Environment steps at which it was taken.
-        step: u64,
-        /// Mean over the layouts.
-        metrics: EpisodeMetrics,
-    },
-    /// A weight left the range of sensible numbers: the run ends here, and its best weights are all that is left of it.
+    /// The greedy policy was evaluated on the validation layouts.
+    Evaluation(Evaluation),
+    /// A weight is not finite or too large. The run has ended; the best weights so far remain available.
     Diverged {
-        /// Environment steps until then.
+        /// Environment steps made.
         step: u64,
     },
-    /// All steps are done.
+    /// All steps are made. The run has ended.
     Finished {
-        /// Environment steps in the end.
+        /// Environment steps made.
         step: u64,
     },
 }
 
-/// Figures of one iteration: `envs` episodes and `updates_per_iteration` updates.
+/// Metrics of the greedy policy on the validation layouts.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Evaluation {
+    /// Environment steps made when it was taken.
+    pub step: u64,
+    /// Mean over the layouts.
+    pub metrics: EpisodeMetrics,
+}
+
+/// Metrics of one iteration: `envs` episodes and `updates_per_iteration` updates.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Iteration {
     /// Environment steps after it.
@@ -35,20 +42,20 @@ pub struct Iteration {
     pub episodes: u64,
     /// Updates made after it.
     pub updates: u64,
-    /// Exploration while collecting.
+    /// Epsilon during collection.
     pub epsilon: f64,
-    /// Mean AoI of the episodes collected.
+    /// Mean AoI of the collected episodes, in slots.
     pub mean_aoi: f64,
-    /// Mean of the updates' losses; absent while the buffer holds less than a batch.
+    /// Mean of the updates' losses; absent while replay holds less than a batch.
     pub loss: Option<f64>,
     /// Mean of the updates' gradient norms before clipping.
     pub grad_norm: Option<f64>,
-    /// Mean chosen Q_tot over the updates.
+    /// Mean Q_tot of the actions taken, over the updates.
     pub q_tot: Option<f64>,
 }
 
 impl Event {
-    /// The event as rows of a curve: (step, name, value). Names are those that servers and CSV files show.
+    /// The event as metrics: (step, name, value), with the names used by servers and CSV files.
     pub fn rows(&self) -> Vec<(u64, &'static str, f64)> {
         match self {
             Self::Iteration(i) => {
@@ -57,7 +64,7 @@ impl Event {
                 rows.extend(optional.into_iter().filter_map(|(name, value)| Some((i.step, name, value?))));
                 rows
             }
-            Self::Evaluation { step, metrics: m } => vec![
+            Self::Evaluation(Evaluation { step, metrics: m }) => vec![
                 (*step, "eval/mean_aoi", m.mean_aoi),
                 (*step, "eval/p95_aoi", m.p95_aoi),
                 (*step, "eval/peak_aoi", m.peak_aoi),

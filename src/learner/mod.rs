@@ -1,26 +1,30 @@
-//! Learning (spec 5): replay, rollout, targets, the update, training as an iterator of events, evaluation.
+//! Learning: replay, rollout, loss, update, training as an iterator of events, evaluation (docs/model.md, "Learner").
 
 mod disturbance;
 mod episodes;
 mod evaluation;
 mod event;
-mod flight;
-pub mod objective;
+mod layouts;
+pub mod loss;
 pub mod replay;
 mod rollout;
 mod snapshot;
+mod state;
+mod summary;
 mod trainer;
 mod update;
 
-pub use disturbance::{Disturbance, Loss};
+pub use disturbance::{Disturbance, LostUav};
 pub use episodes::{Episodes, Symmetry};
-pub use evaluation::{Difference, Interval, LAYOUTS, Layouts, Summary, difference, layouts, summarize};
-pub use event::{Event, Iteration};
-pub use flight::{Survey, Track, evaluate, survey};
+pub use evaluation::{TracedEvaluation, Trajectory, evaluate, evaluate_traced};
+pub use event::{Evaluation, Event, Iteration};
+pub use layouts::{LAYOUT_LISTS, LayoutList, layout_list};
+pub use loss::LossMetrics;
 pub use rollout::Rollout;
 pub use snapshot::SnapshotError;
-pub use trainer::{Evaluated, Trainer};
-pub use update::{Learner, LearnerState, Update};
+pub use summary::{Difference, Interval, Summary, difference, summarize};
+pub use trainer::Trainer;
+pub use update::{Learner, LearnerState};
 
 pub use crate::policy::mixer::MixerKind;
-pub use crate::recipe::{Algorithm, Preset, TrainConfig, Training};
+pub use crate::train_config::{Algorithm, Preset, TrainConfig, Training};

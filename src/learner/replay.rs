@@ -1,5 +1,5 @@
-//! Replay (spec 5): a ring of whole episodes in compact form. AoI is u16, actions u8, positions f32; memory grows with the
-//! episodes held, not with the capacity.
+//! Replay: a ring buffer of whole episodes (docs/model.md, "Replay"). AoI is stored as u16, actions as u8, positions as f32. Memory
+//! grows with the episodes held, not with the capacity.
 
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
@@ -7,35 +7,35 @@ use rand_chacha::ChaCha8Rng;
 use super::Episodes;
 use crate::env::EnvConfig;
 
-/// The last `capacity` episodes, all of one size.
+/// The last `capacity` episodes, all of the same shape.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Replay {
-    shape: Shape,
+    shape: EpisodeShape,
     capacity: usize,
     len: usize,
-    /// Where the next episode goes.
+    /// Index at which the next episode is stored.
     next: usize,
-    data: Data,
-    /// 0, 1, ..: scratch of sampling.
+    arrays: ReplayArrays,
+    /// 0, 1, 2, ..; sampling permutes it temporarily.
     order: Vec<u32>,
 }
 
-/// Size of an episode.
+/// Sizes of an episode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Shape {
-    /// M.
+pub struct EpisodeShape {
+    /// Number of UAVs M.
     pub uavs: usize,
-    /// N.
+    /// Number of users N.
     pub users: usize,
-    /// K.
+    /// Slots per episode K.
     pub slots: usize,
     /// Whether users move.
     pub users_move: bool,
 }
 
-/// Episode after episode, structure of arrays; see [`Episodes`].
+/// The stored episodes as a structure of arrays; see [`Episodes`] for the layout of each.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Data {
+pub(super) struct ReplayArrays {
     pub uav_xy: Vec<f32>,
     pub user_xy: Vec<f32>,
     pub aoi: Vec<u16>,
@@ -44,8 +44,8 @@ pub(super) struct Data {
     pub token: Vec<f32>,
 }
 
-impl Shape {
-    /// The shape of the episodes of `e`.
+impl EpisodeShape {
+    /// The shape of the episodes in `e`.
     pub fn of(e: &Episodes) -> Self {
         Self { uavs: e.uavs, users: e.users, slots: e.slots, users_move: e.users_move }
     }
@@ -55,7 +55,7 @@ impl Shape {
         Self { uavs: env.uavs, users: env.users, slots: env.slots, users_move: env.user_speed > 0.0 }
     }
 
-    /// Values per episode of each array of [`Data`], in its order.
+    /// Values per episode of each array of [`ReplayArrays`], in its order.
     fn widths(&self) -> [usize; 6] {
         let (m, n, k) = (self.uavs, self.users, self.slots);
         let moments = if self.users_move { k + 1 } else { 1 };
@@ -71,71 +71,71 @@ impl Shape {
 
 impl Replay {
     /// An empty replay for `capacity` episodes.
-    pub fn new(shape: Shape, capacity: usize) -> Self {
-        Self { shape, capacity, len: 0, next: 0, data: Data::default(), order: Vec::new() }
+    pub fn new(shape: EpisodeShape, capacity: usize) -> Self {
+        Self { shape, capacity, len: 0, next: 0, arrays: ReplayArrays::default(), order: Vec::new() }
     }
 
-    /// A replay that holds what another held; `None` where the pieces do not fit together.
-    pub(super) fn from_parts(shape: Shape, capacity: usize, next: usize, data: Data) -> Option<Self> {
+    /// A replay with this content; `None` if the sizes contradict each other.
+    pub(super) fn from_parts(shape: EpisodeShape, capacity: usize, next: usize, arrays: ReplayArrays) -> Option<Self> {
         let [uavs, users, aoi, actions, reward, token] = shape.widths();
-        let len = data.reward.len() / reward.max(1);
+        let len = arrays.reward.len() / reward.max(1);
         let fits = [
-            data.uav_xy.len() == len * uavs,
-            data.user_xy.len() == len * users,
-            data.aoi.len() == len * aoi,
-            data.actions.len() == len * actions,
-            data.reward.len() == len * reward,
-            data.token.len() == len * token,
+            arrays.uav_xy.len() == len * uavs,
+            arrays.user_xy.len() == len * users,
+            arrays.aoi.len() == len * aoi,
+            arrays.actions.len() == len * actions,
+            arrays.reward.len() == len * reward,
+            arrays.token.len() == len * token,
             len <= capacity,
             next == if len < capacity { len } else { next.min(capacity - 1) },
         ];
         let order = (0..len as u32).collect();
-        fits.into_iter().all(|fit| fit).then_some(Self { shape, capacity, len, next, data, order })
+        fits.into_iter().all(|fit| fit).then_some(Self { shape, capacity, len, next, arrays, order })
     }
 
-    /// Episodes held.
+    /// Number of episodes held.
     pub fn len(&self) -> usize {
         self.len
     }
 
-    /// Whether it holds nothing.
+    /// Whether it holds no episode.
     pub fn is_empty(&self) -> bool {
         self.len == 0
     }
 
-    /// Where the next episode goes.
+    /// Index at which the next episode is stored.
     pub(super) fn next(&self) -> usize {
         self.next
     }
 
-    /// What it holds.
-    pub(super) fn data(&self) -> &Data {
-        &self.data
+    /// The stored episodes.
+    pub(super) fn arrays(&self) -> &ReplayArrays {
+        &self.arrays
     }
 
     /// Bytes held.
     pub fn bytes(&self) -> usize {
-        let d = &self.data;
+        let d = &self.arrays;
         4 * (d.uav_xy.capacity() + d.user_xy.capacity() + d.reward.capacity() + d.token.capacity() + self.order.capacity())
             + 2 * d.aoi.capacity()
             + d.actions.capacity()
     }
 
-    /// Adds every episode of `batch`, over the oldest where the ring is full.
+    /// Adds every episode of `batch`. When the replay is full, each replaces the oldest.
     ///
     /// # Panics
-    /// When the episodes are of another size.
+    /// If the episodes have another shape.
     pub fn push(&mut self, batch: &Episodes) {
-        assert_eq!(Shape::of(batch), self.shape, "all episodes of a replay have one size");
+        assert_eq!(EpisodeShape::of(batch), self.shape, "all episodes of a replay have one shape");
         let [uavs, users, aoi, actions, reward, token] = self.shape.widths();
         for b in 0..batch.len {
             let at = self.next;
-            put(&mut self.data.uav_xy, at, &batch.uav_xy[b * uavs..][..uavs], |x| x);
-            put(&mut self.data.user_xy, at, &batch.user_xy[b * users..][..users], |x| x);
-            put(&mut self.data.aoi, at, &batch.aoi[b * aoi..][..aoi], |x| x as u16);
-            put(&mut self.data.actions, at, &batch.actions[b * actions..][..actions], |x| x);
-            put(&mut self.data.reward, at, &batch.reward[b * reward..][..reward], |x| x);
-            put(&mut self.data.token, at, &batch.token[b * token..][..token], |x| x);
+            put(&mut self.arrays.uav_xy, at, &batch.uav_xy[b * uavs..][..uavs], |x| x);
+            put(&mut self.arrays.user_xy, at, &batch.user_xy[b * users..][..users], |x| x);
+            put(&mut self.arrays.aoi, at, &batch.aoi[b * aoi..][..aoi], |x| x as u16);
+            put(&mut self.arrays.actions, at, &batch.actions[b * actions..][..actions], |x| x);
+            put(&mut self.arrays.reward, at, &batch.reward[b * reward..][..reward], |x| x);
+            put(&mut self.arrays.token, at, &batch.token[b * token..][..token], |x| x);
             if self.len < self.capacity {
                 self.order.push(self.len as u32);
                 self.len += 1;
@@ -144,10 +144,10 @@ impl Replay {
         }
     }
 
-    /// Draws `count` different episodes, each as likely as any other, into `batch`, whose allocations are kept.
+    /// Draws `count` different episodes uniformly into `batch`, reusing its allocations.
     ///
     /// # Panics
-    /// When fewer than `count` are held.
+    /// If fewer than `count` episodes are held.
     pub fn sample(&mut self, count: usize, rng: &mut ChaCha8Rng, batch: &mut Episodes) {
         assert!(count <= self.len, "{count} different episodes of {}", self.len);
         let shape = self.shape;
@@ -157,7 +157,7 @@ impl Replay {
             array.clear();
         }
         batch.actions.clear();
-        // The beginning of a shuffle; undone below, so that the next draw depends on its own stream only.
+        // The first `count` steps of a shuffle. They are undone below, so that a draw depends on its own random stream only.
         let mut swaps = Vec::with_capacity(count);
         for i in 0..count {
             let j = rng.random_range(i..self.len);
@@ -166,13 +166,13 @@ impl Replay {
         }
         let [uavs, users, aoi, actions, reward, token] = shape.widths();
         for &e in &self.order[..count] {
-            let (e, data) = (e as usize, &self.data);
-            batch.uav_xy.extend_from_slice(&data.uav_xy[e * uavs..][..uavs]);
-            batch.user_xy.extend_from_slice(&data.user_xy[e * users..][..users]);
-            batch.aoi.extend(data.aoi[e * aoi..][..aoi].iter().map(|&a| f32::from(a)));
-            batch.actions.extend_from_slice(&data.actions[e * actions..][..actions]);
-            batch.reward.extend_from_slice(&data.reward[e * reward..][..reward]);
-            batch.token.extend_from_slice(&data.token[e * token..][..token]);
+            let (e, arrays) = (e as usize, &self.arrays);
+            batch.uav_xy.extend_from_slice(&arrays.uav_xy[e * uavs..][..uavs]);
+            batch.user_xy.extend_from_slice(&arrays.user_xy[e * users..][..users]);
+            batch.aoi.extend(arrays.aoi[e * aoi..][..aoi].iter().map(|&a| f32::from(a)));
+            batch.actions.extend_from_slice(&arrays.actions[e * actions..][..actions]);
+            batch.reward.extend_from_slice(&arrays.reward[e * reward..][..reward]);
+            batch.token.extend_from_slice(&arrays.token[e * token..][..token]);
         }
         for (i, j) in swaps.into_iter().enumerate().rev() {
             self.order.swap(i, j);
@@ -180,14 +180,14 @@ impl Replay {
     }
 }
 
-/// Writes `values` as entry `at` of equally long entries, appending where it is the first of that number.
-fn put<T: Copy, U>(array: &mut Vec<U>, at: usize, values: &[T], as_held: impl Fn(T) -> U) {
+/// Writes `values` as entry `at` of an array of equally long entries; appends if `at` is the number of entries.
+fn put<T: Copy, U>(array: &mut Vec<U>, at: usize, values: &[T], convert: impl Fn(T) -> U) {
     let start = at * values.len();
     if start == array.len() {
-        array.extend(values.iter().map(|&x| as_held(x)));
+        array.extend(values.iter().map(|&x| convert(x)));
     } else {
         for (held, &x) in array[start..].iter_mut().zip(values) {
-            *held = as_held(x);
+            *held = convert(x);
         }
     }
 }
@@ -197,10 +197,10 @@ mod tests {
     use super::*;
     use crate::rng;
 
-    const SHAPE: Shape = Shape { uavs: 3, users: 5, slots: 80, users_move: false };
+    const SHAPE: EpisodeShape = EpisodeShape { uavs: 3, users: 5, slots: 80, users_move: false };
 
-    /// Episodes whose every value tells which episode it is of.
-    fn numbered(shape: Shape, numbers: std::ops::Range<usize>) -> Episodes {
+    /// Episodes in which every value is the number of the episode.
+    fn numbered(shape: EpisodeShape, numbers: std::ops::Range<usize>) -> Episodes {
         let [uavs, users, aoi, actions, reward, token] = shape.widths();
         let fill = |width: usize| -> Vec<f32> { numbers.clone().flat_map(|e| vec![e as f32; width]).collect() };
         Episodes {
@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_go_first() {
+    fn the_oldest_episodes_are_replaced() {
         let mut replay = Replay::new(SHAPE, 10);
         replay.push(&numbered(SHAPE, 0..8));
         assert_eq!(replay.len(), 8);
@@ -234,8 +234,8 @@ mod tests {
     }
 
     #[test]
-    fn episodes_come_back_whole() {
-        for shape in [SHAPE, Shape { users_move: true, ..SHAPE }] {
+    fn sampled_episodes_equal_the_stored_ones() {
+        for shape in [SHAPE, EpisodeShape { users_move: true, ..SHAPE }] {
             let mut replay = Replay::new(shape, 10);
             replay.push(&numbered(shape, 0..7));
             let mut batch = Episodes::default();
@@ -256,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn draws_are_without_replacement_uniform_and_independent_of_each_other() {
+    fn draws_are_uniform_without_replacement_and_independent() {
         let mut replay = Replay::new(SHAPE, 20);
         replay.push(&numbered(SHAPE, 0..20));
         let alone = sampled(&mut replay.clone(), 8, 77);
@@ -270,13 +270,13 @@ mod tests {
             drawn.dedup();
             assert_eq!(drawn.len(), 8);
         }
-        assert_eq!(sampled(&mut replay, 8, 77), alone, "draws before it leave no trace");
+        assert_eq!(sampled(&mut replay, 8, 77), alone, "earlier draws have no effect");
         // 800 expected, standard deviation 22.
         assert!(counts.iter().all(|c| (690..910).contains(c)), "{counts:?}");
     }
 
     #[test]
-    fn a_full_replay_of_the_paper_s_size_is_small() {
+    fn a_replay_of_the_paper_s_size_takes_less_than_50_mib() {
         let mut replay = Replay::new(SHAPE, 5000);
         let batch = numbered(SHAPE, 0..8);
         for _ in 0..700 {
@@ -287,8 +287,8 @@ mod tests {
     }
 
     #[test]
-    fn ages_beyond_u16_saturate() {
-        let shape = Shape { uavs: 1, users: 1, slots: 1, users_move: false };
+    fn aoi_beyond_u16_saturates() {
+        let shape = EpisodeShape { uavs: 1, users: 1, slots: 1, users_move: false };
         let mut replay = Replay::new(shape, 1);
         let mut e = numbered(shape, 0..1);
         e.aoi = vec![65_534.0, 70_000.0];

@@ -16,7 +16,7 @@
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
-use super::replay::Shape;
+use super::replay::EpisodeShape;
 use super::{Episodes, TrainConfig};
 use crate::env::BatchEnv;
 use crate::invalid::Invalid;
@@ -47,7 +47,7 @@ impl Rollout {
         let (environment, fleets) = (&config.environment, config.training.envs);
         let (m, n, k) = (environment.uavs, environment.users, environment.slots);
         let env = BatchEnv::new(environment, fleets)?;
-        let shape = Shape::of_environment(environment);
+        let shape = EpisodeShape::of_environment(environment);
         let moments = if shape.users_move { k + 1 } else { 1 };
         let episodes = Episodes {
             len: fleets,
@@ -153,7 +153,7 @@ fn place<T: Copy>(all: &mut [T], now: &[T], episodes: usize, slot: usize) {
 mod tests {
     use super::*;
     use crate::env::{Layout, Start};
-    use crate::recipe::{Algorithm, Preset};
+    use crate::train_config::{Algorithm, Preset};
 
     fn config(envs: usize, user_speed: f64) -> TrainConfig {
         let mut config = TrainConfig::preset(Algorithm::Qmix, Preset::Practical);

@@ -9,79 +9,18 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use rand::RngExt;
-use serde::{Deserialize, Serialize};
 
 use super::episodes::Symmetry;
-use super::replay::{Replay, Shape};
+use super::replay::{EpisodeShape, Replay};
 use super::rollout::Rollout;
 use super::snapshot::{self, SnapshotError};
-use super::{Episodes, Event, Iteration, Learner, LearnerState, TrainConfig, Training, evaluate, layouts};
+use super::state::{Phase, RunState};
+use super::{Episodes, Evaluation, Event, Iteration, Learner, TrainConfig, Training, evaluate, layout_list};
 use crate::checkpoint::{self, Checkpoint};
 use crate::env::EpisodeMetrics;
 use crate::invalid::Invalid;
 use crate::policy::LearnedPolicy;
 use crate::rng;
-
-/// What the next call of `next` does.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-enum Phase {
-    Evaluate,
-    Iterate,
-    Finish,
-    Finished,
-}
-
-/// How far a run has come.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct Progress {
-    phase: Phase,
-    /// Environment slots flown.
-    step: u64,
-    /// Episodes collected.
-    episodes: u64,
-    /// Updates made.
-    updates: u64,
-    /// Episodes when the targets were last copied.
-    copied: u64,
-    /// Step of the next evaluation.
-    next_evaluation: u64,
-}
-
-impl Progress {
-    /// Whether a run of this configuration, with this many episodes in replay, can have come so far.
-    pub(super) fn fits(&self, config: &TrainConfig, held: usize) -> bool {
-        let t = &config.training;
-        self.episodes.checked_mul(config.environment.slots as u64) == Some(self.step)
-            && self.step < t.steps + (t.envs * config.environment.slots) as u64
-            && self.copied <= self.episodes
-            && self.updates <= self.episodes.saturating_mul(t.updates_per_iteration as u64)
-            && self.next_evaluation <= (self.step / t.eval_every + 1) * t.eval_every
-            && held as u64 == self.episodes.min(t.buffer as u64)
-    }
-}
-
-/// Figures on the validation layouts and when they were taken.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Evaluated {
-    /// Environment steps.
-    pub step: u64,
-    /// Mean over the layouts.
-    pub metrics: EpisodeMetrics,
-}
-
-/// Everything that a run's future depends on; what a snapshot holds.
-#[derive(Debug)]
-pub(super) struct State {
-    pub config: TrainConfig,
-    pub progress: Progress,
-    pub latest: Option<Evaluated>,
-    pub best: Option<(Evaluated, Vec<f32>)>,
-    pub learner: LearnerState,
-    pub replay: Replay,
-}
 
 /// A training run.
 pub struct Trainer {
@@ -91,9 +30,7 @@ pub struct Trainer {
     rollout: Rollout,
     replay: Replay,
     batch: Episodes,
-    progress: Progress,
-    latest: Option<Evaluated>,
-    best: Option<(Evaluated, Vec<f32>)>,
+    run: RunState,
     stop: Arc<AtomicBool>,
 }
 
@@ -105,16 +42,14 @@ impl Trainer {
     pub fn new(config: TrainConfig, threads: usize) -> Result<Self, Invalid> {
         config.validate()?;
         let learner = Learner::new(&config, threads)?;
-        let replay = Replay::new(Shape::of_environment(&config.environment), config.training.buffer);
+        let replay = Replay::new(EpisodeShape::of_environment(&config.environment), config.training.buffer);
         Ok(Self {
             rollout: Rollout::new(&config, learner.agent())?,
             threads,
             learner,
             replay,
             batch: Episodes::default(),
-            progress: Progress { phase: Phase::Evaluate, step: 0, episodes: 0, updates: 0, copied: 0, next_evaluation: 0 },
-            latest: None,
-            best: None,
+            run: RunState::new(),
             stop: Arc::default(),
             config,
         })
@@ -125,26 +60,17 @@ impl Trainer {
     /// # Errors
     /// The bytes are damaged, of another version, or do not hold a run that can be.
     pub fn restore(bytes: &[u8], threads: usize) -> Result<Self, SnapshotError> {
-        let state = snapshot::decode(bytes)?;
-        let mut trainer = Self::new(state.config, threads)?;
-        trainer.learner.restore(state.learner)?;
-        trainer.replay = state.replay;
-        trainer.progress = state.progress;
-        trainer.latest = state.latest;
-        trainer.best = state.best;
+        let snapshot = snapshot::decode(bytes)?;
+        let mut trainer = Self::new(snapshot.config, threads)?;
+        trainer.learner.restore(snapshot.learner)?;
+        trainer.replay = snapshot.replay;
+        trainer.run = snapshot.run;
         Ok(trainer)
     }
 
     /// Everything needed to go on later, elsewhere, as if the run had never stopped.
     pub fn snapshot(&self) -> Vec<u8> {
-        snapshot::encode(&snapshot::Parts {
-            config: &self.config,
-            progress: &self.progress,
-            latest: self.latest.as_ref(),
-            best: self.best.as_ref(),
-            learner: &self.learner.state(),
-            replay: &self.replay,
-        })
+        snapshot::encode(&self.config, &self.run, &self.learner.state(), &self.replay)
     }
 
     /// Once set, [`Iterator::next`] returns `None` after the event it is working on; cleared, the run goes on.
@@ -159,12 +85,12 @@ impl Trainer {
 
     /// Environment slots flown.
     pub fn step(&self) -> u64 {
-        self.progress.step
+        self.run.counters.step
     }
 
     /// Whether there is nothing more to tell: all steps are done, or the run diverged.
     pub fn finished(&self) -> bool {
-        self.progress.phase == Phase::Finished
+        self.run.counters.phase == Phase::Finished
     }
 
     /// The current weights, with their figures where they were just evaluated.
@@ -172,9 +98,9 @@ impl Trainer {
     /// # Errors
     /// Training has diverged: a weight is no sensible number.
     pub fn checkpoint(&self) -> Result<Checkpoint, checkpoint::Error> {
-        let latest = self.latest.filter(|e| e.step == self.progress.step);
+        let latest = self.run.latest.filter(|e| e.step == self.run.counters.step);
         let weights = self.learner.published().to_vec();
-        Checkpoint::new(self.config.clone(), self.progress.step, latest.map(|e| e.metrics), weights)
+        Checkpoint::new(self.config.clone(), self.run.counters.step, latest.map(|e| e.metrics), weights)
     }
 
     /// The weights with the lowest mean AoI on the validation layouts so far; `None` before the first evaluation.
@@ -182,35 +108,35 @@ impl Trainer {
     /// # Errors
     /// Training has diverged: a weight is no sensible number.
     pub fn best(&self) -> Result<Option<Checkpoint>, checkpoint::Error> {
-        let best = self.best.as_ref();
+        let best = self.run.best.as_ref();
         best.map(|(e, weights)| Checkpoint::new(self.config.clone(), e.step, Some(e.metrics), weights.clone())).transpose()
     }
 
     /// Figures of the best weights and the step they are of, without copying them.
-    pub fn best_evaluation(&self) -> Option<Evaluated> {
-        self.best.as_ref().map(|(e, _)| *e)
+    pub fn best_evaluation(&self) -> Option<Evaluation> {
+        self.run.best.as_ref().map(|(e, _)| *e)
     }
 
     fn evaluate(&mut self) -> Event {
         let t = &self.config.training;
         let weights = self.learner.published()[..self.learner.agent().layout().len()].to_vec();
         let policy = LearnedPolicy::new(self.config.agent(), self.config.dims(), weights).expect("as many as the agent has");
-        let seeds = layouts("valid-v1").expect("a list of this program").seeds(t.eval_episodes);
+        let seeds = layout_list("valid-v1").expect("a list of this program").seeds(t.eval_episodes);
         let flown = evaluate(&policy, &self.config.environment, &seeds, self.threads).expect("an agent fits its environment");
-        let now = Evaluated { step: self.progress.step, metrics: EpisodeMetrics::mean(&flown) };
-        self.latest = Some(now);
-        if self.best.as_ref().is_none_or(|(best, _)| now.metrics.mean_aoi < best.metrics.mean_aoi) {
-            self.best = Some((now, self.learner.published().to_vec()));
+        let now = Evaluation { step: self.run.counters.step, metrics: EpisodeMetrics::mean(&flown) };
+        self.run.latest = Some(now);
+        if self.run.best.as_ref().is_none_or(|(best, _)| now.metrics.mean_aoi < best.metrics.mean_aoi) {
+            self.run.best = Some((now, self.learner.published().to_vec()));
         }
-        let p = &mut self.progress;
+        let p = &mut self.run.counters;
         p.next_evaluation = (p.step / t.eval_every + 1) * t.eval_every;
         p.phase = if p.step >= t.steps { Phase::Finish } else { Phase::Iterate };
-        Event::Evaluation { step: now.step, metrics: now.metrics }
+        Event::Evaluation(now)
     }
 
     fn iterate(&mut self) -> Event {
         let t = &self.config.training;
-        let p = &mut self.progress;
+        let p = &mut self.run.counters;
         let epsilon = epsilon(t, p.step);
         let learning_rate = learning_rate(t, p.step);
         let flown = self.rollout.collect(self.learner.agent(), self.learner.agent_parameters(), epsilon, p.episodes);
@@ -265,12 +191,12 @@ impl Iterator for Trainer {
         if self.stop.load(Ordering::Relaxed) {
             return None;
         }
-        Some(match self.progress.phase {
+        Some(match self.run.counters.phase {
             Phase::Evaluate => self.evaluate(),
             Phase::Iterate => self.iterate(),
             Phase::Finish => {
-                self.progress.phase = Phase::Finished;
-                Event::Finished { step: self.progress.step }
+                self.run.counters.phase = Phase::Finished;
+                Event::Finished { step: self.run.counters.step }
             }
             Phase::Finished => return None,
         })
@@ -295,7 +221,7 @@ fn epsilon(t: &Training, step: u64) -> f64 {
 #[allow(clippy::float_cmp, reason = "the ends of the schedule are exact")]
 mod tests {
     use super::*;
-    use crate::recipe::{Algorithm, Preset};
+    use crate::train_config::{Algorithm, Preset};
 
     #[test]
     fn a_run_that_diverges_says_so_and_keeps_its_best() {
@@ -303,7 +229,7 @@ mod tests {
         config.environment.slots = 5;
         config.training.batch = 8;
         let mut trainer = Trainer::new(config, 1).unwrap();
-        assert!(matches!(trainer.next(), Some(Event::Evaluation { .. })));
+        assert!(matches!(trainer.next(), Some(Event::Evaluation(_))));
         let best = trainer.best().unwrap().unwrap();
         let mut state = trainer.learner.state();
         state.online.fill(1e30);

@@ -3,15 +3,12 @@
 use rayon::ThreadPool;
 
 use super::episodes::Episodes;
-use super::objective::{Figures, Objective, Returns};
+use super::loss::{Loss, LossMetrics, TdLambda};
 use crate::invalid::{Invalid, in_range};
 use crate::nn::{Adam, ParameterLayout};
 use crate::policy::Agent;
-use crate::recipe::TrainConfig;
 use crate::rng;
-
-/// What an update reports.
-pub type Update = Figures;
+use crate::train_config::TrainConfig;
 
 /// Everything of a learner that a snapshot must hold; vectors as long as [`Learner::layout`].
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -33,7 +30,7 @@ pub struct LearnerState {
 /// Online and target networks with their optimiser. Same configuration, same episodes: same bits, on any number of threads.
 #[derive(Debug)]
 pub struct Learner {
-    objective: Objective<f32>,
+    loss: Loss<f32>,
     online: Vec<f32>,
     target: Vec<f32>,
     adam: Adam<f32>,
@@ -52,11 +49,11 @@ impl Learner {
     pub fn new(config: &TrainConfig, threads: usize) -> Result<Self, Invalid> {
         in_range("threads", threads, 1..=1024)?;
         let training = &config.training;
-        let returns = Returns { gamma: training.gamma, lambda: training.lambda };
-        let objective = Objective::new(config.agent(), config.dims(), training.mixer, returns, threads);
-        let mut online: Vec<f32> = objective.layout().initialise(&mut rng::stream(config.seed, "init", 0));
+        let td_lambda = TdLambda { gamma: training.gamma, lambda: training.lambda };
+        let loss = Loss::new(config.agent(), config.dims(), training.mixer, td_lambda, threads);
+        let mut online: Vec<f32> = loss.layout().initialise(&mut rng::stream(config.seed, "init", 0));
         // The last layers of the hypernetworks, by their names in the checkpoint.
-        for p in objective.layout().parameters().iter().filter(|p| p.name.starts_with("mixer.") && p.name.contains(".2.")) {
+        for p in loss.layout().parameters().iter().filter(|p| p.name.starts_with("mixer.") && p.name.contains(".2.")) {
             online[p.range.clone()].iter_mut().for_each(|x| *x *= training.hyper_init as f32);
         }
         let pool = rayon::ThreadPoolBuilder::new()
@@ -67,7 +64,7 @@ impl Learner {
         Ok(Self {
             target: online.clone(),
             adam: Adam::new(online.len()),
-            objective,
+            loss,
             average: if training.average > 1 { (online.clone(), training.average) } else { (Vec::new(), 0) },
             online,
             tau: training.target_tau as f32,
@@ -80,10 +77,10 @@ impl Learner {
     ///
     /// # Panics
     /// When the episodes' sizes are not those of the configuration, or there are none.
-    pub fn update(&mut self, episodes: &Episodes, learning_rate: f64) -> Update {
-        let Self { objective, online, target, adam, pool, .. } = self;
-        let figures = pool.install(|| objective.evaluate(online, target, episodes, None));
-        adam.step(online, objective.gradient(), learning_rate, (figures.grad_norm, self.clip));
+    pub fn update(&mut self, episodes: &Episodes, learning_rate: f64) -> LossMetrics {
+        let Self { loss, online, target, adam, pool, .. } = self;
+        let metrics = pool.install(|| loss.evaluate(online, target, episodes, None));
+        adam.step(online, loss.gradient(), learning_rate, (metrics.grad_norm, self.clip));
         if self.tau > 0.0 {
             blend(&mut self.target, &self.online, self.tau);
         }
@@ -92,7 +89,7 @@ impl Learner {
             let seen = self.adam.steps.min(self.average.1);
             blend(&mut self.average.0, &self.online, 1.0 / seen as f32);
         }
-        figures
+        metrics
     }
 
     /// Copies the online networks to the targets.
@@ -102,12 +99,12 @@ impl Learner {
 
     /// The agents' architecture.
     pub fn agent(&self) -> &Agent {
-        self.objective.agent()
+        self.loss.agent()
     }
 
     /// Names, shapes and ranges of the flat vectors: `agent.*`, then `mixer.*`.
     pub fn layout(&self) -> &ParameterLayout {
-        self.objective.layout()
+        self.loss.layout()
     }
 
     /// All parameters of the online networks.

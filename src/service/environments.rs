@@ -4,8 +4,8 @@ use serde_json::Value;
 
 use super::paging::json_bytes;
 use super::{App, Error, Page, PageRequest};
-use crate::recipe;
 use crate::serving::{Blueprint, EnvironmentInfo, Flight, Reset, State};
+use crate::train_config;
 
 /// How to create an environment.
 #[derive(Clone, Debug)]
@@ -29,7 +29,7 @@ pub struct Create {
 pub async fn create(app: &App, create: Create) -> Result<EnvironmentInfo, Error> {
     app.admit()?;
     let Create { id, environment, seed, count, auto_reset } = create;
-    let blueprint = Blueprint::new(recipe::environment(environment)?, count, seed, auto_reset)?;
+    let blueprint = Blueprint::new(train_config::environment(environment)?, count, seed, auto_reset)?;
     Ok(app.environments.create(id, blueprint).await?)
 }
 

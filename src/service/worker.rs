@@ -8,8 +8,8 @@ use super::{App, Error, policies};
 use crate::error_code::ErrorCode;
 use crate::invalid::{Invalid, in_range};
 use crate::jobs::{Directive, equal_secrets, token_digest};
-use crate::recipe::TrainConfig;
 use crate::store::{AttemptResult, EndedAttempt, JobId, Lease, Metric, NewCheckpoint, PartialSnapshot, PendingAction, Snapshot};
+use crate::train_config::TrainConfig;
 
 /// Largest chunk of an upload, in bytes.
 pub const MAX_CHUNK: usize = 1 << 20;

@@ -11,7 +11,7 @@ use sqlx::{FromRow, Sqlite, SqliteConnection, Transaction};
 use uuid::Uuid;
 
 use super::{Error, Result, Store, corrupt, timestamp};
-use crate::recipe::{Algorithm, Preset, TrainConfig};
+use crate::train_config::{Algorithm, Preset, TrainConfig};
 
 /// Identifies a job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]

@@ -9,7 +9,7 @@ use std::time::Duration;
 use qedgix::checkpoint::Checkpoint;
 use qedgix::env::EpisodeMetrics;
 use qedgix::jobs::LocalProcess;
-use qedgix::learner::{Event, Preset, TrainConfig, Trainer, evaluate, layouts};
+use qedgix::learner::{Event, Preset, TrainConfig, Trainer, evaluate, layout_list};
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
@@ -138,7 +138,7 @@ fn undisturbed(spec: &Value) -> (Rows, Checkpoint) {
     let seed = spec["seed"].as_u64().unwrap();
     let config = TrainConfig::resolve(algorithm, Preset::default(), &environment, &training, seed).unwrap();
     let reference = |checkpoint: &Checkpoint| {
-        let seeds = layouts("eval-v1").unwrap().seeds(256);
+        let seeds = layout_list("eval-v1").unwrap().seeds(256);
         EpisodeMetrics::mean(&evaluate(&checkpoint.policy(), &config.environment, &seeds, 1).unwrap()).mean_aoi
     };
     let mut trainer = Trainer::new(config.clone(), 1).unwrap();

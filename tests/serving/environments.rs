@@ -4,7 +4,7 @@ use bytes::Bytes;
 use futures::future::join_all;
 use qedgix::api::convert::structs::to_struct;
 use qedgix::env::{BatchEnv, EnvConfig, EpisodeMetrics};
-use qedgix::recipe;
+use qedgix::train_config;
 use qedgix::wire::v1;
 use qedgix::wire::v1::environment_service_client::EnvironmentServiceClient;
 use rand::RngExt;
@@ -89,7 +89,7 @@ async fn an_environment_is_a_batch_env() {
         ("large, stepped elsewhere", 2, json!({"uavs": 40, "users": 700, "slots": 3})),
     ];
     for (id, count, environment) in cases {
-        let config: EnvConfig = recipe::environment(environment.clone()).unwrap();
+        let config: EnvConfig = train_config::environment(environment.clone()).unwrap();
         let mut env = BatchEnv::new(&config, count).unwrap();
         env.reset(&(0..count as u64).map(|b| 7 + b).collect::<Vec<_>>());
         let state = made(&mut client, create(id, count as u32, &environment)).await;

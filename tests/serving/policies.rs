@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 use bytes::Bytes;
 use jiff::Timestamp;
 use qedgix::checkpoint::{Checkpoint, digest};
-use qedgix::recipe::{Algorithm, Preset};
 use qedgix::service::policies::{IndexEntry, index};
 use qedgix::store::{
     AttemptResult, CheckpointKind, EndedAttempt, JobId, JobKind, JobSpec, NewCheckpoint, NewJob, Store, SubmitResult,

@@ -3,9 +3,9 @@
 use bytes::Bytes;
 use qedgix::checkpoint::{Checkpoint, layout};
 use qedgix::policy::FleetStep;
-use qedgix::recipe::{Algorithm, Preset, TrainConfig};
 use qedgix::service::{Error, policies};
 use qedgix::serving::{Observation, PolicyRef};
+use qedgix::train_config::{Algorithm, Preset, TrainConfig};
 use qedgix::wire::v1;
 use rand::RngExt;
 

@@ -15,11 +15,11 @@ use super::structs::to_struct;
 use crate::env::EnvConfig;
 use crate::invalid::Invalid;
 use crate::jobs::Directive;
-use crate::recipe::{Algorithm, Preset, TrainConfig, Training};
 use crate::store::{
     Attempt, AttemptOutcome, AttemptResult, Checkpoint, CheckpointKind, Job, JobId, JobKind, JobState, JobSummary, Metric,
     MetricRow, NewCheckpoint, PendingAction, SpecSummary,
 };
+use crate::train_config::{Algorithm, Preset, TrainConfig, Training};
 use crate::wire::v1;
 
 /// What may be asked of a job; all of it is optional.

@@ -7,7 +7,7 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use crate::learner::Episodes;
-use crate::learner::objective::chunk_of;
+use crate::learner::loss::chunk_of;
 use crate::nn::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
 use crate::policy::{Agent, Geometry};
 

@@ -11,18 +11,19 @@ use anyhow::Context;
 use serde::{Deserialize, Serialize};
 
 use crate::checkpoint::Checkpoint;
-use crate::cli::files::{read_if_there, write_whole};
-use crate::experiment::{Curve, Experiment, Outcome, Run};
+use crate::cli::files::{read_if_exists, write_atomic};
+use crate::experiment::{Experiment, Run, RunResult, TrainingCurve};
+use crate::files::partial_path;
 use crate::learner::Trainer;
 
 /// A run's folder.
-pub struct Folder {
+pub struct RunFolder {
     path: PathBuf,
 }
 
 /// How far a run had come when its files were last written.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Progress {
+pub struct RunProgress {
     /// Environment steps.
     pub step: u64,
     /// Seconds of training.
@@ -33,18 +34,18 @@ pub struct Progress {
     pub diverged: bool,
 }
 
-impl Folder {
+impl RunFolder {
     /// The folder of `run` below `root`; not made yet.
     pub fn new(root: &Path, run: &Run) -> Self {
         Self { path: root.join("runs").join(&run.folder) }
     }
 
     fn read(&self, name: &str) -> anyhow::Result<Option<Vec<u8>>> {
-        read_if_there(&self.path.join(name))
+        read_if_exists(&self.path.join(name))
     }
 
     fn write(&self, name: &str, bytes: &[u8]) -> anyhow::Result<()> {
-        write_whole(&self.path.join(name), bytes)
+        write_atomic(&self.path.join(name), bytes)
     }
 
     /// Makes the folder, and writes the configuration that it is named after.
@@ -54,21 +55,21 @@ impl Folder {
     }
 
     /// What the run left, if it is finished and was flown on the layouts of this experiment.
-    pub fn outcome(&self, experiment: &Experiment) -> anyhow::Result<Option<Outcome>> {
+    pub fn result(&self, experiment: &Experiment) -> anyhow::Result<Option<RunResult>> {
         let Some(bytes) = self.read("result.json")? else { return Ok(None) };
         // A result of another version is no result; the weights are flown again.
-        let outcome: Option<Outcome> = serde_json::from_slice(&bytes).ok();
-        Ok(outcome.filter(|o| o.layouts == experiment.layouts && o.best.episodes.len() == experiment.layout_seeds.len()))
+        let result: Option<RunResult> = serde_json::from_slice(&bytes).ok();
+        Ok(result.filter(|o| o.layouts == experiment.layouts && o.best.episodes.len() == experiment.layout_seeds.len()))
     }
 
     /// How far training has come.
-    pub fn progress(&self) -> anyhow::Result<Progress> {
+    pub fn progress(&self) -> anyhow::Result<RunProgress> {
         let bytes = self.read("progress.json")?;
         Ok(bytes.and_then(|bytes| serde_json::from_slice(&bytes).ok()).unwrap_or_default())
     }
 
     /// The run where its snapshot left it, with its curve; at its beginning where there is none that can be used.
-    pub fn restore(&self, run: &Run, threads: usize) -> anyhow::Result<(Trainer, Curve, f64)> {
+    pub fn restore(&self, run: &Run, threads: usize) -> anyhow::Result<(Trainer, TrainingCurve, f64)> {
         if let Some(bytes) = self.read("snapshot")?
             && let Ok(trainer) = Trainer::restore(&bytes, threads)
             && *trainer.config() == run.config
@@ -77,18 +78,18 @@ impl Folder {
             curve.truncate(trainer.step());
             return Ok((trainer, curve, self.progress()?.seconds));
         }
-        Ok((Trainer::new(run.config.clone(), threads)?, Curve::default(), 0.0))
+        Ok((Trainer::new(run.config.clone(), threads)?, TrainingCurve::default(), 0.0))
     }
 
     /// The curve so far.
-    pub fn curve(&self) -> anyhow::Result<Curve> {
+    pub fn curve(&self) -> anyhow::Result<TrainingCurve> {
         let bytes = self.read("curve.csv")?.with_context(|| format!("{} has no curve.csv", self.path.display()))?;
         let text = String::from_utf8(bytes).with_context(|| format!("{}/curve.csv", self.path.display()))?;
-        Curve::parse(&text).with_context(|| format!("{}/curve.csv", self.path.display()))
+        TrainingCurve::parse(&text).with_context(|| format!("{}/curve.csv", self.path.display()))
     }
 
     /// Keeps a run that is under way.
-    pub fn save(&self, snapshot: &[u8], curve: &Curve, progress: &Progress) -> anyhow::Result<()> {
+    pub fn save(&self, snapshot: &[u8], curve: &TrainingCurve, progress: &RunProgress) -> anyhow::Result<()> {
         // The curve first: rows after the snapshot are computed again, missing ones are not.
         self.write("curve.csv", curve.csv().as_bytes())?;
         self.write("snapshot", snapshot)?;
@@ -100,8 +101,8 @@ impl Folder {
         &self,
         best: &Checkpoint,
         last: Option<&Checkpoint>,
-        curve: &Curve,
-        progress: &Progress,
+        curve: &TrainingCurve,
+        progress: &RunProgress,
     ) -> anyhow::Result<()> {
         self.write("curve.csv", curve.csv().as_bytes())?;
         self.write("policy.safetensors", &best.to_bytes())?;
@@ -128,12 +129,15 @@ impl Folder {
     }
 
     /// Ends the run: its result is there, its snapshot is of no more use.
-    pub fn finish(&self, outcome: &Outcome) -> anyhow::Result<()> {
-        self.write("result.json", &serde_json::to_vec(outcome)?)?;
-        // What a process left that was killed while it wrote goes too.
-        for name in ["snapshot", "snapshot.partial"] {
-            match fs::remove_file(self.path.join(name)) {
-                Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(e).context("removing a snapshot"),
+    pub fn finish(&self, result: &RunResult) -> anyhow::Result<()> {
+        self.write("result.json", &serde_json::to_vec(result)?)?;
+        let snapshot = self.path.join("snapshot");
+        // The partial file is left by a process that was killed during a write.
+        for path in [partial_path(&snapshot), snapshot] {
+            match fs::remove_file(&path) {
+                Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+                    return Err(e).with_context(|| format!("cannot remove {}", path.display()));
+                }
                 _ => {}
             }
         }

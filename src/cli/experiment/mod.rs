@@ -14,15 +14,15 @@ use anyhow::{Context, bail};
 use clap::Args;
 use serde_json::{Value, json};
 
-use self::folder::Folder;
+use self::folder::RunFolder;
 use self::runner::Runner;
-use super::files::write_whole;
+use super::files::write_atomic;
 use super::run_args::{self, all_cores};
 use crate::cli::output::outln;
 use crate::env::EpisodeMetrics;
-use crate::experiment::{Curve, Experiment, Figure, Outcome, Overrides, figures, readme, report};
-use crate::figure::Flight;
-use crate::learner::{Disturbance, Interval, evaluate, survey};
+use crate::experiment::{Experiment, ExperimentSummary, Overrides, PlotKind, RunResult, TrainingCurve, plots, readme};
+use crate::learner::{Disturbance, Interval, evaluate, evaluate_traced};
+use crate::plot::Trajectories;
 use crate::policy::baselines;
 
 /// Flags of `experiment`.
@@ -131,10 +131,10 @@ fn command(args: &ExperimentArgs) -> String {
 fn list(experiment: &Experiment, out: &Path) -> anyhow::Result<()> {
     outln!("{}: {} runs below {}", experiment.title, experiment.runs.len(), out.display())?;
     for run in &experiment.runs {
-        let folder = Folder::new(out, run);
+        let folder = RunFolder::new(out, run);
         let (steps, progress) = (run.config.training.steps, folder.progress()?);
         let state = match progress.step {
-            _ if folder.outcome(experiment)?.is_some() => "done".to_owned(),
+            _ if folder.result(experiment)?.is_some() => "done".to_owned(),
             _ if progress.trained => "trained".to_owned(),
             0 => "to do".to_owned(),
             step => format!("at step {step}"),
@@ -146,27 +146,27 @@ fn list(experiment: &Experiment, out: &Path) -> anyhow::Result<()> {
 
 /// Writes what all runs say together: numbers, a page, figures; and the measured seconds, which differ from time to time.
 fn conclude(experiment: &Experiment, out: &Path, threads: usize, command: &str) -> anyhow::Result<()> {
-    let mut outcomes: Vec<Outcome> = Vec::new();
-    let mut curves: Vec<Curve> = Vec::new();
+    let mut results: Vec<RunResult> = Vec::new();
+    let mut curves: Vec<TrainingCurve> = Vec::new();
     for run in &experiment.runs {
-        let folder = Folder::new(out, run);
-        outcomes.push(folder.outcome(experiment)?.with_context(|| format!("{} has no result", run.folder))?);
+        let folder = RunFolder::new(out, run);
+        results.push(folder.result(experiment)?.with_context(|| format!("{} has no result", run.folder))?);
         curves.push(folder.curve()?);
     }
-    let report = report(experiment, &outcomes, &references(experiment, threads)?);
-    let drawn = figures(experiment, &report, &curves, &flights(experiment, out)?);
+    let summary = ExperimentSummary::new(experiment, &results, &references(experiment, threads)?);
+    let drawn = plots(experiment, &summary, &curves, &trajectories(experiment, out)?);
     let names: Vec<String> = drawn.iter().map(|(name, _)| name.clone()).collect();
     for (name, svg) in &drawn {
-        write_whole(&out.join(name), svg.as_bytes())?;
+        write_atomic(&out.join(name), svg.as_bytes())?;
     }
-    let seconds: Vec<Value> = (experiment.runs.iter().zip(&outcomes))
-        .map(|(run, outcome)| json!({"folder": run.folder, "training_seconds": outcome.seconds}))
+    let seconds: Vec<Value> = (experiment.runs.iter().zip(&results))
+        .map(|(run, result)| json!({"folder": run.folder, "training_seconds": result.seconds}))
         .collect();
-    write_whole(&out.join("timing.json"), &serde_json::to_vec_pretty(&seconds)?)?;
-    write_whole(&out.join("results.json"), &serde_json::to_vec_pretty(&report)?)?;
-    let page = readme(experiment, &report, command, &names);
-    write_whole(&out.join("README.md"), page.as_bytes())?;
-    for row in &report.rows {
+    write_atomic(&out.join("timing.json"), &serde_json::to_vec_pretty(&seconds)?)?;
+    write_atomic(&out.join("results.json"), &serde_json::to_vec_pretty(&summary)?)?;
+    let page = readme(experiment, &summary, command, &names);
+    write_atomic(&out.join("README.md"), page.as_bytes())?;
+    for row in &summary.rows {
         let Interval { mean, low, high } = row.mean_aoi;
         let name = [row.point.as_str(), row.series.as_str()].join(" ");
         outln!("{:<32} mean AoI {mean:6.2}  ({low:.2} to {high:.2})", name.trim_start())?;
@@ -190,17 +190,17 @@ fn references(experiment: &Experiment, threads: usize) -> anyhow::Result<Vec<Vec
 }
 
 /// What the best weights of the first seed fly on the first layout, where that is what the experiment draws.
-fn flights(experiment: &Experiment, out: &Path) -> anyhow::Result<Vec<Flight>> {
-    if experiment.figure != Figure::Trajectories {
+fn trajectories(experiment: &Experiment, out: &Path) -> anyhow::Result<Vec<Trajectories>> {
+    if experiment.plot != PlotKind::Trajectories {
         return Ok(Vec::new());
     }
     let first = experiment.runs.iter().take(experiment.series.len() * experiment.points.len());
-    let flight = |run: &crate::experiment::Run| {
-        let policy = Folder::new(out, run).best()?.policy();
+    let trajectory = |run: &crate::experiment::Run| {
+        let policy = RunFolder::new(out, run).best()?.policy();
         let env = &run.config.environment;
-        let track = survey(&policy, env, &experiment.layout_seeds[..1], 0, &Disturbance::default(), 1)?.track;
-        let users = track.users.iter().filter_map(|path| path.first().copied()).collect();
-        Ok(Flight { uavs: track.uavs, users, transmission_range: env.transmission_range })
+        let trajectory = evaluate_traced(&policy, env, &experiment.layout_seeds[..1], 0, &Disturbance::default(), 1)?.trajectory;
+        let users = trajectory.users.iter().filter_map(|path| path.first().copied()).collect();
+        Ok(Trajectories { uavs: trajectory.uavs, users, transmission_range: env.transmission_range })
     };
-    first.map(flight).collect()
+    first.map(trajectory).collect()
 }

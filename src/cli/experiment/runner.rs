@@ -9,10 +9,10 @@ use std::time::Instant;
 use anyhow::Context;
 use indicatif::{MultiProgress, ProgressBar};
 
-use super::folder::{Folder, Progress};
+use super::folder::{RunFolder, RunProgress};
 use crate::cli::output::errln;
 use crate::cli::progress;
-use crate::experiment::{Experiment, Flown, Outcome, Run};
+use crate::experiment::{EvaluatedWeights, Experiment, Run, RunResult};
 use crate::learner::{Event, Trainer, evaluate};
 
 /// What the threads share.
@@ -52,7 +52,7 @@ impl<'a> Runner<'a> {
     pub fn run(&self) -> anyhow::Result<bool> {
         let mut pending = Vec::new();
         for run in &self.experiment.runs {
-            if Folder::new(self.root, run).outcome(self.experiment)?.is_none() {
+            if RunFolder::new(self.root, run).result(self.experiment)?.is_none() {
                 pending.push(run);
             }
         }
@@ -92,11 +92,11 @@ impl<'a> Runner<'a> {
             if ended.is_err() {
                 self.stop.store(true, Ordering::Relaxed);
             }
-            if let Some(outcome) = ended? {
+            if let Some(result) = ended? {
                 self.count(self.unfinished.fetch_sub(1, Ordering::Relaxed) - 1);
-                let aoi = outcome.best.episodes.iter().map(|e| e.mean_aoi).sum::<f64>() / outcome.best.episodes.len() as f64;
-                let note = if outcome.diverged { "  (diverged)" } else { "" };
-                self.say(&format!("done  {label}: mean AoI {aoi:.2} on {}{note}", outcome.layouts));
+                let aoi = result.best.episodes.iter().map(|e| e.mean_aoi).sum::<f64>() / result.best.episodes.len() as f64;
+                let note = if result.diverged { "  (diverged)" } else { "" };
+                self.say(&format!("done  {label}: mean AoI {aoi:.2} on {}{note}", result.layouts));
             }
         }
         Ok(())
@@ -117,19 +117,19 @@ impl<'a> Runner<'a> {
     }
 
     /// Trains and flies one run; `None` when it was stopped before its end.
-    fn one(&self, run: &Run, label: &str, bar: &ProgressBar) -> anyhow::Result<Option<Outcome>> {
-        let folder = Folder::new(self.root, run);
+    fn one(&self, run: &Run, label: &str, bar: &ProgressBar) -> anyhow::Result<Option<RunResult>> {
+        let folder = RunFolder::new(self.root, run);
         folder.create(run)?;
         if !folder.progress()?.trained && !self.train(run, &folder, label, bar)? {
             return Ok(None);
         }
         let progress = folder.progress()?;
-        let fly = |checkpoint: &crate::checkpoint::Checkpoint| -> anyhow::Result<Flown> {
+        let fly = |checkpoint: &crate::checkpoint::Checkpoint| -> anyhow::Result<EvaluatedWeights> {
             let seeds = &self.experiment.layout_seeds;
             let episodes = evaluate(&checkpoint.policy(), &run.config.environment, seeds, self.share())?;
-            Ok(Flown { step: checkpoint.step(), episodes })
+            Ok(EvaluatedWeights { step: checkpoint.step(), episodes })
         };
-        let outcome = Outcome {
+        let result = RunResult {
             layouts: self.experiment.layouts.clone(),
             steps: progress.step,
             diverged: progress.diverged,
@@ -137,16 +137,16 @@ impl<'a> Runner<'a> {
             last: if progress.diverged { None } else { Some(fly(&folder.last()?)?) },
             seconds: progress.seconds,
         };
-        folder.finish(&outcome)?;
-        Ok(Some(outcome))
+        folder.finish(&result)?;
+        Ok(Some(result))
     }
 
     /// Trains to the end, or until stopped; whether it is the end.
-    fn train(&self, run: &Run, folder: &Folder, label: &str, bar: &ProgressBar) -> anyhow::Result<bool> {
+    fn train(&self, run: &Run, folder: &RunFolder, label: &str, bar: &ProgressBar) -> anyhow::Result<bool> {
         let mut threads = self.share();
         let (mut trainer, mut curve, before) = folder.restore(run, threads)?;
         let begun = Instant::now();
-        let progress = |trainer: &Trainer, trained, diverged| Progress {
+        let progress = |trainer: &Trainer, trained, diverged| RunProgress {
             step: trainer.step(),
             seconds: before + begun.elapsed().as_secs_f64(),
             trained,
@@ -164,7 +164,7 @@ impl<'a> Runner<'a> {
             let step = trainer.step().min(steps);
             bar.set_position(step);
             self.overall.inc(step - std::mem::replace(&mut told, step));
-            let evaluated = if let Event::Evaluation { step, metrics } = event { Some((step, metrics.mean_aoi)) } else { None };
+            let evaluated = if let Event::Evaluation(e) = event { Some((e.step, e.metrics.mean_aoi)) } else { None };
             if evaluated.is_none() && !self.stopped() {
                 continue;
             }

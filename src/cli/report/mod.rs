@@ -8,10 +8,11 @@ mod render;
 use std::fs;
 use std::path::Path;
 
-use super::comparison::{Comparison, Flown, Pair};
-use crate::figure::{self, Bar, Chart, Flight, Series};
-use crate::learner::Interval;
-use render::{Document, Figure, Section, Table};
+use super::comparison::{Comparison, Pair, PolicyEvaluation};
+use crate::experiment::{difference_cells, metric_cells};
+use crate::learner::{Difference, Interval};
+use crate::plot::{self, Bar, Chart, Series, Trajectories};
+use render::{ReportPage, ReportPlot, ReportSection, ReportTable};
 
 /// Writes `index.html`, `report.md`, `report.json` and the figures into `directory`, which is made where it is missing;
 /// files of these names are replaced.
@@ -19,18 +20,18 @@ use render::{Document, Figure, Section, Table};
 /// # Errors
 /// The directory or a file cannot be written.
 pub fn write(directory: &Path, comparison: &Comparison, command: &str) -> anyhow::Result<()> {
-    let document = document(comparison, command)?;
+    let page = page(comparison, command)?;
     fs::create_dir_all(directory)?;
-    for figure in document.sections.iter().flat_map(|s| &s.figures) {
+    for figure in page.sections.iter().flat_map(|s| &s.plots) {
         fs::write(directory.join(&figure.file), &figure.svg)?;
     }
-    fs::write(directory.join("index.html"), render::html(&document))?;
-    fs::write(directory.join("report.md"), render::markdown(&document))?;
+    fs::write(directory.join("index.html"), render::html(&page))?;
+    fs::write(directory.join("report.md"), render::markdown(&page))?;
     fs::write(directory.join("report.json"), serde_json::to_string_pretty(&comparison.json()?)? + "\n")?;
     Ok(())
 }
 
-fn document(comparison: &Comparison, command: &str) -> anyhow::Result<Document> {
+fn page(comparison: &Comparison, command: &str) -> anyhow::Result<ReportPage> {
     let flown = comparison.best_first();
     let mut sections = vec![conditions(comparison), policies(&flown)];
     for name in Comparison::REFERENCES {
@@ -40,10 +41,10 @@ fn document(comparison: &Comparison, command: &str) -> anyhow::Result<Document> 
     sections.push(over_slots(&flown));
     sections.push(over_layouts(&flown));
     sections.push(flights(comparison, &flown));
-    Ok(Document { title: "Evaluation of UAV policies".to_owned(), command: command.to_owned(), sections })
+    Ok(ReportPage { title: "Evaluation of UAV policies".to_owned(), command: command.to_owned(), sections })
 }
 
-fn conditions(comparison: &Comparison) -> Section {
+fn conditions(comparison: &Comparison) -> ReportSection {
     let Comparison { env, disturbance, layouts, episodes, .. } = comparison;
     let row = |what: &str, value: String| vec![what.to_owned(), value];
     let last = layouts.first + *episodes as u64 - 1;
@@ -63,90 +64,80 @@ fn conditions(comparison: &Comparison) -> Section {
             },
         ),
     ];
-    Section {
+    ReportSection {
         title: "What was flown".to_owned(),
         text: "Every policy flew the same layouts. Lengths are in units of the square's side; the age of information (AoI) is \
                in slots, and less is fresher."
             .to_owned(),
-        table: Some(Table { header: vec!["condition".to_owned(), "value".to_owned()], rows, numbers_from: 2 }),
-        figures: Vec::new(),
+        table: Some(ReportTable { header: vec!["condition".to_owned(), "value".to_owned()], rows, numbers_from: 2 }),
+        plots: Vec::new(),
     }
 }
 
-fn policies(flown: &[&Flown]) -> Section {
+fn policies(flown: &[&PolicyEvaluation]) -> ReportSection {
     let header = ["policy", "mean AoI", "95 % interval", "p95 AoI", "peak AoI", "coverage", "fairness"];
     let rows = flown.iter().map(|f| {
-        let (interval, mean) = (f.summary.mean_aoi, f.summary.mean);
-        vec![
-            if f.reference { format!("{} (reference)", f.name) } else { f.name.clone() },
-            format!("{:.2}", interval.mean),
-            format!("{:.2} to {:.2}", interval.low, interval.high),
-            format!("{:.1}", mean.p95_aoi),
-            format!("{:.1}", mean.peak_aoi),
-            format!("{:.1} %", 100.0 * mean.coverage),
-            format!("{:.2}", mean.fairness),
-        ]
+        let name = if f.reference { format!("{} (reference)", f.name) } else { f.name.clone() };
+        std::iter::once(name).chain(metric_cells(&f.summary.mean_aoi, &f.summary.mean)).collect()
     });
     let bars: Vec<Bar> = flown.iter().map(|f| bar(f, f.summary.mean_aoi)).collect();
-    Section {
+    ReportSection {
         title: "Policies, the freshest first".to_owned(),
         text: "Means over layouts; the interval of the mean AoI is a 95 % bootstrap interval. p95 and peak are over the users \
                and slots of an episode, coverage is the share of users ever visited, fairness is Jain's index of the users' \
                mean AoI. References flew only to be compared with; `tour` is a planner that knows everything, not a bound."
             .to_owned(),
-        table: Some(Table { header: header.map(str::to_owned).to_vec(), rows: rows.collect(), numbers_from: 1 }),
-        figures: vec![Figure {
+        table: Some(ReportTable { header: header.map(str::to_owned).to_vec(), rows: rows.collect(), numbers_from: 1 }),
+        plots: vec![ReportPlot {
             file: "means.svg".to_owned(),
             caption: "Mean AoI with its 95 % interval.".to_owned(),
-            svg: figure::bars("Mean AoI", "mean AoI (slots)", &bars),
+            svg: plot::bars("Mean AoI", "mean AoI (slots)", &bars),
         }],
     }
 }
 
 /// Nothing when the reference did not fly, or nobody else did.
-fn gaps(name: &str, gaps: &[Pair]) -> Option<Section> {
+fn gaps(name: &str, gaps: &[Pair]) -> Option<ReportSection> {
     let others = gaps.iter().filter(|(f, reference, _)| f.name != reference.name);
-    let rows: Vec<Vec<String>> =
-        others.map(|(f, _, d)| vec![f.name.clone(), signed(d.mean_aoi), between(d.mean_aoi), share(d.wins)]).collect();
+    let rows: Vec<Vec<String>> = others.map(|(f, _, d)| difference_row([&f.name], d)).collect();
     if rows.is_empty() {
         return None;
     }
     // The reference keeps its bar, of length 0, so that every policy keeps its colour.
     let bars: Vec<Bar> = gaps.iter().map(|(f, _, d)| bar(f, d.mean_aoi)).collect();
     let header = ["policy", "gap", "95 % interval", "better on"];
-    Some(Section {
+    Some(ReportSection {
         title: format!("Gap to {name}"),
         text: format!(
             "Mean AoI of the policy minus that of {name} on the same layout, averaged over layouts: negative where the policy \
              is better."
         ),
-        table: Some(Table { header: header.map(str::to_owned).to_vec(), rows, numbers_from: 1 }),
-        figures: vec![Figure {
+        table: Some(ReportTable { header: header.map(str::to_owned).to_vec(), rows, numbers_from: 1 }),
+        plots: vec![ReportPlot {
             file: format!("gap-{name}.svg"),
             caption: format!("Gap to {name} with its 95 % interval."),
-            svg: figure::bars(&format!("Gap to {name}"), &format!("mean AoI minus that of {name} (slots)"), &bars),
+            svg: plot::bars(&format!("Gap to {name}"), &format!("mean AoI minus that of {name} (slots)"), &bars),
         }],
     })
 }
 
 /// Nothing when only one policy was asked for.
-fn pairs(pairs: &[Pair]) -> Option<Section> {
-    let row = |(a, b, d): &Pair| vec![a.name.clone(), b.name.clone(), signed(d.mean_aoi), between(d.mean_aoi), share(d.wins)];
-    let rows: Vec<_> = pairs.iter().map(row).collect();
+fn pairs(pairs: &[Pair]) -> Option<ReportSection> {
+    let rows: Vec<_> = pairs.iter().map(|(a, b, d)| difference_row([&a.name, &b.name], d)).collect();
     let header = ["first", "second", "first minus second", "95 % interval", "first better on"];
-    (!rows.is_empty()).then(|| Section {
+    (!rows.is_empty()).then(|| ReportSection {
         title: "Every pair".to_owned(),
         text: "Paired differences of mean AoI on the same layouts. Where the interval holds 0, these layouts do not tell which \
                is better."
             .to_owned(),
-        table: Some(Table { header: header.map(str::to_owned).to_vec(), rows, numbers_from: 2 }),
-        figures: Vec::new(),
+        table: Some(ReportTable { header: header.map(str::to_owned).to_vec(), rows, numbers_from: 2 }),
+        plots: Vec::new(),
     })
 }
 
-fn over_slots(flown: &[&Flown]) -> Section {
+fn over_slots(flown: &[&PolicyEvaluation]) -> ReportSection {
     let series = flown.iter().map(|f| {
-        let points = f.survey.aoi.iter().enumerate().map(|(slot, &aoi)| [slot as f64, aoi]).collect();
+        let points = f.evaluation.aoi.iter().enumerate().map(|(slot, &aoi)| [slot as f64, aoi]).collect();
         Series { name: f.name.clone(), points, band: None }
     });
     let chart = Chart {
@@ -156,75 +147,68 @@ fn over_slots(flown: &[&Flown]) -> Section {
         series: series.collect(),
         markers: false,
     };
-    Section {
+    ReportSection {
         title: "Over slots".to_owned(),
         text: "All data is fresh at slot 0. A curve that levels off keeps up with its users; one that keeps rising leaves some \
                of them alone."
             .to_owned(),
         table: None,
-        figures: vec![Figure {
+        plots: vec![ReportPlot {
             file: "aoi.svg".to_owned(),
             caption: "Mean AoI over users and layouts in every slot.".to_owned(),
-            svg: figure::lines(&chart),
+            svg: plot::lines(&chart),
         }],
     }
 }
 
-fn over_layouts(flown: &[&Flown]) -> Section {
-    let values = |f: &&Flown| (f.name.clone(), f.survey.episodes.iter().map(|e| e.mean_aoi).collect());
+fn over_layouts(flown: &[&PolicyEvaluation]) -> ReportSection {
+    let values = |f: &&PolicyEvaluation| (f.name.clone(), f.evaluation.episodes.iter().map(|e| e.mean_aoi).collect());
     let series: Vec<(String, Vec<f64>)> = flown.iter().map(values).collect();
-    Section {
+    ReportSection {
         title: "Over layouts".to_owned(),
         text: "A curve further left is better; a long tail to the right says that some layouts went badly.".to_owned(),
         table: None,
-        figures: vec![Figure {
+        plots: vec![ReportPlot {
             file: "distribution.svg".to_owned(),
             caption: "Share of layouts whose mean AoI is at most that of the x axis.".to_owned(),
-            svg: figure::distribution("Distribution over layouts", "mean AoI of a layout (slots)", &series),
+            svg: plot::distribution("Distribution over layouts", "mean AoI of a layout (slots)", &series),
         }],
     }
 }
 
-fn flights(comparison: &Comparison, flown: &[&Flown]) -> Section {
-    let seed = flown.first().map_or(0, |f| f.survey.track.seed);
+fn flights(comparison: &Comparison, flown: &[&PolicyEvaluation]) -> ReportSection {
+    let seed = flown.first().map_or(0, |f| f.evaluation.trajectory.seed);
     let index = seed.saturating_sub(comparison.layouts.first) as usize;
     let figures = flown.iter().enumerate().map(|(i, f)| {
-        let track = &f.survey.track;
-        let flight = Flight {
-            uavs: track.uavs.clone(),
-            users: track.users.iter().filter_map(|path| path.first().copied()).collect(),
+        let trajectory = &f.evaluation.trajectory;
+        let flight = Trajectories {
+            uavs: trajectory.uavs.clone(),
+            users: trajectory.users.iter().filter_map(|path| path.first().copied()).collect(),
             transmission_range: comparison.env.transmission_range,
         };
-        let aoi = f.survey.episodes.get(index).map_or(f64::NAN, |e| e.mean_aoi);
-        Figure {
+        let aoi = f.evaluation.episodes.get(index).map_or(f64::NAN, |e| e.mean_aoi);
+        ReportPlot {
             file: format!("flight-{}-{}.svg", i + 1, file_name(&f.name)),
             caption: format!("{}: mean AoI {aoi:.2} on this layout.", f.name),
-            svg: figure::trajectories(&f.name, &flight),
+            svg: plot::trajectories(&f.name, &flight),
         }
     });
     let walking = if comparison.env.user_speed > 0.0 { " Users are drawn where they start." } else { "" };
-    Section {
+    ReportSection {
         title: format!("Flights on layout {index}"),
         text: format!("What each fleet flew on layout {index} of {} (seed {seed}), all slots.{walking}", comparison.layouts.name),
         table: None,
-        figures: figures.collect(),
+        plots: figures.collect(),
     }
 }
 
-fn bar(flown: &Flown, interval: Interval) -> Bar {
+fn bar(flown: &PolicyEvaluation, interval: Interval) -> Bar {
     Bar { name: flown.name.clone(), mean: interval.mean, low: interval.low, high: interval.high }
 }
 
-fn signed(interval: Interval) -> String {
-    format!("{:+.2}", interval.mean)
-}
-
-fn between(interval: Interval) -> String {
-    format!("{:+.2} to {:+.2}", interval.low, interval.high)
-}
-
-fn share(wins: f64) -> String {
-    format!("{:.0} %", 100.0 * wins)
+/// A row of names and their difference.
+fn difference_row<const N: usize>(names: [&String; N], difference: &Difference) -> Vec<String> {
+    names.into_iter().cloned().chain(difference_cells(&difference.mean_aoi, difference.wins)).collect()
 }
 
 /// `name` as a part of a file's name that every system takes.

@@ -3,30 +3,30 @@
 use std::fmt::Write;
 
 /// A report.
-pub(super) struct Document {
+pub(super) struct ReportPage {
     pub(super) title: String,
     /// The command that repeats it.
     pub(super) command: String,
-    pub(super) sections: Vec<Section>,
+    pub(super) sections: Vec<ReportSection>,
 }
 
 /// A heading with what follows it.
-pub(super) struct Section {
+pub(super) struct ReportSection {
     pub(super) title: String,
     pub(super) text: String,
-    pub(super) table: Option<Table>,
-    pub(super) figures: Vec<Figure>,
+    pub(super) table: Option<ReportTable>,
+    pub(super) plots: Vec<ReportPlot>,
 }
 
 /// Rows as wide as the header; columns from `numbers_from` on are aligned right.
-pub(super) struct Table {
+pub(super) struct ReportTable {
     pub(super) header: Vec<String>,
     pub(super) rows: Vec<Vec<String>>,
     pub(super) numbers_from: usize,
 }
 
 /// A figure and the file it is in.
-pub(super) struct Figure {
+pub(super) struct ReportPlot {
     pub(super) file: String,
     pub(super) caption: String,
     pub(super) svg: String,
@@ -53,7 +53,7 @@ footer { margin-top: 3rem; color: #777; font-size: .9rem; }
 ";
 
 /// The page.
-pub(super) fn html(document: &Document) -> String {
+pub(super) fn html(document: &ReportPage) -> String {
     let title = escaped(&document.title);
     let mut page = format!(
         "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
@@ -65,7 +65,7 @@ pub(super) fn html(document: &Document) -> String {
         let _ = write!(page, "<h2>{}</h2>\n<p>{}</p>\n", escaped(&section.title), code(&escaped(&section.text)));
         page += "<div class=\"row\">\n";
         page += &section.table.as_ref().map(html_table).unwrap_or_default();
-        for figure in &section.figures {
+        for figure in &section.plots {
             let caption = escaped(&figure.caption);
             let _ = write!(page, "<figure>\n{}<figcaption>{caption}</figcaption>\n</figure>\n", figure.svg);
         }
@@ -74,7 +74,7 @@ pub(super) fn html(document: &Document) -> String {
     page + &format!("<footer>qedgix {}</footer>\n</body>\n</html>\n", env!("CARGO_PKG_VERSION"))
 }
 
-fn html_table(table: &Table) -> String {
+fn html_table(table: &ReportTable) -> String {
     let cells = |row: &[String], tag: &str| -> String {
         let cell = |(i, text): (usize, &String)| {
             let class = if i >= table.numbers_from { " class=\"n\"" } else { "" };
@@ -87,7 +87,7 @@ fn html_table(table: &Table) -> String {
 }
 
 /// The same as Markdown.
-pub(super) fn markdown(document: &Document) -> String {
+pub(super) fn markdown(document: &ReportPage) -> String {
     let mut text = format!("# {}\n\n```sh\n{}\n```\n", document.title, document.command.replace("```", "'''"));
     for section in &document.sections {
         let _ = write!(text, "\n## {}\n\n{}\n", plain(&section.title), section.text);
@@ -99,7 +99,7 @@ pub(super) fn markdown(document: &Document) -> String {
                 &line((0..table.header.len()).map(|i| if i < table.numbers_from { ":--" } else { "--:" }.to_owned()).collect());
             text.extend(table.rows.iter().map(|row| line(row.iter().map(|c| plain(c)).collect())));
         }
-        for figure in &section.figures {
+        for figure in &section.plots {
             let _ = write!(text, "\n![{}]({})\n", plain(&figure.caption), figure.file);
         }
     }
@@ -150,10 +150,10 @@ mod tests {
     #[test]
     fn names_cannot_break_out() {
         let name = "<script>alert('x')</script> | `a` & \"b\"\n# c";
-        let table = Table { header: vec!["policy".to_owned()], rows: vec![vec![name.to_owned()]], numbers_from: 1 };
-        let figure = Figure { file: "a.svg".to_owned(), caption: name.to_owned(), svg: "<svg></svg>\n".to_owned() };
-        let section = Section { title: name.to_owned(), text: "t".to_owned(), table: Some(table), figures: vec![figure] };
-        let document = Document { title: "t".to_owned(), command: name.to_owned(), sections: vec![section] };
+        let table = ReportTable { header: vec!["policy".to_owned()], rows: vec![vec![name.to_owned()]], numbers_from: 1 };
+        let figure = ReportPlot { file: "a.svg".to_owned(), caption: name.to_owned(), svg: "<svg></svg>\n".to_owned() };
+        let section = ReportSection { title: name.to_owned(), text: "t".to_owned(), table: Some(table), plots: vec![figure] };
+        let document = ReportPage { title: "t".to_owned(), command: name.to_owned(), sections: vec![section] };
         let page = html(&document);
         assert!(!page.contains("<script") && page.contains("&lt;script&gt;"));
         assert!(page.contains("<svg></svg>") && !page.contains("http"));

@@ -10,7 +10,7 @@ use super::StopSignal;
 use crate::checkpoint::Checkpoint;
 use crate::env::EpisodeMetrics;
 use crate::jobs::Directive;
-use crate::learner::{Event, TrainConfig, Trainer, evaluate, layouts};
+use crate::learner::{Evaluation, Event, TrainConfig, Trainer, evaluate, layout_list};
 use crate::store::AttemptResult;
 use crate::wire::v1::CheckpointKind;
 
@@ -71,7 +71,7 @@ impl ReportQueue {
 
     fn checkpoint(&self, kind: CheckpointKind, checkpoint: &Checkpoint) {
         let metrics = checkpoint.metrics().map_or_else(Vec::new, |metrics| {
-            let rows = Event::Evaluation { step: checkpoint.step(), metrics: *metrics }.rows();
+            let rows = Event::Evaluation(Evaluation { step: checkpoint.step(), metrics: *metrics }).rows();
             rows.into_iter().map(|(_, name, value)| (name, value)).collect()
         });
         self.push(Report::Checkpoint { kind, step: checkpoint.step(), bytes: checkpoint.to_bytes(), metrics });
@@ -108,7 +108,7 @@ fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Re
             reports.push(Report::Metrics { step: trainer.step(), rows });
         }
         match event {
-            Event::Evaluation { step, .. } if trainer.best_evaluation().is_some_and(|best| best.step == step) => {
+            Event::Evaluation(evaluation) if trainer.best_evaluation().is_some_and(|best| best.step == evaluation.step) => {
                 if let Some(best) = trainer.best()? {
                     reports.checkpoint(CheckpointKind::Best, &best);
                 }
@@ -117,7 +117,7 @@ fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Re
                 let reason = format!("training diverged at step {step}: a weight is not finite or too large");
                 return Ok(AttemptResult::Failed { reason, permanent: true });
             }
-            Event::Iteration(_) | Event::Evaluation { .. } | Event::Finished { .. } => {}
+            Event::Iteration(_) | Event::Evaluation(_) | Event::Finished { .. } => {}
         }
         if last_snapshot.elapsed() >= snapshot_every && !reports.snapshot_pending.load(Ordering::Acquire) {
             reports.snapshot(&trainer);
@@ -142,7 +142,7 @@ fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Re
 
 /// Mean AoI of a policy on the reference layouts.
 fn reference(checkpoint: &Checkpoint, threads: usize) -> Result<f64, Box<dyn std::error::Error>> {
-    let seeds = layouts(REFERENCE)?.seeds(usize::MAX);
+    let seeds = layout_list(REFERENCE)?.seeds(usize::MAX);
     let flown = evaluate(&checkpoint.policy(), &checkpoint.config().environment, &seeds, threads)?;
     Ok(EpisodeMetrics::mean(&flown).mean_aoi)
 }
@@ -187,7 +187,7 @@ impl Curve {
 mod tests {
     use super::*;
     use crate::learner::Iteration;
-    use crate::recipe::{Algorithm, Preset};
+    use crate::train_config::{Algorithm, Preset};
 
     fn curve_of(steps: u64) -> Vec<u64> {
         let mut config = TrainConfig::preset(Algorithm::Qmix, Preset::Practical);

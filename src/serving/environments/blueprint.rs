@@ -4,8 +4,8 @@ use rand::RngExt;
 
 use crate::env::EnvConfig;
 use crate::invalid::{Invalid, in_range};
-use crate::recipe::EXACT;
 use crate::rng;
+use crate::train_config::EXACT;
 
 /// Most copies of one environment.
 const MAX_COPIES: usize = 1024;

@@ -1,4 +1,4 @@
-//! What all figures share: the white sheet, colours, text, the heading, the legend, axes.
+//! Common parts of all plots: background, colours, text, title, legend, axes.
 
 use std::ops::Range;
 
@@ -10,26 +10,26 @@ use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::scale::tick;
 
-/// Where a figure is drawn, in pixels.
+/// The drawing area, in pixels.
 pub(super) type Sheet<'a> = DrawingArea<SVGBackend<'a>, Shift>;
-/// What drawing returns.
+/// The result of drawing.
 pub(super) type Drawn = Result<(), DrawingAreaErrorKind<std::io::Error>>;
 /// A plot with two linear axes.
 pub(super) type Plot<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 
 /// Size of a chart in pixels.
 pub(super) const SIZE: (u32, u32) = (720, 440);
-/// Pixels above a plot, for the heading.
+/// Height of the title above a plot, in pixels.
 pub(super) const TOP: u32 = 44;
-/// Pixels beside a plot, for the legend.
+/// Width of the legend beside a plot, in pixels.
 pub(super) const SIDE: u32 = 168;
 
-/// Text and axes.
+/// Colour of text and axes.
 pub(super) const INK: RGBColor = RGBColor(0x22, 0x22, 0x22);
 const FAINT: RGBColor = RGBColor(0xe4, 0xe4, 0xe4);
 const AXIS: RGBColor = RGBColor(0x88, 0x88, 0x88);
 
-/// Okabe and Ito's colours, which readers tell apart however they see colour; their yellow, which white swallows, is grey here.
+/// The colours of Okabe and Ito, for colour-blind readers. Yellow, hard to see on white, is replaced by grey.
 const PALETTE: [RGBColor; 8] = [
     RGBColor(0x00, 0x72, 0xb2),
     RGBColor(0xd5, 0x5e, 0x00),
@@ -46,12 +46,12 @@ pub(super) fn colour(i: usize) -> RGBColor {
     PALETTE[i % PALETTE.len()]
 }
 
-/// Whether series `i` is dashed, because its colour was used before.
+/// Whether series `i` is dashed, because an earlier series has the same colour.
 pub(super) fn dashed(i: usize) -> bool {
     i / PALETTE.len() % 2 == 1
 }
 
-/// Draws on a white sheet of `size` pixels.
+/// Draws an SVG of `size` pixels with a white background.
 pub(super) fn draw(size: (u32, u32), body: impl FnOnce(&Sheet) -> Drawn) -> String {
     let mut svg = String::new();
     let sheet = SVGBackend::with_string(&mut svg, size).into_drawing_area();
@@ -61,7 +61,7 @@ pub(super) fn draw(size: (u32, u32), body: impl FnOnce(&Sheet) -> Drawn) -> Stri
     svg
 }
 
-/// A sheet of `size` with nothing but a heading and the words "no data".
+/// An SVG of `size` pixels with a title and the words "no data".
 pub(super) fn no_data(size: (u32, u32), title: &str) -> String {
     draw(size, |sheet| {
         heading(sheet, title)?;
@@ -71,18 +71,18 @@ pub(super) fn no_data(size: (u32, u32), title: &str) -> String {
     })
 }
 
-/// A way to write text.
+/// A text style.
 pub(super) fn text(size: i32, colour: RGBColor, horizontal: HPos, vertical: VPos) -> TextStyle<'static> {
     ("sans-serif", size).into_font().color(&colour).pos(Pos::new(horizontal, vertical))
 }
 
-/// The heading of a figure.
+/// The title of a plot.
 pub(super) fn heading(sheet: &Sheet, title: &str) -> Drawn {
     let style = ("sans-serif", 19, FontStyle::Bold).into_font().color(&INK).pos(Pos::new(HPos::Left, VPos::Center));
-    sheet.draw(&Text::new(cut(title, 80), (16, 22), style))
+    sheet.draw(&Text::new(shorten(title, 80), (16, 22), style))
 }
 
-/// Axes with a light grid; `side` pixels stay free on the right and `left` hold what stands before the plot.
+/// Axes with a light grid. `left` and `side` are the pixels to the left and right of the plot.
 pub(super) fn axes<'b>(
     sheet: &Sheet<'b>,
     [x, y]: [Range<f64>; 2],
@@ -107,28 +107,28 @@ pub(super) fn axes<'b>(
         .y_label_formatter(&|&x| tick(x))
         .label_style(("sans-serif", 15).into_font().color(&INK))
         .axis_desc_style(("sans-serif", 16).into_font().color(&INK))
-        .x_desc(cut(x_name, 70));
+        .x_desc(shorten(x_name, 70));
     if y_name.is_empty() {
         mesh.disable_y_mesh().disable_y_axis();
     } else {
-        mesh.y_desc(cut(y_name, 45));
+        mesh.y_desc(shorten(y_name, 45));
     }
     mesh.draw()?;
     Ok(plot)
 }
 
-/// How an entry of the legend is drawn.
+/// The symbol of an entry of the legend.
 #[derive(Clone, Copy)]
 pub(super) enum Key {
-    /// A line like that of series `i`; with a marker on it or not.
+    /// The line of series `i`, with or without a marker.
     Line(usize, bool),
-    /// A filled dot of some radius.
+    /// A filled circle of this radius.
     Dot(RGBColor, i32),
-    /// A hollow circle of some radius.
+    /// A circle of this radius.
     Ring(RGBColor, i32),
 }
 
-/// The legend: entries below each other in the column right of the plot; what does not fit is counted.
+/// The legend, in the column right of the plot. Entries that do not fit are counted.
 pub(super) fn legend(sheet: &Sheet, entries: &[(Key, String)]) -> Drawn {
     const ROW: i32 = 22;
     let (width, height) = sheet.dim_in_pixel();
@@ -142,7 +142,7 @@ pub(super) fn legend(sheet: &Sheet, entries: &[(Key, String)]) -> Drawn {
         let middle = (left + 11, y);
         match *key {
             Key::Line(i, marked) => {
-                // A gap in the middle says dashed, as there is no room for more dashes.
+                // A dashed line has one gap, as there is no space for more.
                 let ends = if dashed(i) { vec![(0, 9), (13, 22)] } else { vec![(0, 22)] };
                 for (from, to) in ends {
                     sheet.draw(&PathElement::new([(left + from, y), (left + to, y)], colour(i).stroke_width(3)))?;
@@ -154,7 +154,7 @@ pub(super) fn legend(sheet: &Sheet, entries: &[(Key, String)]) -> Drawn {
             Key::Dot(colour, radius) => sheet.draw(&Circle::new(middle, radius, colour.filled()))?,
             Key::Ring(colour, radius) => sheet.draw(&Circle::new(middle, radius, colour.stroke_width(2)))?,
         }
-        sheet.draw(&Text::new(cut(name, 18), (left + 30, y), style.clone()))?;
+        sheet.draw(&Text::new(shorten(name, 18), (left + 30, y), style.clone()))?;
     }
     if shown < entries.len() {
         let rest = format!("and {} more", entries.len() - shown);
@@ -163,9 +163,9 @@ pub(super) fn legend(sheet: &Sheet, entries: &[(Key, String)]) -> Drawn {
     Ok(())
 }
 
-/// `words` in at most `most` characters: the middle is left out, as names of files differ at either end.
-pub(super) fn cut(words: &str, most: usize) -> String {
-    let all: Vec<char> = words.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+/// `text` shortened to `most` characters. The middle is left out, as file names differ at either end.
+pub(super) fn shorten(text: &str, most: usize) -> String {
+    let all: Vec<char> = text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
     if all.len() <= most {
         return all.into_iter().collect();
     }

@@ -1,36 +1,36 @@
-//! Bars with whiskers, one below the other, the value written behind each.
+//! Horizontal bars with error bars and their values.
 
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, VPos};
 
-use super::Bar;
-use super::canvas::{self, INK, SIZE, colour, cut, text};
+use super::canvas::{self, INK, SIZE, colour, shorten, text};
+use super::data::Bar;
 use super::scale::{drawable, extent, value};
 
-/// Pixels per bar.
+/// Height of a bar in pixels.
 const ROW: u32 = 38;
-/// Pixels for the names.
+/// Width of the labels in pixels.
 const NAMES: u32 = 190;
 
-/// Bars over one axis, which `y` names with its unit, as SVG; as high as there are bars.
+/// Bars as SVG. `y` labels the axis, with the unit. The height depends on the number of bars.
 pub fn bars(title: &str, y: &str, bars: &[Bar]) -> String {
     let ends = bars.iter().flat_map(|b| [b.mean, b.low, b.high]);
     let Some(range) = extent(ends.clone()) else { return canvas::no_data(SIZE, title) };
     let range = extent([0.0, range.start, range.end].into_iter()).unwrap_or(0.0..1.0);
-    // Room for the value behind the longest bar, and before one that is negative.
+    // Space for the value behind the longest bar, and before a negative bar.
     let span = range.end - range.start;
     let axis = if range.start < 0.0 { range.start - 0.04 * span } else { 0.0 }..range.end + 0.14 * span;
     let rows = bars.len().min(MOST);
     let size = (SIZE.0, canvas::TOP + 62 + ROW * rows as u32);
     canvas::draw(size, |sheet| {
         canvas::heading(sheet, title)?;
-        // Bar i is around y = -i, so that the first is on top.
+        // Bar i is at y = -i, so that the first is on top.
         let mut plot = canvas::axes(sheet, [axis, 0.5 - rows as f64..0.5], [y, ""], (NAMES, 24))?;
         let left = 12 + NAMES as i32;
         for (i, bar) in bars[..rows].iter().enumerate() {
             let at = -(i as f64);
             let row = plot.backend_coord(&(0.0, at)).1;
-            sheet.draw(&Text::new(cut(&bar.name, 26), (left - 10, row), text(15, INK, HPos::Right, VPos::Center)))?;
+            sheet.draw(&Text::new(shorten(&bar.name, 26), (left - 10, row), text(15, INK, HPos::Right, VPos::Center)))?;
             if !drawable(bar.mean) {
                 continue;
             }
@@ -52,5 +52,5 @@ pub fn bars(title: &str, y: &str, bars: &[Bar]) -> String {
     })
 }
 
-/// Most bars of a figure; more would be no figure.
+/// Largest number of bars that are drawn.
 const MOST: usize = 60;

@@ -1,24 +1,29 @@
-//! The figures of an experiment.
+//! The plots of an experiment.
 
 use super::plan::slug;
-use super::{Curve, Experiment, Figure, Report};
-use crate::figure::{Bar, Chart, Flight, Series, bars, lines, trajectories};
+use super::{Experiment, ExperimentSummary, PlotKind, Run, TrainingCurve};
 use crate::learner::Interval;
+use crate::plot::{self, Bar, Chart, Series, Trajectories, bars, lines};
 
 const AOI: &str = "mean AoI (slots)";
 
-/// Name and text of every SVG. `curves` are in the order of the runs; `flights` are those of the first seed's runs.
-pub fn figures(experiment: &Experiment, report: &Report, curves: &[Curve], flights: &[Flight]) -> Vec<(String, String)> {
-    match experiment.figure {
-        Figure::Convergence => convergence(experiment, report, curves),
-        Figure::Parameter => vec![("parameter.svg".to_owned(), parameter(experiment, report))],
-        Figure::Trajectories => panels(experiment, flights),
+/// File name and SVG text of every plot. `curves` are in the order of the runs; `trajectories` are of the first seed's runs.
+pub fn plots(
+    experiment: &Experiment,
+    summary: &ExperimentSummary,
+    curves: &[TrainingCurve],
+    trajectories: &[Trajectories],
+) -> Vec<(String, String)> {
+    match experiment.plot {
+        PlotKind::Convergence => convergence(experiment, summary, curves),
+        PlotKind::Parameter => vec![("parameter.svg".to_owned(), parameter(experiment, summary))],
+        PlotKind::Trajectories => trajectory_plots(experiment, trajectories),
     }
 }
 
-/// Mean over seeds of the mean AoI on the validation layouts, with the band from the best to the worst seed; a file per
-/// point. Then the bars of what the best weights reach.
-fn convergence(experiment: &Experiment, report: &Report, curves: &[Curve]) -> Vec<(String, String)> {
+/// Per point, a plot of the mean AoI on the validation layouts (mean over seeds, with a band from the best to the worst seed), and
+/// a bar plot of the results of the best weights.
+fn convergence(experiment: &Experiment, summary: &ExperimentSummary, curves: &[TrainingCurve]) -> Vec<(String, String)> {
     let mut files = Vec::new();
     for (p, point) in experiment.points.iter().enumerate() {
         let series = experiment.series.iter().enumerate().map(|(s, name)| {
@@ -28,7 +33,7 @@ fn convergence(experiment: &Experiment, report: &Report, curves: &[Curve]) -> Ve
                 .collect();
             let mut points = Vec::new();
             let mut band = Vec::new();
-            // Steps that every seed reached: a mean over other seeds at other steps would jump.
+            // Only steps that every seed reached, so that each mean is over the same seeds.
             for &step in of_seeds.first().into_iter().flat_map(|first| first.keys()) {
                 let Some(values) = of_seeds.iter().map(|values| values.get(&step).copied()).collect::<Option<Vec<f64>>>() else {
                     continue;
@@ -38,7 +43,7 @@ fn convergence(experiment: &Experiment, report: &Report, curves: &[Curve]) -> Ve
             }
             Series { name: name.clone(), points, band: (of_seeds.len() > 1).then_some(band) }
         });
-        let title = titled(&experiment.title, &point.name);
+        let title = title_with_point(&experiment.title, &point.name);
         let chart = Chart {
             title: title.clone(),
             x: "environment steps".into(),
@@ -46,20 +51,20 @@ fn convergence(experiment: &Experiment, report: &Report, curves: &[Curve]) -> Ve
             series: series.collect(),
             markers: false,
         };
-        files.push((named("convergence", &point.name), lines(&chart)));
+        files.push((file_name("convergence", &point.name), lines(&chart)));
         let bar = |name: &str, aoi: &Interval| Bar { name: name.to_owned(), mean: aoi.mean, low: aoi.low, high: aoi.high };
-        let reached: Vec<Bar> = (report.rows.iter().filter(|row| row.point == point.name))
+        let reached: Vec<Bar> = (summary.rows.iter().filter(|row| row.point == point.name))
             .map(|row| bar(&row.series, &row.mean_aoi))
-            .chain(report.baselines.iter().filter(|b| b.point == point.name).map(|b| bar(&b.name, &b.mean_aoi)))
+            .chain(summary.baselines.iter().filter(|b| b.point == point.name).map(|b| bar(&b.name, &b.mean_aoi)))
             .collect();
         let title = format!("{title}: best weights");
-        files.push((named("reached", &point.name), bars(&title, &format!("{AOI} on {}", report.layouts), &reached)));
+        files.push((file_name("reached", &point.name), bars(&title, &format!("{AOI} on {}", summary.layouts), &reached)));
     }
     files
 }
 
 /// Mean AoI with its interval against the points' x, series first and then baselines.
-fn parameter(experiment: &Experiment, report: &Report) -> String {
+fn parameter(experiment: &Experiment, summary: &ExperimentSummary) -> String {
     let along = |name: &str, aoi: Vec<Interval>| {
         let mut all: Vec<([f64; 2], [f64; 2])> =
             experiment.points.iter().zip(aoi).map(|(point, aoi)| ([point.x, aoi.mean], [aoi.low, aoi.high])).collect();
@@ -70,32 +75,35 @@ fn parameter(experiment: &Experiment, report: &Report) -> String {
     let series = experiment
         .series
         .iter()
-        .map(|name| along(name, report.rows.iter().filter(|row| &row.series == name).map(|row| row.mean_aoi).collect()));
+        .map(|name| along(name, summary.rows.iter().filter(|row| &row.series == name).map(|row| row.mean_aoi).collect()));
     let baselines = experiment
         .baselines
         .iter()
-        .map(|name| along(name, report.baselines.iter().filter(|b| &b.name == name).map(|b| b.mean_aoi).collect()));
+        .map(|name| along(name, summary.baselines.iter().filter(|b| &b.name == name).map(|b| b.mean_aoi).collect()));
     lines(&Chart {
         title: experiment.title.clone(),
         x: experiment.x.clone(),
-        y: format!("{AOI} on {}", report.layouts),
+        y: format!("{AOI} on {}", summary.layouts),
         series: series.chain(baselines).collect(),
         markers: true,
     })
 }
 
-fn panels(experiment: &Experiment, flights: &[Flight]) -> Vec<(String, String)> {
-    let panel = |(run, flight): (&super::Run, &Flight)| {
+fn trajectory_plots(experiment: &Experiment, trajectories: &[Trajectories]) -> Vec<(String, String)> {
+    let panel = |(run, trajectory): (&Run, &Trajectories)| {
         let (series, point) = (&experiment.series[run.series], &experiment.points[run.point].name);
-        (named(&format!("trajectories-{}", slug(series)), point), trajectories(&titled(series, point), flight))
+        (
+            file_name(&format!("trajectories-{}", slug(series)), point),
+            plot::trajectories(&title_with_point(series, point), trajectory),
+        )
     };
-    experiment.runs.iter().zip(flights).map(panel).collect()
+    experiment.runs.iter().zip(trajectories).map(panel).collect()
 }
 
-fn titled(title: &str, point: &str) -> String {
+fn title_with_point(title: &str, point: &str) -> String {
     if point.is_empty() { title.to_owned() } else { format!("{title}: {point}") }
 }
 
-fn named(figure: &str, point: &str) -> String {
-    if point.is_empty() { format!("{figure}.svg") } else { format!("{figure}-{}.svg", slug(point)) }
+fn file_name(plot: &str, point: &str) -> String {
+    if point.is_empty() { format!("{plot}.svg") } else { format!("{plot}-{}.svg", slug(point)) }
 }

@@ -30,7 +30,7 @@ pub fn chunk_of(uavs: usize) -> usize {
 
 /// Discounting.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Returns {
+pub struct TdLambda {
     /// gamma.
     pub gamma: f64,
     /// lambda.
@@ -39,7 +39,7 @@ pub struct Returns {
 
 /// What a batch says about the parameters.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Figures {
+pub struct LossMetrics {
     /// The loss.
     pub loss: f64,
     /// L2 norm of the gradient.
@@ -61,11 +61,11 @@ pub struct Trace<T> {
 
 /// The networks and the buffers of an update. Parameters belong to the caller.
 #[derive(Debug)]
-pub struct Objective<T: Real> {
+pub struct Loss<T: Real> {
     agent: Agent,
     mixer: Mixer,
     layout: ParameterLayout,
-    returns: Returns,
+    td_lambda: TdLambda,
     /// Online and target network, see [`Weights`].
     transposed: [Vec<T>; 2],
     chunks: Vec<Chunk<T>>,
@@ -99,14 +99,14 @@ struct Workspace<T: Real> {
     best: Batch<T>,
     total: Batch<T>,
     target_total: Batch<T>,
-    goal: Batch<T>,
+    td_target: Batch<T>,
     d_chosen: Batch<T>,
     dq: Batch<T>,
 }
 
-impl<T: Real> Objective<T> {
+impl<T: Real> Loss<T> {
     /// Networks for `config`; `threads` is how many threads will work at most.
-    pub fn new(config: AgentConfig, dims: Dims, mixer: MixerKind, returns: Returns, threads: usize) -> Self {
+    pub fn new(config: AgentConfig, dims: Dims, mixer: MixerKind, td_lambda: TdLambda, threads: usize) -> Self {
         let agent = Agent::new(config, dims);
         let mut layout = agent.layout().clone();
         let mixer = Mixer::new(mixer, &dims, &mut layout);
@@ -115,7 +115,7 @@ impl<T: Real> Objective<T> {
             agent,
             mixer,
             layout,
-            returns,
+            td_lambda,
             transposed: [vec![T::ZERO; len], vec![T::ZERO; len]],
             chunks: Vec::new(),
             workspaces: (0..threads.max(1)).map(|_| Mutex::default()).collect(),
@@ -143,7 +143,7 @@ impl<T: Real> Objective<T> {
     ///
     /// # Panics
     /// When the episodes' sizes are not those of the networks, or there are none.
-    pub fn evaluate(&mut self, online: &[T], target: &[T], episodes: &Episodes, trace: Option<&mut Trace<T>>) -> Figures {
+    pub fn evaluate(&mut self, online: &[T], target: &[T], episodes: &Episodes, trace: Option<&mut Trace<T>>) -> LossMetrics {
         let dims = *self.agent.dims();
         assert!(episodes.len > 0, "a batch of at least one episode");
         assert_eq!((episodes.uavs, episodes.users, episodes.slots), (dims.uavs, dims.users, dims.slots), "episodes of M, N, K");
@@ -164,7 +164,7 @@ impl<T: Real> Objective<T> {
             mixer: &self.mixer,
             online: Weights { flat: online, transposed: transposed_online },
             target: Weights { flat: target, transposed: transposed_target },
-            returns: self.returns,
+            td_lambda: self.td_lambda,
             episodes,
             traced: trace.is_some(),
         };
@@ -189,7 +189,7 @@ impl<T: Real> Objective<T> {
             *trace = Trace { q: join(|t| &t.q), q_tot: join(|t| &t.q_tot), target: join(|t| &t.target) };
         }
         let count = (episodes.len * dims.slots * self.mixer.values()) as f64;
-        Figures {
+        LossMetrics {
             loss: 0.5 * chunks.iter().map(|c| c.loss).sum::<f64>() / count,
             grad_norm: self.norms.iter().sum::<f64>().sqrt(),
             q_tot: chunks.iter().map(|c| c.q_tot).sum::<f64>() / count,
@@ -203,7 +203,7 @@ struct Pass<'a, T> {
     mixer: &'a Mixer,
     online: Weights<'a, T>,
     target: Weights<'a, T>,
-    returns: Returns,
+    td_lambda: TdLambda,
     episodes: &'a Episodes,
     traced: bool,
 }
@@ -239,17 +239,17 @@ impl<T: Real> Pass<'_, T> {
         let present = (w.states.range(0..k * b), w.chosen.rows());
         self.mixer.forward(self.online, present, &mut w.online_mixer, w.total.rows_mut());
 
-        w.goal.reset(values, k * b);
-        self.goals(range.start, b, w.target_total.as_slice(), w.goal.as_mut_slice());
+        w.td_target.reset(values, k * b);
+        self.td_targets(range.start, b, w.target_total.as_slice(), w.td_target.as_mut_slice());
         if self.traced {
             trace(w, (b, slots, m), &mut out.trace);
         }
         let share = T::from_f64(1.0 / (ep.len * k * values) as f64);
         (out.loss, out.q_tot) = (0.0, 0.0);
         // From here on `total` is its own gradient.
-        for (total, &goal) in w.total.as_mut_slice().iter_mut().zip(w.goal.as_slice()) {
+        for (total, &td_target) in w.total.as_mut_slice().iter_mut().zip(w.td_target.as_slice()) {
             out.q_tot += total.to_f64();
-            *total -= goal;
+            *total -= td_target;
             out.loss += total.to_f64() * total.to_f64();
             *total *= share;
         }
@@ -265,17 +265,17 @@ impl<T: Real> Pass<'_, T> {
     }
 
     /// TD(lambda), from the last slot backwards; `future` begins with slot 1.
-    fn goals(&self, first: usize, b: usize, future: &[T], goal: &mut [T]) {
+    fn td_targets(&self, first: usize, b: usize, future: &[T], td_target: &mut [T]) {
         let k = self.episodes.slots;
         let stride = b * self.mixer.values();
-        let gamma = T::from_f64(self.returns.gamma);
-        let (keep, cut) = (T::from_f64(self.returns.lambda), T::from_f64(1.0 - self.returns.lambda));
+        let gamma = T::from_f64(self.td_lambda.gamma);
+        let (keep, cut) = (T::from_f64(self.td_lambda.lambda), T::from_f64(1.0 - self.td_lambda.lambda));
         for t in (0..k).rev() {
             for i in 0..stride {
                 let reward = T::from_f64(self.episodes.reward[(first + i / self.mixer.values()) * k + t].into());
                 let value = future[t * stride + i];
-                let next = if t + 1 == k { value } else { goal[(t + 1) * stride + i] };
-                goal[t * stride + i] = reward + gamma * (keep * next + cut * value);
+                let next = if t + 1 == k { value } else { td_target[(t + 1) * stride + i] };
+                td_target[t * stride + i] = reward + gamma * (keep * next + cut * value);
             }
         }
     }
@@ -325,5 +325,5 @@ fn trace<T: Real>(w: &Workspace<T>, (b, slots, m): (usize, usize, usize), out: &
     debug_assert_eq!(w.online.q.len(), slots * b * m);
     reorder(w.online.q.as_slice(), slots, &mut out.q);
     reorder(w.total.as_slice(), slots - 1, &mut out.q_tot);
-    reorder(w.goal.as_slice(), slots - 1, &mut out.target);
+    reorder(w.td_target.as_slice(), slots - 1, &mut out.target);
 }

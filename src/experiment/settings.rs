@@ -1,19 +1,19 @@
-//! Reading tables field by field, so that a message names the table and the field that is wrong.
+//! Reads the tables of a document field by field, so that errors name the table and the field.
 
 use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
 
 use crate::invalid::{Invalid, expectation};
-use crate::recipe::{Algorithm, Preset, TrainConfig};
+use crate::train_config::{Algorithm, Preset, TrainConfig};
 
-/// What the command line puts over a document.
+/// Settings of the command line, which override the document.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Overrides {
-    /// Seeds instead of the document's.
+    /// Seeds that replace those of the document.
     pub seeds: Option<Vec<u64>>,
-    /// Names of the only series to run; empty: all.
+    /// Names of the series to run; empty: all.
     pub series: Vec<String>,
-    /// Names of the only points to run; empty: all.
+    /// Names of the points to run; empty: all.
     pub points: Vec<String>,
     /// Fields of `environment`.
     pub environment: Map<String, Value>,
@@ -21,15 +21,15 @@ pub struct Overrides {
     pub training: Map<String, Value>,
 }
 
-/// A table of the document that is being read.
-pub(super) struct Table {
+/// A table of the document; fields are removed as they are read.
+pub(super) struct TableReader {
     /// Its name, as `series[1]`; empty for the document itself.
     path: String,
     fields: Map<String, Value>,
 }
 
-impl Table {
-    /// The table, if it has no fields but these.
+impl TableReader {
+    /// The table `value`; an error if it has other fields than `known`.
     pub fn new(path: &str, value: Value, known: &[&str]) -> Result<Self, Invalid> {
         let Value::Object(fields) = value else {
             return Err(Invalid::schema(path, &value, "a table"));
@@ -41,7 +41,7 @@ impl Table {
         }
     }
 
-    /// A field with the name of the table before it.
+    /// The path of a field, as `series[1].name`.
     pub fn at(&self, field: &str) -> String {
         if self.path.is_empty() { field.to_owned() } else { format!("{}.{field}", self.path) }
     }
@@ -55,7 +55,7 @@ impl Table {
         self.optional(field)?.ok_or_else(|| Invalid::missing_field(self.at(field), expected))
     }
 
-    /// A name that is not empty and fits a line.
+    /// A name: not empty, on one line.
     pub fn name(&mut self, field: &str) -> Result<String, Invalid> {
         let expected = "1 to 80 characters on one line";
         let name: String = self.required(field, expected)?;
@@ -66,10 +66,10 @@ impl Table {
     }
 }
 
-/// What a table says about the runs it is for: the same fields in `run`, in a series and in a point.
+/// Settings of runs; the same fields occur in `run`, in a series and in a point.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Section {
-    /// What stands before its fields in a message.
+pub(super) struct RunSettings {
+    /// Prefix of its fields in errors.
     prefix: String,
     algorithm: Option<Algorithm>,
     preset: Option<Preset>,
@@ -77,11 +77,11 @@ pub(super) struct Section {
     training: Map<String, Value>,
 }
 
-impl Section {
+impl RunSettings {
     /// Its fields.
     pub const FIELDS: [&str; 4] = ["algorithm", "preset", "environment", "training"];
 
-    pub fn read(table: &mut Table) -> Result<Self, Invalid> {
+    pub fn read(table: &mut TableReader) -> Result<Self, Invalid> {
         Ok(Self {
             prefix: table.at(""),
             algorithm: table.optional("algorithm")?,
@@ -91,15 +91,13 @@ impl Section {
         })
     }
 
-    /// What the command line says.
+    /// The settings of the command line.
     pub fn overrides(overrides: &Overrides) -> Self {
         let Overrides { environment, training, .. } = overrides.clone();
         Self { prefix: "on the command line, ".into(), environment, training, ..Self::default() }
     }
 
-    /// The configuration of one run: later sections override earlier ones.
-    ///
-    /// The error names the section that a wrong field stands in.
+    /// The configuration of one run; later sections override earlier ones. An error names the section of the invalid field.
     pub fn resolve(sections: &[&Self], seed: u64) -> Result<TrainConfig, Invalid> {
         let mut all = Self::default();
         for section in sections {
@@ -115,18 +113,18 @@ impl Section {
             &all.training,
             seed,
         )
-        .map_err(|mut wrong| {
-            let field = wrong.field.split(['.', '[']).collect::<Vec<_>>();
+        .map_err(|mut invalid| {
+            let field = invalid.field.split(['.', '[']).collect::<Vec<_>>();
             let holds = |section: &&&Self| match field[..] {
                 ["environment", name, ..] => section.environment.contains_key(name),
                 ["training", name, ..] => section.training.contains_key(name),
                 _ => false,
             };
-            // Where no section has the field, it is the whole that does not fit together.
+            // If no section has the field, the combination of the fields is invalid.
             if let Some(section) = sections.iter().rev().find(holds) {
-                wrong.field = format!("{}{}", section.prefix, wrong.field);
+                invalid.field = format!("{}{}", section.prefix, invalid.field);
             }
-            wrong
+            invalid
         })
     }
 }

@@ -4,30 +4,30 @@ use std::sync::Mutex;
 
 use qedgix::env::{EnvConfig, EpisodeMetrics};
 use qedgix::invalid::Invalid;
-use qedgix::learner::{Disturbance, Loss, Survey, evaluate, layouts, survey};
+use qedgix::learner::{Disturbance, LostUav, TracedEvaluation, evaluate, evaluate_traced, layout_list};
 use qedgix::policy::baselines::{self, EnvParams};
 use qedgix::policy::{FleetStep, Policy, RequiredInput};
 
-fn flown(name: &str, env: &EnvConfig, disturbance: &Disturbance, threads: usize) -> Survey {
+fn flown(name: &str, env: &EnvConfig, disturbance: &Disturbance, threads: usize) -> TracedEvaluation {
     let policy = baselines::by_name(name, EnvParams::from(env)).unwrap();
-    survey(&*policy, env, &layouts("valid-v1").unwrap().seeds(11), 7, disturbance, threads).unwrap()
+    evaluate_traced(&*policy, env, &layout_list("valid-v1").unwrap().seeds(11), 7, disturbance, threads).unwrap()
 }
 
 fn losing(uav: usize, slot: usize) -> Disturbance {
-    Disturbance { lose: Some(Loss { uav, slot }), ..Disturbance::default() }
+    Disturbance { lose: Some(LostUav { uav, slot }), ..Disturbance::default() }
 }
 
 #[test]
 fn without_disturbance_a_survey_is_an_evaluation() {
     let env = EnvConfig { user_speed: 0.01, ..EnvConfig::default() };
-    let seeds = layouts("valid-v1").unwrap().seeds(11);
+    let seeds = layout_list("valid-v1").unwrap().seeds(11);
     for name in ["sweep", "random", "greedy-global"] {
         let plain = evaluate(&*baselines::by_name(name, EnvParams::default()).unwrap(), &env, &seeds, 1).unwrap();
-        let survey = flown(name, &env, &Disturbance::default(), 1);
-        assert_eq!(plain, survey.episodes, "{name}");
-        assert_eq!(survey.aoi.len(), env.slots + 1);
-        assert_eq!(survey.aoi[0], 0.0);
-        let over_slots = survey.aoi[1..].iter().sum::<f64>() / env.slots as f64;
+        let evaluation = flown(name, &env, &Disturbance::default(), 1);
+        assert_eq!(plain, evaluation.episodes, "{name}");
+        assert_eq!(evaluation.aoi.len(), env.slots + 1);
+        assert_eq!(evaluation.aoi[0], 0.0);
+        let over_slots = evaluation.aoi[1..].iter().sum::<f64>() / env.slots as f64;
         assert!((over_slots - EpisodeMetrics::mean(&plain).mean_aoi).abs() < 1e-9, "{name}: {over_slots}");
     }
 }
@@ -35,11 +35,11 @@ fn without_disturbance_a_survey_is_an_evaluation() {
 #[test]
 fn the_track_is_the_episode_that_was_asked_for() {
     let env = EnvConfig::default();
-    let Survey { episodes, track, .. } = flown("sweep", &env, &Disturbance::default(), 3);
-    assert_eq!(track.seed, layouts("valid-v1").unwrap().first + 7);
-    assert_eq!((track.uavs.len(), track.users.len(), track.aoi.len()), (env.uavs, env.users, env.users));
-    assert!(track.uavs.iter().chain(&track.users).all(|path| path.len() == env.slots + 1));
-    let sum: f32 = track.aoi.iter().flat_map(|ages| &ages[1..]).sum();
+    let TracedEvaluation { episodes, trajectory, .. } = flown("sweep", &env, &Disturbance::default(), 3);
+    assert_eq!(trajectory.seed, layout_list("valid-v1").unwrap().first + 7);
+    assert_eq!((trajectory.uavs.len(), trajectory.users.len(), trajectory.aoi.len()), (env.uavs, env.users, env.users));
+    assert!(trajectory.uavs.iter().chain(&trajectory.users).all(|path| path.len() == env.slots + 1));
+    let sum: f32 = trajectory.aoi.iter().flat_map(|ages| &ages[1..]).sum();
     assert!((f64::from(sum) / (env.users * env.slots) as f64 - episodes[7].mean_aoi).abs() < 1e-9);
 }
 
@@ -67,16 +67,16 @@ fn a_lost_uav_stays_where_it_was_and_collects_no_more() {
         speed: 0.0,
         ..EnvConfig::default()
     };
-    let track = flown("random", &env, &losing(0, 30), 1).track;
-    assert!(track.aoi[0][..=30].iter().all(|&a| a == 0.0));
-    assert!(track.aoi[0][31..].iter().enumerate().all(|(i, &a)| a == i as f32 + 1.0));
+    let trajectory = flown("random", &env, &losing(0, 30), 1).trajectory;
+    assert!(trajectory.aoi[0][..=30].iter().all(|&a| a == 0.0));
+    assert!(trajectory.aoi[0][31..].iter().enumerate().all(|(i, &a)| a == i as f32 + 1.0));
 
     let env = EnvConfig::default();
-    let track = flown("sweep", &env, &losing(2, 10), 1).track;
-    let before = flown("sweep", &env, &Disturbance::default(), 1).track;
-    assert!(track.uavs[2][10..].iter().all(|at| *at == track.uavs[2][10]));
-    assert_eq!(track.uavs[2][..=10], before.uavs[2][..=10]);
-    assert_ne!(track.uavs[0][10], track.uavs[0][11], "the others fly on");
+    let trajectory = flown("sweep", &env, &losing(2, 10), 1).trajectory;
+    let before = flown("sweep", &env, &Disturbance::default(), 1).trajectory;
+    assert!(trajectory.uavs[2][10..].iter().all(|at| *at == trajectory.uavs[2][10]));
+    assert_eq!(trajectory.uavs[2][..=10], before.uavs[2][..=10]);
+    assert_ne!(trajectory.uavs[0][10], trajectory.uavs[0][11], "the others fly on");
 }
 
 /// Flies east and writes down, per slot, what it was shown: who sees whom, and all positions.
@@ -93,7 +93,7 @@ struct Shown {
 impl Spy {
     fn shown(env: &EnvConfig, disturbance: &Disturbance) -> Vec<Shown> {
         let spy = Self(Mutex::default());
-        survey(&spy, env, &[5], 0, disturbance, 1).unwrap();
+        evaluate_traced(&spy, env, &[5], 0, disturbance, 1).unwrap();
         spy.0.into_inner().unwrap()
     }
 }
@@ -163,7 +163,14 @@ fn noise_moves_what_is_seen_by_its_standard_deviation_and_nothing_else() {
     assert!(mean.abs() < 2e-3 && (deviation - 0.05).abs() < 2e-3, "mean {mean}, deviation {deviation}");
     // It flew the same way: the spy ignores what it sees, so the world must not have changed.
     let metrics = |noise| {
-        survey(&Spy(Mutex::default()), &env, &[5], 0, &Disturbance { position_noise: noise, ..Disturbance::default() }, 1)
+        evaluate_traced(
+            &Spy(Mutex::default()),
+            &env,
+            &[5],
+            0,
+            &Disturbance { position_noise: noise, ..Disturbance::default() },
+            1,
+        )
     };
     assert_eq!(metrics(0.05).unwrap(), metrics(0.0).unwrap());
 }
@@ -177,8 +184,8 @@ fn what_does_not_fit_is_named() {
         (Disturbance { position_noise: -0.1, ..Disturbance::default() }, "position_noise"),
         (Disturbance { position_noise: f64::NAN, ..Disturbance::default() }, "position_noise"),
     ] {
-        let error = survey(&Spy(Mutex::default()), &env, &[1], 0, &disturbance, 1).unwrap_err();
+        let error = evaluate_traced(&Spy(Mutex::default()), &env, &[1], 0, &disturbance, 1).unwrap_err();
         assert_eq!(error.field, field);
     }
-    assert_eq!(survey(&Spy(Mutex::default()), &env, &[1], 1, &Disturbance::default(), 1).unwrap_err().field, "drawn");
+    assert_eq!(evaluate_traced(&Spy(Mutex::default()), &env, &[1], 1, &Disturbance::default(), 1).unwrap_err().field, "traced");
 }

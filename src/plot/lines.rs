@@ -1,26 +1,26 @@
-//! Curves: anything over anything, and the distribution of a figure over layouts.
+//! Curves, and distributions of a metric over layouts.
 
 use std::ops::Range;
 
 use plotters::prelude::*;
 
 use super::canvas::{self, Drawn, Key, Plot, SIDE, SIZE, colour, dashed};
+use super::data::{Chart, Series};
 use super::scale::{drawable, extent, value_axis};
-use super::{Chart, Series};
 
-/// Curves with their bands (or, with markers, error bars), as SVG.
+/// Curves with bands, or with markers and error bars, as SVG.
 pub fn lines(chart: &Chart) -> String {
     let all = || chart.series.iter().flat_map(|s| finite(&s.points));
-    let bands = chart.series.iter().flat_map(runs).flatten().filter_map(|(_, band)| band).flatten();
+    let bands = chart.series.iter().flat_map(drawable_pieces).flatten().filter_map(|(_, band)| band).flatten();
     let (Some(x), Some(y)) = (extent(all().map(|p| p[0])), extent(all().map(|p| p[1]).chain(bands))) else {
         return canvas::no_data(SIZE, &chart.title);
     };
-    // Marked points stand clear of the frame.
+    // Markers do not touch the frame.
     let x = if chart.markers { value_margin(&x) } else { x };
     plot(chart, [x, value_axis(&y)])
 }
 
-/// The empirical distribution of each series: the share of its values that are at most x, one curve per policy, as SVG.
+/// The empirical distribution of each series as SVG: the share of its values that are at most x.
 pub fn distribution(title: &str, x: &str, series: &[(String, Vec<f64>)]) -> String {
     let Some(range) = extent(series.iter().flat_map(|(_, values)| values.iter().copied())) else {
         return canvas::no_data(SIZE, title);
@@ -50,7 +50,7 @@ fn plot(chart: &Chart, ranges: [Range<f64>; 2]) -> String {
         for (i, series) in chart.series.iter().enumerate() {
             intervals(&mut plot, i, series, chart.markers)?;
         }
-        // Curves lie above all bands.
+        // Curves are drawn over all bands.
         for (i, series) in chart.series.iter().enumerate() {
             curve(&mut plot, i, series, chart.markers)?;
         }
@@ -60,10 +60,10 @@ fn plot(chart: &Chart, ranges: [Range<f64>; 2]) -> String {
     })
 }
 
-/// The intervals of series `i`: areas, or bars with caps.
+/// The intervals of series `i`, as areas or error bars.
 fn intervals(plot: &mut Plot, i: usize, series: &Series, bars: bool) -> Drawn {
-    for run in runs(series) {
-        let banded: Vec<([f64; 2], [f64; 2])> = run.into_iter().filter_map(|(p, band)| Some((p, band?))).collect();
+    for piece in drawable_pieces(series) {
+        let banded: Vec<([f64; 2], [f64; 2])> = piece.into_iter().filter_map(|(p, band)| Some((p, band?))).collect();
         if bars {
             let style = colour(i).stroke_width(2);
             plot.draw_series(
@@ -81,9 +81,9 @@ fn intervals(plot: &mut Plot, i: usize, series: &Series, bars: bool) -> Drawn {
 
 fn curve(plot: &mut Plot, i: usize, series: &Series, markers: bool) -> Drawn {
     let style = colour(i).stroke_width(2);
-    for run in runs(series) {
-        let points = run.iter().map(|(p, _)| (p[0], p[1]));
-        if markers || run.len() == 1 {
+    for piece in drawable_pieces(series) {
+        let points = piece.iter().map(|(p, _)| (p[0], p[1]));
+        if markers || piece.len() == 1 {
             plot.draw_series(points.clone().map(|p| Circle::new(p, 4, colour(i).filled())))?;
         }
         if dashed(i) {
@@ -95,11 +95,11 @@ fn curve(plot: &mut Plot, i: usize, series: &Series, markers: bool) -> Drawn {
     Ok(())
 }
 
-/// A point, and its (low, high) where it has an interval that can be drawn.
+/// A point, and its interval (low, high) if that is drawable.
 type Banded = ([f64; 2], Option<[f64; 2]>);
 
-/// The pieces of a series between points that cannot be drawn.
-fn runs(series: &Series) -> Vec<Vec<Banded>> {
+/// The pieces of a series between points that are not drawable.
+fn drawable_pieces(series: &Series) -> Vec<Vec<Banded>> {
     let band = |k: usize| series.band.as_ref().and_then(|b| b.get(k).copied()).filter(|b| b.iter().all(|&x| drawable(x)));
     let ordered = |b: [f64; 2]| [b[0].min(b[1]), b[0].max(b[1])];
     let points: Vec<Banded> = series.points.iter().enumerate().map(|(k, &p)| (p, band(k).map(ordered))).collect();
@@ -112,6 +112,6 @@ fn finite(points: &[[f64; 2]]) -> impl Iterator<Item = [f64; 2]> {
 }
 
 fn value_margin(extent: &Range<f64>) -> Range<f64> {
-    let air = 0.04 * (extent.end - extent.start);
-    extent.start - air..extent.end + air
+    let margin = 0.04 * (extent.end - extent.start);
+    extent.start - margin..extent.end + margin
 }

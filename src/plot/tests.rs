@@ -1,4 +1,4 @@
-//! Figures are well-formed, repeat themselves, and survive whatever numbers they are given.
+//! Plots are well-formed SVG for all numbers, and the same data gives the same bytes.
 
 use super::*;
 
@@ -8,7 +8,7 @@ fn chart(points: Vec<[f64; 2]>, band: Option<Vec<[f64; 2]>>, markers: bool) -> C
 }
 
 /// Every tag is closed and no text breaks out of its element.
-fn well_formed(svg: &str) {
+fn assert_well_formed(svg: &str) {
     assert!(svg.starts_with("<svg") && svg.trim_end().ends_with("</svg>"), "{svg}");
     assert_eq!(svg.matches("<text").count(), svg.matches("</text>").count());
     assert!(!svg.contains("<b>") && !svg.contains("NaN") && !svg.contains("inf"), "{svg}");
@@ -18,14 +18,14 @@ fn well_formed(svg: &str) {
 fn the_same_data_gives_the_same_bytes() {
     let chart = chart(vec![[0.0, 1.0], [1.0, 3.0], [2.0, 2.0]], Some(vec![[0.5, 1.5], [2.0, 4.0], [1.0, 3.0]]), false);
     let svg = lines(&chart);
-    well_formed(&svg);
+    assert_well_formed(&svg);
     assert_eq!(svg, lines(&chart));
     assert!(svg.contains("a &lt;b&gt; &amp;") && svg.contains("AoI (slots)") && svg.contains("<polygon"));
 }
 
 #[test]
-fn nothing_to_draw_says_so() {
-    let nothing = [
+fn plots_without_data_say_no_data() {
+    let empty_plots = [
         lines(&Chart::default()),
         lines(&chart(Vec::new(), None, true)),
         lines(&chart(vec![[f64::NAN, 1.0], [1.0, f64::INFINITY]], None, false)),
@@ -33,51 +33,51 @@ fn nothing_to_draw_says_so() {
         bars("t", "y", &[Bar { name: "a".into(), mean: f64::NAN, low: f64::NAN, high: f64::NAN }]),
         distribution("t", "x", &[("a".into(), Vec::new())]),
         distribution("t", "x", &[]),
-        trajectories("t", &Flight::default()),
-        trajectories("t", &Flight { uavs: vec![vec![[f64::NAN; 2]]], users: vec![], transmission_range: f64::NAN }),
+        trajectories("t", &Trajectories::default()),
+        trajectories("t", &Trajectories { uavs: vec![vec![[f64::NAN; 2]]], users: vec![], transmission_range: f64::NAN }),
     ];
-    for svg in nothing {
-        well_formed(&svg);
+    for svg in empty_plots {
+        assert_well_formed(&svg);
         assert!(svg.contains("no data"), "{svg}");
     }
 }
 
 #[test]
-fn strange_numbers_are_left_out_or_drawn() {
+fn numbers_of_every_kind_give_well_formed_plots() {
     let strange = [0.0, -0.0, 1.0, -1.0, 1e-300, 1e12, -1e12, 1e300, f64::MAX, f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1e-9];
     for &a in &strange {
         for &b in &strange {
             for markers in [false, true] {
                 let points = vec![[a, b], [b, a], [0.5, a], [a, a]];
-                well_formed(&lines(&chart(points.clone(), Some(points), markers)));
+                assert_well_formed(&lines(&chart(points.clone(), Some(points), markers)));
             }
-            well_formed(&bars("t", "y", &[Bar { name: "a".into(), mean: a, low: b, high: a }]));
-            well_formed(&distribution("t", "x", &[("a".into(), vec![a, b]), ("b".into(), vec![])]));
-            let flight =
-                Flight { uavs: vec![vec![[a, b], [b, b], [0.0, a]], vec![]], users: vec![[a, a]], transmission_range: b };
-            well_formed(&trajectories("t", &flight));
+            assert_well_formed(&bars("t", "y", &[Bar { name: "a".into(), mean: a, low: b, high: a }]));
+            assert_well_formed(&distribution("t", "x", &[("a".into(), vec![a, b]), ("b".into(), vec![])]));
+            let shown =
+                Trajectories { uavs: vec![vec![[a, b], [b, b], [0.0, a]], vec![]], users: vec![[a, a]], transmission_range: b };
+            assert_well_formed(&trajectories("t", &shown));
         }
     }
 }
 
 #[test]
-fn many_series_are_told_apart_and_counted() {
+fn series_beyond_the_legend_are_counted() {
     let series = |i: usize| Series { name: format!("policy {i}"), points: vec![[0.0, i as f64], [1.0, 1.0]], band: None };
     let chart = Chart { series: (0..40).map(series).collect(), ..chart(Vec::new(), None, false) };
     let svg = lines(&chart);
     assert!(svg.contains("policy 3") && svg.contains("more"), "{svg}");
-    let flight = Flight { uavs: vec![vec![[0.5; 2]; 3]; 100], users: vec![[0.1, 0.2]; 100], transmission_range: 0.1 };
-    well_formed(&trajectories("t", &flight));
+    let shown = Trajectories { uavs: vec![vec![[0.5; 2]; 3]; 100], users: vec![[0.1, 0.2]; 100], transmission_range: 0.1 };
+    assert_well_formed(&trajectories("t", &shown));
 }
 
 #[test]
-fn a_distribution_rises_from_none_to_all() {
+fn a_distribution_is_a_curve_of_shares() {
     let svg = distribution("t", "mean AoI (slots)", &[("a".into(), vec![3.0, 1.0, 2.0])]);
     assert!(svg.contains("share of layouts") && svg.contains("<polyline"));
 }
 
 #[test]
-fn bars_write_their_values() {
+fn bars_show_their_values() {
     let svg = bars("t", "y", &[Bar { name: "a".into(), mean: 4.937, low: 4.5, high: 5.5 }]);
     assert!(svg.contains("4.94"), "{svg}");
 }

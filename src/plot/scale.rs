@@ -1,31 +1,31 @@
-//! Ranges of axes and the writing of numbers.
+//! Ranges of axes, and formats of numbers.
 
 use std::ops::Range;
 
-/// Whether a number can be drawn. Beyond this, neighbouring ticks of an axis could be the same f64.
+/// Whether a number is drawable. With larger numbers, neighbouring ticks of an axis can be the same f64.
 pub(super) fn drawable(x: f64) -> bool {
     x.abs() <= 1e12
 }
 
-/// The least range that holds all drawable `values`; nothing when there is none. Never empty: a single value gets room.
+/// The range of all drawable `values`; `None` if there are none. A range is never empty: a single value is widened.
 pub(super) fn extent(values: impl Iterator<Item = f64>) -> Option<Range<f64>> {
     let (low, high) = values.filter(|&x| drawable(x)).fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), x| (l.min(x), h.max(x)));
     if low > high {
         return None;
     }
-    let room = (low.abs().max(high.abs()) * 1e-6).max(1e-6);
-    Some(if high - low < room { low - room..high + room } else { low..high })
+    let margin = (low.abs().max(high.abs()) * 1e-6).max(1e-6);
+    Some(if high - low < margin { low - margin..high + margin } else { low..high })
 }
 
-/// `extent` with zero in it where that costs little, and air above and below the data.
+/// The axis for `extent`: with a margin, and from zero if the data is not far from it.
 pub(super) fn value_axis(extent: &Range<f64>) -> Range<f64> {
-    let air = 0.05 * (extent.end - extent.start);
+    let margin = 0.05 * (extent.end - extent.start);
     let from_zero = extent.start >= 0.0 && extent.start <= 0.7 * extent.end;
-    let low = if from_zero { 0.0 } else { extent.start - air };
-    low..extent.end + air
+    let low = if from_zero { 0.0 } else { extent.start - margin };
+    low..extent.end + margin
 }
 
-/// A tick: few digits, thousands and millions by letter.
+/// The label of a tick: few digits, with k and M for thousands and millions.
 pub(super) fn tick(x: f64) -> String {
     let (scaled, unit) = match x.abs() {
         a if a >= 1e9 => return format!("{x:.0e}"),
@@ -35,7 +35,7 @@ pub(super) fn tick(x: f64) -> String {
         _ => return short(x, 4),
     };
     if unit.is_empty() {
-        // Noise of counting up to zero, or a truly small number; the axis is then in powers of ten.
+        // A rounding error of zero, or a small number on an axis in powers of ten.
         return if scaled.abs() < 1e-12 { "0".to_owned() } else { format!("{scaled:.0e}") };
     }
     short(scaled, 3) + unit
@@ -48,7 +48,7 @@ fn short(x: f64, digits: usize) -> String {
     if text == "-0" { "0".to_owned() } else { text.to_owned() }
 }
 
-/// A measured value, as written beside a bar.
+/// The label of a value beside a bar.
 pub(super) fn value(x: f64) -> String {
     if x != 0.0 && !(0.01..1e6).contains(&x.abs()) { format!("{x:.2e}") } else { format!("{x:.2}") }
 }

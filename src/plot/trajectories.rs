@@ -1,41 +1,40 @@
-//! What a fleet flew, seen from above (as in the paper's figure of trajectories): users with the circle within which their
-//! data is collected, and the path of every UAV with arrows along it.
+//! The paths of a fleet from above: users with their collection circles, and each UAV's path with arrows.
 
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, VPos};
 
-use super::Flight;
 use super::canvas::{self, Drawn, INK, Key, Plot, SIDE, Sheet, colour, text};
+use super::data::Trajectories;
 use super::scale::{drawable, extent};
 use crate::env::Point;
 
 /// Side of the plot in pixels; one scale for x and y.
 const PLOT: u32 = 490;
-/// Width and height in pixels: heading, legend and axes around the plot.
+/// Width and height in pixels, with title, legend and axes.
 const SIZE: (u32, u32) = (12 + AXIS + PLOT + SIDE, canvas::TOP + PLOT + 46 + 8);
-/// Pixels left of the plot, for its axis.
+/// Width of the y axis in pixels.
 const AXIS: u32 = 54;
 /// Slots between two arrows.
 const ARROWS: usize = 4;
-/// More users than this go without a number each.
+/// Users are numbered if there are at most this many.
 const NUMBERED: usize = 60;
 const USER: RGBColor = RGBColor(0x55, 0x55, 0x55);
 const START: RGBColor = RGBColor(0x22, 0x22, 0x22);
 
-/// Users, circles and paths over the unit square (and whatever lies beyond it, where UAVs may leave it), as SVG.
-pub fn trajectories(title: &str, flight: &Flight) -> String {
-    let users: Vec<(usize, Point)> = flight.users.iter().copied().enumerate().filter(|(_, p)| visible(p)).collect();
-    let paths: Vec<Vec<Point>> = flight.uavs.iter().map(|path| path.iter().copied().filter(visible).collect()).collect();
+/// Users, circles and paths as SVG, over the unit square and the area around it that UAVs reached.
+pub fn trajectories(title: &str, shown: &Trajectories) -> String {
+    let users: Vec<(usize, Point)> = shown.users.iter().copied().enumerate().filter(|(_, p)| visible(p)).collect();
+    let paths: Vec<Vec<Point>> = shown.uavs.iter().map(|path| path.iter().copied().filter(visible).collect()).collect();
     if users.is_empty() && paths.iter().all(Vec::is_empty) {
         return canvas::no_data(SIZE, title);
     }
     let all = users.iter().map(|(_, p)| p).chain(paths.iter().flatten()).flatten().copied();
     let range = extent(all.chain([0.0, 1.0])).unwrap_or(0.0..1.0);
-    // Some room, as circles reach over the border.
-    let room = 0.04 * (range.end - range.start);
-    let range = range.start - room..range.end + room;
+    // A margin, as circles reach over the border.
+    let margin = 0.04 * (range.end - range.start);
+    let range = range.start - margin..range.end + margin;
     let scale = f64::from(PLOT) / (range.end - range.start);
-    let circle = if flight.transmission_range > 0.0 { (flight.transmission_range * scale).min(4e3) as i32 } else { 0 };
+    let circle = if shown.transmission_range > 0.0 { (shown.transmission_range * scale).min(4e3) as i32 } else { 0 };
     canvas::draw(SIZE, |sheet| {
         canvas::heading(sheet, title)?;
         let names = ["x (sides of the square)", "y (sides of the square)"];
@@ -54,9 +53,9 @@ pub fn trajectories(title: &str, flight: &Flight) -> String {
         for (number, [x, y]) in &users {
             area.draw(&Circle::new((*x, *y), 5, USER.filled()))?;
             if users.len() <= NUMBERED {
-                let words =
+                let label =
                     EmptyElement::at((*x, *y)) + Text::new(number.to_string(), (8, -10), text(15, INK, HPos::Left, VPos::Center));
-                area.draw(&words)?;
+                area.draw(&label)?;
             }
         }
         for (i, path) in paths.iter().enumerate() {
@@ -65,13 +64,13 @@ pub fn trajectories(title: &str, flight: &Flight) -> String {
             area.draw(&Circle::new((last[0], last[1]), 7, WHITE.filled()))?;
             area.draw(&Circle::new((last[0], last[1]), 5, colour(i).filled()))?;
         }
-        key(sheet, paths.len())
+        draw_legend(sheet, paths.len())
     })
 }
 
-/// Every few slots a triangle in the middle of the step, pointing where the UAV flies; `size` in units of the axes.
+/// Every few slots, an arrow in the middle of the move; `size` is in units of the axes.
 fn arrows(plot: &mut Plot, i: usize, path: &[Point], size: f64) -> Drawn {
-    // Paths of several UAVs often cover each other; their arrows then take turns.
+    // Paths of several UAVs often overlap, so their arrows are at different slots.
     for step in path.windows(2).skip((1 + i) % ARROWS).step_by(ARROWS) {
         let [from, to] = [step[0], step[1]];
         let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
@@ -87,7 +86,7 @@ fn arrows(plot: &mut Plot, i: usize, path: &[Point], size: f64) -> Drawn {
     Ok(())
 }
 
-fn key(sheet: &Sheet, uavs: usize) -> Drawn {
+fn draw_legend(sheet: &Sheet, uavs: usize) -> Drawn {
     let mut entries = vec![
         (Key::Ring(START, 7), "start".to_owned()),
         (Key::Dot(USER, 5), "user".to_owned()),

@@ -1,0 +1,81 @@
+//! Atomic writes of files: after a crash, a file has its old or its new content, never a part of it.
+
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+/// The file beside `path` that [`write_atomic`] writes first. It is left behind when the process is killed during a write.
+pub fn partial_path(path: &Path) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".partial");
+    name.into()
+}
+
+/// Replaces the content of `path` by `bytes`, or leaves the file as it is. On success the content survives a power failure.
+///
+/// # Errors
+/// The directory is missing or not writable, or the disk is full.
+pub fn write_atomic(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let partial = partial_path(path);
+    let written = write_synced(&partial, bytes).and_then(|()| fs::rename(&partial, path));
+    if written.is_err() {
+        let _ = fs::remove_file(&partial);
+    }
+    written.and_then(|()| sync_directory_of(path))
+}
+
+/// Writes `bytes` and waits until they are on disk. Renamed without this, a file can be empty after a power failure.
+fn write_synced(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let mut file = File::create(path)?;
+    file.write_all(bytes)?;
+    file.sync_all()
+}
+
+/// Waits until the directory entry of `path` is on disk.
+fn sync_directory_of(path: &Path) -> io::Result<()> {
+    let directory = match path.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        _ => Path::new("."),
+    };
+    if cfg!(unix) { File::open(directory)?.sync_all() } else { Ok(()) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_write_replaces_the_content_and_leaves_no_partial_file() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("a.json");
+        write_atomic(&path, b"first, longer").unwrap();
+        write_atomic(&path, b"second").unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"second");
+        // A process that was killed left a partial file.
+        fs::write(partial_path(&path), b"rest of a killed write").unwrap();
+        write_atomic(&path, b"third").unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"third");
+        assert_eq!(fs::read_dir(directory.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_failed_write_keeps_the_old_content() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("a.json");
+        write_atomic(&path, b"old").unwrap();
+        fs::create_dir(partial_path(&path)).unwrap();
+        assert!(write_atomic(&path, b"new").is_err());
+        assert_eq!(fs::read(&path).unwrap(), b"old");
+        assert!(write_atomic(&directory.path().join("missing/a.json"), b"new").is_err());
+        // A directory cannot be replaced by a file; the partial file is removed.
+        let other = directory.path().join("directory");
+        fs::create_dir(&other).unwrap();
+        assert!(write_atomic(&other, b"new").is_err());
+        assert!(!partial_path(&other).exists());
+    }
+
+    #[test]
+    fn the_directory_of_a_bare_name_is_the_current_one() {
+        sync_directory_of(Path::new("a.json")).unwrap();
+    }
+}

@@ -1,0 +1,63 @@
+//! How far a training run has come: counters, the next phase, evaluations. The trainer changes it, a snapshot holds it.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Evaluation, TrainConfig};
+
+/// What the next call of [`super::Trainer::next`] does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Phase {
+    Evaluate,
+    Iterate,
+    Finish,
+    Finished,
+}
+
+/// Counters of a run, and the phase that comes next.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Counters {
+    pub phase: Phase,
+    /// Environment steps made.
+    pub step: u64,
+    /// Episodes collected.
+    pub episodes: u64,
+    /// Updates made.
+    pub updates: u64,
+    /// `episodes` when the target networks were last copied.
+    pub copied: u64,
+    /// Environment step of the next evaluation.
+    pub next_evaluation: u64,
+}
+
+/// Everything about a run that is neither configuration nor networks nor replay.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct RunState {
+    pub counters: Counters,
+    /// The last evaluation.
+    pub latest: Option<Evaluation>,
+    /// The evaluation with the lowest mean AoI, and the weights that reached it.
+    pub best: Option<(Evaluation, Vec<f32>)>,
+}
+
+impl Counters {
+    /// Whether a run of this configuration can reach these counters with `held` episodes in replay.
+    pub(super) fn is_consistent(&self, config: &TrainConfig, held: usize) -> bool {
+        let t = &config.training;
+        self.episodes.checked_mul(config.environment.slots as u64) == Some(self.step)
+            && self.step < t.steps + (t.envs * config.environment.slots) as u64
+            && self.copied <= self.episodes
+            && self.updates <= self.episodes.saturating_mul(t.updates_per_iteration as u64)
+            && self.next_evaluation <= (self.step / t.eval_every + 1) * t.eval_every
+            && held as u64 == self.episodes.min(t.buffer as u64)
+    }
+}
+
+impl RunState {
+    /// A run that has not begun.
+    pub(super) fn new() -> Self {
+        let counters = Counters { phase: Phase::Evaluate, step: 0, episodes: 0, updates: 0, copied: 0, next_evaluation: 0 };
+        Self { counters, latest: None, best: None }
+    }
+}

@@ -1,0 +1,53 @@
+//! The data of plots.
+
+use crate::env::Point;
+
+/// One curve.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Series {
+    /// Name in the legend.
+    pub name: String,
+    /// (x, y) in drawing order; a point that is not finite interrupts the curve.
+    pub points: Vec<[f64; 2]>,
+    /// Interval (low, high) of each point.
+    pub band: Option<Vec<[f64; 2]>>,
+}
+
+/// Curves over common axes.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Chart {
+    /// Title of the plot.
+    pub title: String,
+    /// Label of the x axis, with the unit.
+    pub x: String,
+    /// Label of the y axis, with the unit.
+    pub y: String,
+    /// The curves; their order fixes their colours.
+    pub series: Vec<Series>,
+    /// Draws a marker at every point, and bands as error bars: for few x values.
+    pub markers: bool,
+}
+
+/// A bar with its interval.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Bar {
+    /// Its label.
+    pub name: String,
+    /// Its length.
+    pub mean: f64,
+    /// Low end of the interval.
+    pub low: f64,
+    /// High end of the interval.
+    pub high: f64,
+}
+
+/// The paths of a fleet in one episode. Lengths are in units of the square's side.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Trajectories {
+    /// Per UAV its positions in slots 0..=K.
+    pub uavs: Vec<Vec<Point>>,
+    /// Position of each user.
+    pub users: Vec<Point>,
+    /// Range within which a user's data is collected.
+    pub transmission_range: f64,
+}

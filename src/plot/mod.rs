@@ -1,0 +1,19 @@
+//! Plots: data in, SVG text out. No files, no clock, no fonts of the machine: the same data gives the same bytes.
+//!
+//! Every plot has a white background, one colour per series that colour-blind readers can distinguish, and a legend beside it.
+//! Numbers that are not finite, or above 1e12, are left out. A plot without data says "no data".
+
+mod bars;
+mod canvas;
+mod data;
+mod lines;
+mod scale;
+mod trajectories;
+
+pub use bars::bars;
+pub use data::{Bar, Chart, Series, Trajectories};
+pub use lines::{distribution, lines};
+pub use trajectories::trajectories;
+
+#[cfg(test)]
+mod tests;
