@@ -9,6 +9,7 @@ use qedgix::service::policies::{IndexEntry, index};
 use qedgix::store::{
     AttemptResult, CheckpointKind, EndedAttempt, JobId, JobKind, JobSpec, NewCheckpoint, NewJob, Store, SubmitResult,
 };
+use qedgix::train_config::{Algorithm, Preset};
 use qedgix::wire::v1;
 use reqwest::{Client, Method, Response, StatusCode};
 use serde_json::{Value, json};
