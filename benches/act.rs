@@ -1,4 +1,5 @@
-//! Time of a served answer without its transport, by size of the fleet: `cargo bench --bench act`.
+//! Time of one `Act` without transport, by size of the fleet: conversion of a scene plus forward pass. Run it with
+//! `cargo bench --bench act`.
 #![allow(missing_docs)] // criterion's macros
 
 use criterion::{Criterion, criterion_group, criterion_main};
@@ -6,12 +7,12 @@ use qedgix::learner::{Algorithm, Learner, Preset, TrainConfig};
 use qedgix::policy::{FleetStep, LearnedPolicy, Policy, Slot};
 
 fn act(c: &mut Criterion) {
-    let mut group = c.benchmark_group("served answer");
+    let mut group = c.benchmark_group("act");
     for (uavs, users) in [(3, 5), (20, 100), (1000, 10_000)] {
         let config = TrainConfig::preset(Algorithm::Qedgix, Preset::Practical);
         let learner = Learner::new(&config, 1).expect("a thread");
         let policy = LearnedPolicy::new(config.agent(), config.dims(), learner.agent_parameters().to_vec()).expect("its own");
-        // One user per 1/10 of a square as wide as the detection range, however many there are.
+        // Ten users per square of the side of the detection range, for all fleet sizes.
         let width = 0.28 * (users as f64 / 10.0).sqrt();
         let spread = |n: usize, step: f64| -> Vec<[f64; 2]> {
             (0..n).map(|i| [(i as f64 * step).fract() * width, (i as f64 + 0.5) / n as f64 * width]).collect()

@@ -237,7 +237,7 @@ pub async fn run(
     telemetry::install_metrics();
     let stop = CancellationToken::new();
     let health = grpc::Health::new(app.draining.clone(), stop.clone());
-    health.report(operations::vitals(&app).await);
+    health.report(operations::server_health(&app).await);
 
     let connections = Connections {
         permits: Arc::new(Semaphore::new(config.max_connections)),

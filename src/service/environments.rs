@@ -1,22 +1,22 @@
-//! Creating, resetting, stepping, showing and ending hosted environments.
+//! Use cases of hosted environments: create, reset, step, describe, delete, list.
 
 use serde_json::Value;
 
 use super::paging::json_bytes;
 use super::{App, Error, Page, PageRequest};
-use crate::serving::{Blueprint, EnvironmentInfo, Flight, Reset, State};
+use crate::serving::{EnvironmentInfo, EnvironmentReset, EnvironmentSpec, EnvironmentState, EnvironmentStep};
 use crate::train_config;
 
-/// How to create an environment.
+/// A request to create an environment.
 #[derive(Clone, Debug)]
 pub struct Create {
-    /// Chosen by the server when absent.
+    /// The environment's name; generated if absent.
     pub id: Option<String>,
-    /// Fields of the configuration, over the defaults.
+    /// Fields of the configuration that differ from the defaults.
     pub environment: Value,
     /// Copy b's first episode has the seed `seed` + b.
     pub seed: u64,
-    /// Number of copies.
+    /// B, the number of copies.
     pub count: usize,
     /// Whether the last step of an episode begins the next.
     pub auto_reset: bool,
@@ -25,45 +25,47 @@ pub struct Create {
 /// Creates an environment, at slot 0 of episode 0.
 ///
 /// # Errors
-/// A field that is unknown or out of range, a name that is taken, too many or too large environments, draining.
+/// [`Error::Draining`]; [`Error::Invalid`] for unknown fields and values out of range; [`Error::Conflict`] if the name is
+/// taken; [`Error::Busy`] if the number or the memory of environments is exhausted.
 pub async fn create(app: &App, create: Create) -> Result<EnvironmentInfo, Error> {
     app.admit()?;
     let Create { id, environment, seed, count, auto_reset } = create;
-    let blueprint = Blueprint::new(train_config::environment(environment)?, count, seed, auto_reset)?;
-    Ok(app.environments.create(id, blueprint).await?)
+    let spec = EnvironmentSpec::new(train_config::environment(environment)?, count, seed, auto_reset)?;
+    Ok(app.environments.create(id, spec).await?)
 }
 
 /// Begins an episode in every copy.
 ///
 /// # Errors
-/// A seed out of range, graphs that are too large, an environment that expired or does not exist, draining.
-pub async fn reset(app: &App, id: &str, reset: Reset) -> Result<State, Error> {
+/// [`Error::Draining`]; [`Error::Invalid`] if the seed is out of range or graphs would be too large; [`Error::NotFound`];
+/// `environment_expired`.
+pub async fn reset(app: &App, id: &str, reset: EnvironmentReset) -> Result<EnvironmentState, Error> {
     app.admit()?;
     Ok(app.environments.table().get(id)?.reset(reset).await?)
 }
 
-/// Flies one slot in every copy.
+/// Advances every copy by one slot.
 ///
 /// # Errors
-/// Actions that do not fit, a wrong step, an episode that is over, graphs that are too large, an environment that expired or
-/// does not exist, draining.
-pub async fn step(app: &App, id: &str, flight: Flight) -> Result<State, Error> {
+/// [`Error::Draining`]; [`Error::Invalid`] if the actions do not fit or graphs would be too large; [`Error::NotFound`];
+/// `wrong_step`, `episode_over`, `environment_expired`.
+pub async fn step(app: &App, id: &str, step: EnvironmentStep) -> Result<EnvironmentState, Error> {
     app.admit()?;
-    Ok(app.environments.table().get(id)?.step(flight).await?)
+    Ok(app.environments.table().get(id)?.step(step).await?)
 }
 
-/// Shows an environment.
+/// Describes an environment.
 ///
 /// # Errors
-/// It expired, or there is none.
+/// [`Error::NotFound`], or `environment_expired`.
 pub fn get(app: &App, id: &str) -> Result<EnvironmentInfo, Error> {
     Ok(app.environments.describe(id)?)
 }
 
-/// Ends an environment after its step in flight.
+/// Deletes an environment after its step in flight.
 ///
 /// # Errors
-/// It expired, or there is none.
+/// [`Error::NotFound`], or `environment_expired`.
 pub async fn delete(app: &App, id: &str) -> Result<EnvironmentInfo, Error> {
     Ok(app.environments.delete(id).await?)
 }
@@ -76,5 +78,5 @@ pub fn list(app: &App, page: &PageRequest) -> Result<Page<EnvironmentInfo>, Erro
     let table = app.environments.table();
     let (environments, more) = table.list(&page.token, page.usual_limit()?);
     let environments = environments.iter().map(|environment| environment.info(table.ttl())).collect();
-    Ok(Page::bounded(environments, more, |info| json_bytes(&info.blueprint.config), |info| info.id.clone()))
+    Ok(Page::bounded(environments, more, |info| json_bytes(&info.spec.config), |info| info.id.clone()))
 }

@@ -9,7 +9,6 @@ pub mod keys;
 pub mod operations;
 mod paging;
 pub mod policies;
-pub mod sequences;
 pub mod sessions;
 pub mod worker;
 

@@ -1,96 +1,96 @@
-//! What operators ask: whether the server can do its work, part by part, and how much of it there is.
+//! State of the server for operators: health of its components, readiness, and metrics of its present load.
 
 use std::time::Duration;
 
 use super::{App, Error};
 use crate::store::JobState;
 
-/// A database that takes longer to answer counts as one that does not.
-const PATIENCE: Duration = Duration::from_secs(2);
+/// If the database takes longer to answer, it counts as unavailable.
+const DATABASE_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Which parts of the server work.
+/// Health of the server's components.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Vitals {
+pub struct ServerHealth {
     /// The database answers.
     pub database: bool,
-    /// There is a policy to ask.
+    /// There is a policy.
     pub policies: bool,
-    /// The queue of jobs can be read, so jobs are started.
+    /// The queue of jobs is readable, so jobs are started.
     pub scheduler: bool,
 }
 
-/// Looks which parts of the server work.
-pub async fn vitals(app: &App) -> Vitals {
-    Vitals {
-        database: database(app).await.is_ok(),
+/// Checks the server's components.
+pub async fn server_health(app: &App) -> ServerHealth {
+    ServerHealth {
+        database: ping_database(app).await.is_ok(),
         policies: !app.registry.is_empty(),
         scheduler: *app.scheduler.queue_readable().borrow(),
     }
 }
 
-/// Returns when [`vitals`] are worth another look.
-pub async fn vitals_changed(app: &App) {
-    let mut able = app.scheduler.queue_readable();
+/// Waits until [`server_health`] may have changed.
+pub async fn server_health_changed(app: &App) {
+    let mut readable = app.scheduler.queue_readable();
     tokio::select! {
-        // The sender lives in `app`.
-        _ = able.changed() => {}
-        () = tokio::time::sleep(PATIENCE) => {}
+        // Never an error: `app` owns the sender.
+        _ = readable.changed() => {}
+        () = tokio::time::sleep(DATABASE_TIMEOUT) => {}
     }
 }
 
-async fn database(app: &App) -> Result<(), Error> {
-    match tokio::time::timeout(PATIENCE, app.store.ping()).await {
-        Ok(answered) => Ok(answered?),
+async fn ping_database(app: &App) -> Result<(), Error> {
+    match tokio::time::timeout(DATABASE_TIMEOUT, app.store.ping()).await {
+        Ok(result) => Ok(result?),
         Err(_) => Err(Error::internal("the database does not answer")),
     }
 }
 
 impl App {
-    /// Checks that the server can do its work: the database answers, there is something to serve, and it is not draining.
+    /// Checks that the server is ready: it is not draining, there is a policy, and the database answers.
     ///
     /// # Errors
-    /// The first of these that is not the case.
+    /// [`Error::Draining`], or [`Error::Internal`] for the others.
     pub async fn ready(&self) -> Result<(), Error> {
         self.admit()?;
         if self.registry.is_empty() {
             return Err(Error::internal("no policy is loaded"));
         }
-        database(self).await
+        ping_database(self).await
     }
 }
 
-/// How much of what there is.
+/// Metrics of the server's present load.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Figures {
+pub struct ServerMetrics {
     /// Open sessions.
     pub sessions: usize,
     /// Hosted environments.
     pub environments: usize,
-    /// Policy versions that can be asked.
+    /// Policy versions.
     pub policy_versions: usize,
-    /// Fleets that wait for the engine.
+    /// Fleets in the engine's queue.
     pub engine_queue: usize,
     /// Threads that running jobs use.
     pub threads_busy: usize,
-    /// Threads that they may use together.
+    /// The CPU budget of jobs, in threads.
     pub threads: usize,
-    /// Streams of jobs' events that are open.
+    /// Open streams of jobs' events.
     pub watchers: usize,
-    /// Jobs by state; empty where the database does not answer.
+    /// Jobs by state; empty if the database does not answer.
     pub jobs: Vec<(JobState, u64)>,
 }
 
-/// Counts everything. What the database does not tell in time is left out: the rest is then wanted most.
-pub async fn figures(app: &App) -> Figures {
-    let jobs = match tokio::time::timeout(PATIENCE, app.store.job_counts()).await {
+/// Collects the metrics. Never fails, because metrics are most needed when the database does not answer.
+pub async fn server_metrics(app: &App) -> ServerMetrics {
+    let jobs = match tokio::time::timeout(DATABASE_TIMEOUT, app.store.job_counts()).await {
         Ok(Ok(jobs)) => jobs,
         Ok(Err(e)) => {
-            tracing::warn!(error = %e, "jobs could not be counted");
+            tracing::warn!(error = %e, "cannot count jobs");
             Vec::new()
         }
         Err(_) => Vec::new(),
     };
-    Figures {
+    ServerMetrics {
         sessions: app.sessions.len(),
         environments: app.environments.table().len(),
         policy_versions: app.registry.len(),

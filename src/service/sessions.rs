@@ -1,36 +1,38 @@
-//! Opening, showing and ending sessions.
+//! Use cases of sessions: open, describe, close, list.
 
-use super::sequences::PREFIX;
+use super::act::SEQUENCE_PREFIX;
 use super::{App, Error, Page, PageRequest};
 use crate::invalid::Invalid;
-use crate::serving::{Entry, Opened, PolicySpec, SessionInfo};
+use crate::serving::{PolicySpec, SessionInfo, SessionOptions, TableEntry};
 
-/// Opens a session pinned to what `policy` names now.
+/// Opens a session pinned to the version that `policy` resolves to.
 ///
 /// # Errors
-/// An unknown policy, a name that is taken, a fenced run, too many sessions, draining.
-pub async fn open(app: &App, policy: &PolicySpec, how: Opened) -> Result<SessionInfo, Error> {
+/// [`Error::Draining`]; [`Error::NotFound`] if the policy is unknown; [`Error::Invalid`] if the name belongs to sequences;
+/// [`Error::Conflict`] if the name is taken; `policy_unloaded`; `run_fenced`; [`Error::Busy`] if the number of sessions is
+/// exhausted.
+pub async fn open(app: &App, policy: &PolicySpec, options: SessionOptions) -> Result<SessionInfo, Error> {
     app.admit()?;
-    if let Some(id) = how.id.as_deref().filter(|id| id.starts_with(PREFIX)) {
-        let expected = format!("an id that does not start with {PREFIX:?}, which the Open Inference Protocol reserves");
+    if let Some(id) = options.id.as_deref().filter(|id| id.starts_with(SEQUENCE_PREFIX)) {
+        let expected = format!("an id that does not start with {SEQUENCE_PREFIX:?}, which the Open Inference Protocol reserves");
         return Err(Invalid::new("session_id", format!("{id:?}"), expected).into());
     }
     let policy = app.registry.resolve(policy)?;
-    Ok(app.sessions.open(policy, how).await?)
+    Ok(app.sessions.open(policy, options).await?)
 }
 
-/// Shows a session.
+/// Describes a session.
 ///
 /// # Errors
-/// It expired, or there is none.
+/// [`Error::NotFound`], or `session_expired`.
 pub fn get(app: &App, id: &str) -> Result<SessionInfo, Error> {
     Ok(app.sessions.describe(id)?)
 }
 
-/// Ends a session after its slot in flight.
+/// Closes a session after its step in flight.
 ///
 /// # Errors
-/// It expired, or there is none.
+/// [`Error::NotFound`], or `session_expired`.
 pub async fn close(app: &App, id: &str) -> Result<SessionInfo, Error> {
     Ok(app.sessions.close(id).await?)
 }

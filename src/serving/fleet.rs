@@ -1,4 +1,4 @@
-//! Who flies: the ids of a fleet in the one order that all slots of an episode share.
+//! The ids of a fleet, in the canonical order that all slots of an episode share.
 
 use std::cmp::Ordering;
 
@@ -9,9 +9,9 @@ use crate::invalid::Invalid;
 /// Ids of UAVs and users in canonical order: shorter first, then bytewise, so that `uav-2` comes before `uav-10`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Fleet {
-    /// M ids.
+    /// Ids of the M UAVs.
     pub uavs: Vec<String>,
-    /// N ids.
+    /// Ids of the N users.
     pub users: Vec<String>,
 }
 
@@ -19,12 +19,17 @@ impl Fleet {
     /// Longest id, in characters.
     pub const LONGEST_ID: usize = 128;
 
-    /// The canonical order of ids.
+    /// Compares two ids in canonical order.
     pub fn order(a: &str, b: &str) -> Ordering {
         a.len().cmp(&b.len()).then_with(|| a.as_bytes().cmp(b.as_bytes()))
     }
 
-    /// A fingerprint of the ids: equal fleets, equal fingerprints.
+    /// The numbers of UAVs and users.
+    pub fn size(&self) -> (usize, usize) {
+        (self.uavs.len(), self.users.len())
+    }
+
+    /// A hash of the ids. Different fleets have different fingerprints.
     pub fn fingerprint(&self) -> [u8; 16] {
         let mut hash = Sha256::new();
         for ids in [&self.uavs, &self.users] {

@@ -1,31 +1,29 @@
-//! Answering now: which policies there are, who flies with which memory, the engine that computes headings, and environments
-//! that learners elsewhere fly.
+//! Serving: the registry of policies, sessions and their memory, the engine that runs policies, and hosted environments.
 //!
-//! Knows neither wire formats nor SQL; `service` brings policies out of the store and puts answers together.
+//! This layer has no wire formats and no SQL: `service` loads policies from the store and assembles responses.
 
 pub mod bundled;
 mod engine;
 mod environments;
 mod error;
 mod fleet;
-mod memory;
-mod meters;
 mod observation;
+mod recurrent_state;
 mod reference;
 mod registry;
 mod sessions;
 mod table;
 
-pub use engine::{Engine, EngineConfig, Outcome, Room, Task, Timings};
+pub use engine::{Decision, Engine, EngineConfig, OutputBuffers, Task, TaskOutput, Timings};
 pub use environments::{
-    Blueprint, CopyState, Environment, EnvironmentInfo, Environments, EnvironmentsConfig, Finished, Flight, Progress, Reset,
-    Sight, State,
+    CopyObservation, CopyState, Environment, EnvironmentInfo, EnvironmentReset, EnvironmentSpec, EnvironmentState,
+    EnvironmentStep, Environments, EnvironmentsConfig, EpisodeCursor, FinishedEpisode,
 };
 pub use error::Error;
 pub use fleet::Fleet;
-pub use memory::HeldState;
-pub use observation::{Graph, GraphForm, MAX_DETECTIONS, MAX_NODES, Observation, Seen, Sighting};
-pub use reference::{PolicyRef, PolicySpec, Which, check_name};
-pub use registry::{About, Described, Kind, LoadedPolicy, Registry};
-pub use sessions::{Answered, Opened, Session, SessionInfo, Sessions, Turn};
-pub use table::{Entry, LastUse, Limits, Table};
+pub use observation::{Graph, GraphForm, MAX_DETECTIONS, MAX_NODES, Observation, ReportedDetection, Scene, SceneOrGraph};
+pub use recurrent_state::RecurrentState;
+pub use reference::{PolicyRef, PolicySpec, VersionSelector, check_name};
+pub use registry::{LoadedPolicy, PolicyDetails, PolicyInfo, PolicyKind, Registry};
+pub use sessions::{PendingStep, Session, SessionInfo, SessionOptions, Sessions, StepStart};
+pub use table::{LastUse, Limits, Table, TableEntry};

@@ -1,8 +1,7 @@
-//! What a caller says a fleet sees in one slot, ids resolved and brought into canonical order; from it the [`Slot`] that
-//! a policy reads.
+//! The observation of one fleet in one slot, and its conversion to the [`Slot`] that a policy reads.
 //!
-//! `api::convert` builds an [`Observation`] and checks everything that does not depend on the policy. Here the policy's
-//! detection range and needs come in: a scene is turned into detections, a graph is completed.
+//! `api::convert` builds an [`Observation`] and checks everything that does not depend on the policy. This file applies the
+//! policy's detection range and needs: it computes the detections of a scene, and completes a graph.
 
 use super::Fleet;
 use crate::env::Point;
@@ -17,31 +16,35 @@ pub const MAX_DETECTIONS: usize = 1 << 22;
 /// Relative coordinates may exceed the detection range by this factor, for callers that compute in f32.
 const RANGE_TOLERANCE: f64 = 1.0 + 1e-5;
 
-/// One slot of one fleet, in canonical order of ids.
+/// Observation of one fleet in one slot, in canonical order of ids.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Observation {
-    /// The ids.
+    /// The ids of UAVs and users.
     pub fleet: Fleet,
     /// Canonical index of each UAV in the order of the request.
     pub uav_order: Vec<u32>,
-    /// What is known of the slot.
-    pub seen: Seen,
+    /// Positions or detections.
+    pub content: SceneOrGraph,
 }
 
-/// The two ways to describe a slot.
+/// The two forms of an observation.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Seen {
+pub enum SceneOrGraph {
     /// Absolute positions.
-    Scene {
-        /// Position of each UAV.
-        uavs: Vec<Point>,
-        /// Position of each user.
-        users: Vec<Point>,
-        /// AoI of each user in slots.
-        aoi: Vec<f32>,
-    },
-    /// What nodes detect.
+    Scene(Scene),
+    /// Detections.
     Graph(Graph),
+}
+
+/// Absolute positions of all nodes.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scene {
+    /// Position of each UAV.
+    pub uavs: Vec<Point>,
+    /// Position of each user.
+    pub users: Vec<Point>,
+    /// AoI of each user in slots.
+    pub aoi: Vec<f32>,
 }
 
 /// Detections of each node, symmetric: where i detects j, j detects i at the negated coordinates.
@@ -49,42 +52,42 @@ pub enum Seen {
 pub struct Graph {
     /// Own position of each UAV, where given.
     pub positions: Vec<Option<Point>>,
-    /// AoI of each user in slots; 0 where nobody said it.
+    /// AoI of each user in slots; 0 if it was not given.
     pub aoi: Vec<f32>,
-    /// What each node detects, UAVs first, in ascending order of target.
-    pub detections: Vec<Vec<Sighting>>,
-    /// Users whose detections of other users were left out.
+    /// Detections of each node, UAVs first, in ascending order of target.
+    pub detections: Vec<Vec<ReportedDetection>>,
+    /// Whether the request leaves out the detections of each user, so that they have to be derived.
     pub left_out: Vec<bool>,
-    /// Place of each node in the request's list.
+    /// Index of each node in the request's list.
     pub places: Vec<u32>,
-    /// How the request is made, for what is said about it.
+    /// Form of the request, for the field names in errors.
     pub form: GraphForm,
 }
 
-/// How a caller writes a graph down.
+/// How a request describes a graph.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum GraphForm {
     /// Nodes, each with a list of detections.
     #[default]
     Nodes,
-    /// A list of edges; the place of a detection is in that list.
+    /// One list of edges for the whole graph.
     Edges,
 }
 
-/// Node `target` seen at `rel`.
+/// A detection of a request, in f64 and with its place in the request.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Sighting {
+pub struct ReportedDetection {
     /// Canonical node index, UAVs first.
     pub target: u32,
-    /// Target position - own position.
+    /// Position of the target minus position of the detecting node.
     pub rel: Point,
-    /// Place in the request's list of detections of the node that reported it, or in its list of edges.
+    /// Index in the request's detections of the node, or in its list of edges.
     pub place: u32,
-    /// Whether it was reported by the target and mirrored.
+    /// Whether the request has only the opposite detection, of which this is the mirror image.
     pub mirrored: bool,
 }
 
-impl Sighting {
+impl ReportedDetection {
     fn detection(&self) -> Detection {
         Detection { target: self.target, rel: self.rel.map(|x| x as f32) }
     }
@@ -101,18 +104,18 @@ impl Observation {
         self.fleet.users.len()
     }
 
-    /// The slot as `policy` sees it. Work is bounded by [`MAX_NODES`] and [`MAX_DETECTIONS`].
+    /// The input of `policy`. Work is bounded by [`MAX_NODES`] and [`MAX_DETECTIONS`].
     ///
     /// # Errors
-    /// The fleet does not fit the policy, something it needs is missing, a detection lies beyond its range, or there are
-    /// too many detections.
+    /// Names the field at fault if the fleet does not fit the policy, if something that the policy needs is missing, if a
+    /// detection lies beyond its range, or if there are too many detections.
     pub fn into_slot(self, policy: &dyn Policy) -> Result<Slot, Invalid> {
         let size = (self.uavs(), self.users());
-        self.seen.into_slot(size, policy)
+        self.content.into_slot(size, policy)
     }
 }
 
-impl Seen {
+impl SceneOrGraph {
     /// As [`Observation::into_slot`], for a fleet of `(uavs, users)`.
     ///
     /// # Errors
@@ -121,7 +124,7 @@ impl Seen {
         policy.check_fleet(uavs, users)?;
         let range = policy.detection_range();
         match self {
-            Self::Scene { uavs, users, aoi } => {
+            Self::Scene(Scene { uavs, users, aoi }) => {
                 Slot::from_scene_within(&uavs, &users, &aoi, range, MAX_DETECTIONS).ok_or_else(|| too_many_detections("scene"))
             }
             Self::Graph(graph) => graph.into_slot(policy.needs(), range),
@@ -154,28 +157,28 @@ impl Graph {
             return Err(Invalid::missing(field, "the position of the UAV, which this policy needs"));
         }
         self.check_range(range)?;
-        let derived = self.derive(range)?;
+        let derived = self.derive_user_detections(range)?;
         let mut offsets = Vec::with_capacity(self.detections.len() + 1);
         offsets.push(0);
         let mut detections = Vec::with_capacity(self.detections.iter().map(Vec::len).chain(derived.iter().map(Vec::len)).sum());
         for (node, list) in self.detections.iter().enumerate() {
             let begin = detections.len();
-            detections.extend(list.iter().map(Sighting::detection));
+            detections.extend(list.iter().map(ReportedDetection::detection));
             if let Some(user) = node.checked_sub(uavs) {
                 detections.extend_from_slice(&derived[user]);
-                // Most users said nothing and detect UAVs, then what was derived: that is in order already.
+                // The list of most users is sorted already: mirrored detections of UAVs, then derived ones of users.
                 if !detections[begin..].is_sorted_by_key(|d| d.target) {
                     detections[begin..].sort_unstable_by_key(|d| d.target);
                 }
             }
             offsets.push(detections.len() as u32);
         }
-        // All or none: a policy that can use positions reads them of every UAV.
+        // All or none: a policy that uses positions needs the position of every UAV.
         let positions = self.positions.into_iter().collect::<Option<Vec<Point>>>();
         Ok(Slot::from_flat_detections(positions, uavs, self.aoi, offsets, detections))
     }
 
-    /// What the relative coordinates of a detection of `node` are called.
+    /// The request's field that holds the relative coordinates of detection `place` of `node`.
     pub fn rel_field(&self, node: usize, place: u32) -> String {
         match self.form {
             GraphForm::Nodes => format!("graph.nodes[{}].detections[{place}].rel", self.places[node]),
@@ -183,13 +186,13 @@ impl Graph {
         }
     }
 
-    /// A detection beyond the range is a mistake in units, or a sensor that the policy was not trained with.
+    /// Rejects detections beyond the range: the caller uses other units, or a sensor that the policy was not trained with.
     fn check_range(&self, range: f64) -> Result<(), Invalid> {
         for (node, list) in self.detections.iter().enumerate() {
-            for sighting in list.iter().filter(|s| !s.mirrored) {
-                if !within(&sighting.rel, range * RANGE_TOLERANCE) {
-                    let [x, y] = sighting.rel;
-                    let field = self.rel_field(node, sighting.place);
+            for detection in list.iter().filter(|d| !d.mirrored) {
+                if !within(&detection.rel, range * RANGE_TOLERANCE) {
+                    let [x, y] = detection.rel;
+                    let field = self.rel_field(node, detection.place);
                     let expected = format!("a position within the detection range of the policy ({range})");
                     return Err(Invalid::new(field, format!("({x}, {y})"), expected));
                 }
@@ -198,10 +201,10 @@ impl Graph {
         Ok(())
     }
 
-    /// What users whose detections were left out detect beside what is mirrored: the other users that some UAV sees together
-    /// with them. Where UAV i sees both, user j sees user k at `rel_ik - rel_ij`; the first UAV in canonical order tells.
-    /// One list per user, in no order.
-    fn derive(&self, range: f64) -> Result<Vec<Vec<Detection>>, Invalid> {
+    /// Derives detections between users for users whose detections the request leaves out. If UAV i detects users j and k,
+    /// then j detects k at `rel_ik - rel_ij`, provided that this is within the range; if several UAVs detect both, the first
+    /// one in canonical order determines the coordinates. Returns one unsorted list per user.
+    fn derive_user_detections(&self, range: f64) -> Result<Vec<Vec<Detection>>, Invalid> {
         let (uavs, users) = (self.positions.len(), self.aoi.len());
         let mut total: usize = self.detections.iter().map(Vec::len).sum();
         if total > MAX_DETECTIONS {
@@ -211,38 +214,40 @@ impl Graph {
         if !self.left_out.contains(&true) {
             return Ok(derived);
         }
-        // A pair of users that both left out their lists is looked at once, from the one that comes first.
-        let mut silent = vec![0_u64; users.div_ceil(64)];
+        // If both users of a pair left out their lists, the pair is examined once, from the first of the two.
+        let mut unreported = vec![0_u64; users.div_ceil(64)];
         for j in (0..users).filter(|&j| self.left_out[j]) {
-            silent[j / 64] |= 1 << (j % 64);
+            unreported[j / 64] |= 1 << (j % 64);
         }
-        let views: Vec<View> = self.detections[..uavs].iter().map(|list| View::of(list, uavs, users)).collect();
+        let by_uav: Vec<DetectedUsers> =
+            self.detections[..uavs].iter().map(|list| DetectedUsers::new(list, uavs, users)).collect();
+        // Bit sets of users: those to skip, and those that user j detects.
         let mut known = vec![0_u64; users.div_ceil(64)];
         let mut found = vec![0_u64; known.len()];
         let mut rels = vec![[0.0_f32; 2]; users];
         for j in (0..users).filter(|&j| self.left_out[j]) {
-            let seen = &self.detections[uavs + j];
+            let reported = &self.detections[uavs + j];
             known.fill(0);
             found.fill(0);
-            let others = seen.iter().filter_map(|s| (s.target as usize).checked_sub(uavs));
+            let others = reported.iter().filter_map(|d| (d.target as usize).checked_sub(uavs));
             for user in others.chain([j]) {
                 known[user / 64] |= 1 << (user % 64);
             }
-            for (known, silent) in known.iter_mut().zip(&silent[..j / 64]) {
-                *known |= silent;
+            for (known, unreported) in known.iter_mut().zip(&unreported[..j / 64]) {
+                *known |= unreported;
             }
-            known[j / 64] |= silent[j / 64] & ((1 << (j % 64)) - 1);
-            for to_uav in seen.iter().take_while(|s| (s.target as usize) < uavs) {
-                let View { bits, first, rel: list } = &views[to_uav.target as usize];
+            known[j / 64] |= unreported[j / 64] & ((1 << (j % 64)) - 1);
+            for to_uav in reported.iter().take_while(|d| (d.target as usize) < uavs) {
+                let DetectedUsers { bits, first, rel: list } = &by_uav[to_uav.target as usize];
                 for (word, (known, &bits)) in known.iter_mut().zip(bits).enumerate() {
-                    // A pair of users seen by many UAVs is looked at once.
+                    // A pair of users that several UAVs detect is examined once.
                     let mut fresh = bits & !*known;
                     *known |= bits;
                     while fresh != 0 {
                         let bit = fresh.trailing_zeros();
                         fresh &= fresh - 1;
-                        let place = first[word] as usize + (bits & ((1 << bit) - 1)).count_ones() as usize;
-                        let rel = [list[place][0] + to_uav.rel[0], list[place][1] + to_uav.rel[1]];
+                        let index = first[word] as usize + (bits & ((1 << bit) - 1)).count_ones() as usize;
+                        let rel = [list[index][0] + to_uav.rel[0], list[index][1] + to_uav.rel[1]];
                         found[word] |= u64::from(within(&rel, range)) << bit;
                         rels[word * 64 + bit as usize] = rel.map(|x| x as f32);
                     }
@@ -266,29 +271,29 @@ impl Graph {
     }
 }
 
-/// The users that a UAV detects.
-struct View {
-    /// A bit for each.
+/// The users that one UAV detects, as a bit set with coordinates.
+struct DetectedUsers {
+    /// One bit per user of the fleet.
     bits: Vec<u64>,
-    /// Place in `rel` of the first of each word.
+    /// For each word of `bits`, the index in `rel` of its first user.
     first: Vec<u32>,
-    /// Where they are, in ascending order.
+    /// Relative coordinates of the detected users, in ascending order of user.
     rel: Vec<Point>,
 }
 
-impl View {
-    fn of(list: &[Sighting], uavs: usize, users: usize) -> Self {
+impl DetectedUsers {
+    fn new(list: &[ReportedDetection], uavs: usize, users: usize) -> Self {
         let words = users.div_ceil(64);
-        let mut view = Self { bits: vec![0; words], first: vec![0; words], rel: Vec::new() };
-        for sighting in list {
-            let Some(user) = (sighting.target as usize).checked_sub(uavs) else { continue };
-            let bits = &mut view.bits[user / 64];
+        let mut detected = Self { bits: vec![0; words], first: vec![0; words], rel: Vec::new() };
+        for detection in list {
+            let Some(user) = (detection.target as usize).checked_sub(uavs) else { continue };
+            let bits = &mut detected.bits[user / 64];
             if *bits == 0 {
-                view.first[user / 64] = view.rel.len() as u32;
+                detected.first[user / 64] = detected.rel.len() as u32;
             }
             *bits |= 1 << (user % 64);
-            view.rel.push(sighting.rel);
+            detected.rel.push(detection.rel);
         }
-        view
+        detected
     }
 }

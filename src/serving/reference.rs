@@ -1,4 +1,4 @@
-//! How policies are named: `NAME`, `NAME@ALIAS`, `NAME:VERSION`, and exactly which one answered.
+//! References to policies: `NAME`, `NAME@ALIAS` or `NAME:VERSION` in requests, and name, version and digest in responses.
 
 use std::fmt;
 use std::str::FromStr;
@@ -6,26 +6,26 @@ use std::str::FromStr;
 use crate::invalid::Invalid;
 
 /// Longest name of a policy or alias, in characters.
-const LONGEST: usize = 64;
+const MAX_NAME: usize = 64;
 
-/// Which version of a policy is asked for.
+/// Selects a version of a policy.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Which {
-    /// The newest.
+pub enum VersionSelector {
+    /// The newest version.
     Newest,
-    /// What an alias points to now.
+    /// The version that this alias points to.
     Alias(String),
-    /// This one.
+    /// The version with this number.
     Version(u64),
 }
 
-/// A policy as a caller names it.
+/// A reference to a policy in a request.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PolicySpec {
     /// Name of the policy.
     pub name: String,
-    /// Its version.
-    pub which: Which,
+    /// The version of the policy.
+    pub version: VersionSelector,
 }
 
 impl FromStr for PolicySpec {
@@ -36,27 +36,27 @@ impl FromStr for PolicySpec {
             let expected = "NAME, NAME@ALIAS or NAME:VERSION; a name has 1 to 64 letters, digits, '.', '_' or '-' and does not start with '.'";
             Invalid::new("policy", format!("{text:?}"), expected)
         };
-        let (name, which) = if let Some((name, alias)) = text.split_once('@') {
+        let (name, version) = if let Some((name, alias)) = text.split_once('@') {
             check_name("policy", alias).map_err(|_| wrong())?;
-            (name, Which::Alias(alias.to_owned()))
+            (name, VersionSelector::Alias(alias.to_owned()))
         } else if let Some((name, version)) = text.split_once(':') {
             let digits = !version.is_empty() && version.bytes().all(|b| b.is_ascii_digit());
             let version = version.parse().ok().filter(|&v| digits && v > 0).ok_or_else(wrong)?;
-            (name, Which::Version(version))
+            (name, VersionSelector::Version(version))
         } else {
-            (text, Which::Newest)
+            (text, VersionSelector::Newest)
         };
         check_name("policy", name).map_err(|_| wrong())?;
-        Ok(Self { name: name.to_owned(), which })
+        Ok(Self { name: name.to_owned(), version })
     }
 }
 
 impl fmt::Display for PolicySpec {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match &self.which {
-            Which::Newest => f.write_str(&self.name),
-            Which::Alias(alias) => write!(f, "{}@{alias}", self.name),
-            Which::Version(version) => write!(f, "{}:{version}", self.name),
+        match &self.version {
+            VersionSelector::Newest => f.write_str(&self.name),
+            VersionSelector::Alias(alias) => write!(f, "{}@{alias}", self.name),
+            VersionSelector::Version(version) => write!(f, "{}:{version}", self.name),
         }
     }
 }
@@ -64,25 +64,25 @@ impl fmt::Display for PolicySpec {
 /// Checks the name of a policy or alias.
 ///
 /// # Errors
-/// Empty, too long, a character other than ASCII letters, digits, `.`, `_`, `-`, or a `.` first, which paths do not keep;
-/// `field` is named.
+/// Names `field` if `name` is empty, is longer than 64 characters, has other characters than ASCII letters, digits, `.`, `_`,
+/// `-`, or begins with `.` (HTTP clients drop path segments like `..`).
 pub fn check_name(field: &str, name: &str) -> Result<(), Invalid> {
     let allowed = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-');
-    if !name.is_empty() && name.len() <= LONGEST && name.bytes().all(allowed) && !name.starts_with('.') {
+    if !name.is_empty() && name.len() <= MAX_NAME && name.bytes().all(allowed) && !name.starts_with('.') {
         return Ok(());
     }
-    let expected = format!("1 to {LONGEST} letters, digits, '.', '_' or '-', not starting with '.'");
+    let expected = format!("1 to {MAX_NAME} letters, digits, '.', '_' or '-', not starting with '.'");
     Err(Invalid::new(field, format!("{name:?}"), expected))
 }
 
-/// Exactly one version of one policy.
+/// One version of one policy.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PolicyRef {
     /// Name.
     pub name: String,
     /// Version, from 1.
     pub version: u64,
-    /// SHA-256 of the checkpoint, or of the name and parameters of a baseline.
+    /// SHA-256 of the checkpoint file, or of the name and parameters of a baseline.
     pub digest: [u8; 32],
 }
 
@@ -104,11 +104,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn three_ways_to_name_a_policy() {
-        let parse = |text: &str| text.parse::<PolicySpec>().map(|spec| spec.which);
-        assert_eq!(parse("sweep"), Ok(Which::Newest));
-        assert_eq!(parse("sweep@prod"), Ok(Which::Alias("prod".into())));
-        assert_eq!(parse("sweep:12"), Ok(Which::Version(12)));
+    fn parses_name_alias_and_version() {
+        let parse = |text: &str| text.parse::<PolicySpec>().map(|spec| spec.version);
+        assert_eq!(parse("sweep"), Ok(VersionSelector::Newest));
+        assert_eq!(parse("sweep@prod"), Ok(VersionSelector::Alias("prod".into())));
+        assert_eq!(parse("sweep:12"), Ok(VersionSelector::Version(12)));
         for wrong in [
             "",
             "a b",

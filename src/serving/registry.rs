@@ -1,6 +1,7 @@
-//! Which policies there are: names, versions, aliases, each version loaded once and shared, or unloaded.
+//! The registry of policies: names, versions and aliases. Each version is either unloaded, or loaded once and shared.
 //!
-//! Whoever holds a [`LoadedPolicy`] goes on with it, whatever happens here: a session ends on the version it began with.
+//! A [`LoadedPolicy`] remains usable after the registry has unloaded or replaced it: a session stays on the version that it
+//! began with.
 
 use std::collections::BTreeMap;
 use std::ops::Deref;
@@ -10,60 +11,60 @@ use jiff::Timestamp;
 use serde_json::Value;
 use tokio::sync::{Mutex, MutexGuard};
 
-use super::{Error, PolicyRef, PolicySpec, Which};
+use super::{Error, PolicyRef, PolicySpec, VersionSelector};
 use crate::error_code::ErrorCode;
 use crate::policy::{Policy, RequiredInput};
 
-/// Where a policy comes from.
+/// Origin of a policy.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kind {
-    /// Learned, stored as a checkpoint.
+pub enum PolicyKind {
+    /// Learned and stored as a checkpoint.
     Checkpoint,
-    /// Part of the program (spec 6).
+    /// A policy by rule (docs/model.md, "Baselines").
     Baseline,
 }
 
-/// What is known of one version of one policy, loaded or not.
+/// Description of one version of one policy, loaded or not.
 #[derive(Clone, Debug)]
-pub struct About {
-    /// Which it is.
+pub struct PolicyInfo {
+    /// Name, version and digest.
     pub reference: PolicyRef,
-    /// Where it comes from.
-    pub kind: Kind,
-    /// A sentence for people.
+    /// Origin.
+    pub kind: PolicyKind,
+    /// A sentence for users of the API.
     pub description: String,
-    /// The only M it serves, where there is one.
+    /// M, if the policy accepts only this number of UAVs.
     pub uavs: Option<u32>,
-    /// The only N it serves, where there is one.
+    /// N, if the policy accepts only this number of users.
     pub users: Option<u32>,
     /// A, the number of headings.
     pub headings: usize,
-    /// What it must be told.
+    /// What observations have to contain.
     pub needs: RequiredInput,
-    /// d, the detection range that it works with.
+    /// d, the detection range.
     pub detection_range: f64,
-    /// Resolved training configuration of a checkpoint, an object; null for a baseline.
+    /// Complete training configuration of a checkpoint (an object); null for a baseline.
     pub config: Value,
-    /// Figures a checkpoint was taken at, an object; null for a baseline.
+    /// Metrics of a checkpoint (an object); null for a baseline.
     pub metrics: Value,
-    /// When it was published; for baselines, when the server started.
+    /// Time of publication; for a baseline, when the server started.
     pub created_at: Timestamp,
 }
 
-/// One version of one policy, ready to fly.
+/// One version of one policy, ready to run.
 pub struct LoadedPolicy {
-    /// What is known of it.
-    pub about: Arc<About>,
-    /// What decides.
+    /// Its description.
+    pub info: Arc<PolicyInfo>,
+    /// The policy.
     pub policy: Arc<dyn Policy>,
 }
 
 impl LoadedPolicy {
-    /// A policy that is part of the program.
+    /// A baseline.
     pub fn baseline(reference: PolicyRef, description: &str, policy: Arc<dyn Policy>, created_at: Timestamp) -> Self {
-        let about = About {
+        let info = PolicyInfo {
             reference,
-            kind: Kind::Baseline,
+            kind: PolicyKind::Baseline,
             description: description.to_owned(),
             uavs: None,
             users: None,
@@ -74,15 +75,15 @@ impl LoadedPolicy {
             metrics: Value::Null,
             created_at,
         };
-        Self { about: Arc::new(about), policy }
+        Self { info: Arc::new(info), policy }
     }
 }
 
 impl Deref for LoadedPolicy {
-    type Target = About;
+    type Target = PolicyInfo;
 
-    fn deref(&self) -> &About {
-        &self.about
+    fn deref(&self) -> &PolicyInfo {
+        &self.info
     }
 }
 
@@ -93,45 +94,45 @@ impl std::fmt::Debug for LoadedPolicy {
 }
 
 #[derive(Debug)]
-struct Version {
-    about: Arc<About>,
+struct VersionEntry {
+    info: Arc<PolicyInfo>,
     loaded: Option<Arc<LoadedPolicy>>,
 }
 
-impl Version {
+impl VersionEntry {
     fn loaded(&self) -> Result<Arc<LoadedPolicy>, Error> {
         self.loaded.clone().ok_or_else(|| {
-            let reference = &self.about.reference;
-            let message = format!("policy {reference} is unloaded; load it to fly it");
+            let reference = &self.info.reference;
+            let message = format!("policy {reference} is unloaded; load it first");
             Error::Precondition { code: ErrorCode::PolicyUnloaded, message }
         })
     }
 }
 
 #[derive(Debug, Default)]
-struct Entry {
-    versions: BTreeMap<u64, Version>,
+struct PolicyEntry {
+    versions: BTreeMap<u64, VersionEntry>,
     aliases: BTreeMap<String, u64>,
 }
 
-impl Entry {
-    fn meant_by(&self, which: &Which) -> Option<&Version> {
-        match which {
-            Which::Newest => self.versions.values().next_back(),
-            Which::Alias(alias) => self.aliases.get(alias).and_then(|version| self.versions.get(version)),
-            Which::Version(version) => self.versions.get(version),
+impl PolicyEntry {
+    fn resolve(&self, selector: &VersionSelector) -> Option<&VersionEntry> {
+        match selector {
+            VersionSelector::Newest => self.versions.values().next_back(),
+            VersionSelector::Alias(alias) => self.aliases.get(alias).and_then(|version| self.versions.get(version)),
+            VersionSelector::Version(version) => self.versions.get(version),
         }
     }
 
-    fn all(&self) -> impl Iterator<Item = (Arc<About>, bool)> {
-        self.versions.values().map(|version| (version.about.clone(), version.loaded.is_some()))
+    fn all(&self) -> impl Iterator<Item = (Arc<PolicyInfo>, bool)> {
+        self.versions.values().map(|version| (version.info.clone(), version.loaded.is_some()))
     }
 
-    fn describe(&self, version: &Version) -> Described {
-        let number = version.about.reference.version;
+    fn describe(&self, version: &VersionEntry) -> PolicyDetails {
+        let number = version.info.reference.version;
         let pointing = self.aliases.iter().filter(|(_, version)| **version == number);
-        Described {
-            about: version.about.clone(),
+        PolicyDetails {
+            info: version.info.clone(),
             loaded: version.loaded.is_some(),
             aliases: pointing.map(|(alias, _)| alias.clone()).collect(),
             versions: self.versions.iter().map(|(number, version)| (*number, version.loaded.is_some())).collect(),
@@ -139,31 +140,31 @@ impl Entry {
     }
 }
 
-/// A policy version with what surrounds it, at one moment.
+/// A policy version with its aliases and sibling versions.
 #[derive(Clone, Debug)]
-pub struct Described {
-    /// The version.
-    pub about: Arc<About>,
-    /// Whether it can be asked.
+pub struct PolicyDetails {
+    /// Description of the version.
+    pub info: Arc<PolicyInfo>,
+    /// Whether it is loaded.
     pub loaded: bool,
-    /// Aliases that mean this version.
+    /// Aliases that point to this version.
     pub aliases: Vec<String>,
-    /// All versions of this name, and which of them are loaded.
+    /// All versions of this name, and whether each is loaded.
     pub versions: Vec<(u64, bool)>,
 }
 
-type Entries = BTreeMap<String, Entry>;
+type Entries = BTreeMap<String, PolicyEntry>;
 
-/// All policies of this server. The lock is held for look-ups and small changes only.
+/// All policies of this server. Its lock is held only for look-ups and small changes.
 #[derive(Debug, Default)]
 pub struct Registry {
     entries: RwLock<Entries>,
-    turns: Mutex<()>,
+    changes: Mutex<()>,
 }
 
 impl Registry {
     fn read(&self) -> RwLockReadGuard<'_, Entries> {
-        // Nothing panics while holding the lock for writing, and a map is whole after every insertion.
+        // Nothing panics while holding the lock for writing.
         self.entries.read().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -171,24 +172,23 @@ impl Registry {
         self.entries.write().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Waits for the turn to change what is also kept elsewhere. Changes that take turns happen here in the order in which
-    /// they happen there.
-    pub async fn turn(&self) -> MutexGuard<'_, ()> {
-        self.turns.lock().await
+    /// Serializes changes that also go to the store, so that they reach registry and store in the same order.
+    pub async fn lock_changes(&self) -> MutexGuard<'_, ()> {
+        self.changes.lock().await
     }
 
-    /// Adds a version, or loads one that is known.
+    /// Adds a version, or loads an unloaded one.
     pub fn insert(&self, policy: LoadedPolicy) -> Arc<LoadedPolicy> {
         let policy = Arc::new(policy);
         let PolicyRef { name, version, .. } = policy.reference.clone();
-        let held = Version { about: policy.about.clone(), loaded: Some(policy.clone()) };
+        let held = VersionEntry { info: policy.info.clone(), loaded: Some(policy.clone()) };
         let former = self.write().entry(name).or_default().versions.insert(version, held);
-        // What it holds may be large: not dropped under the lock.
+        // The former policy may be large, so it is dropped after the lock is released.
         drop(former);
         policy
     }
 
-    /// Keeps a version in mind, but not what decides. Sessions that fly it go on.
+    /// Unloads a version. Sessions that use it continue.
     pub fn unload(&self, name: &str, version: u64) {
         let mut entries = self.write();
         let held = entries.get_mut(name).and_then(|entry| entry.versions.get_mut(&version));
@@ -197,55 +197,55 @@ impl Registry {
         drop(former);
     }
 
-    /// Lets `name@alias` mean `version`.
+    /// Points `name@alias` to `version`.
     pub fn set_alias(&self, name: &str, alias: &str, version: u64) {
         if let Some(entry) = self.write().get_mut(name) {
             entry.aliases.insert(alias.to_owned(), version);
         }
     }
 
-    /// Lets `name@alias` mean nothing.
+    /// Removes `name@alias`.
     pub fn remove_alias(&self, name: &str, alias: &str) {
         if let Some(entry) = self.write().get_mut(name) {
             entry.aliases.remove(alias);
         }
     }
 
-    /// The version that `spec` names now.
+    /// The version that `spec` resolves to.
     ///
     /// # Errors
     /// [`Error::Unknown`], or `policy_unloaded`.
     pub fn resolve(&self, spec: &PolicySpec) -> Result<Arc<LoadedPolicy>, Error> {
         let entries = self.read();
-        let found = entries.get(&spec.name).and_then(|entry| entry.meant_by(&spec.which));
+        let found = entries.get(&spec.name).and_then(|entry| entry.resolve(&spec.version));
         found.ok_or_else(|| Error::unknown("policy", spec.to_string()))?.loaded()
     }
 
-    /// The version with this digest, which an episode asked for as `spec` began with: the one that `spec` names now, or,
-    /// unless `spec` names a version, another of its name. None if it is neither.
+    /// The version with this digest, for an episode that was begun with `spec`. Searches the version that `spec` resolves to,
+    /// and the other versions of its name unless `spec` has a version number. None if no such version has this digest.
     ///
     /// # Errors
-    /// [`Error::Unknown`] where `spec` names nothing, or `policy_unloaded`.
+    /// [`Error::Unknown`] if `spec` does not resolve, or `policy_unloaded`.
     pub fn pinned(&self, spec: &PolicySpec, digest: &[u8; 32]) -> Result<Option<Arc<LoadedPolicy>>, Error> {
-        let is_it = |version: &&Version| version.about.reference.digest == *digest;
+        let matches = |version: &&VersionEntry| version.info.reference.digest == *digest;
         let entries = self.read();
-        let found = entries.get(&spec.name).and_then(|entry| Some((entry, entry.meant_by(&spec.which)?)));
+        let found = entries.get(&spec.name).and_then(|entry| Some((entry, entry.resolve(&spec.version)?)));
         let (entry, now) = found.ok_or_else(|| Error::unknown("policy", spec.to_string()))?;
-        let others = || entry.versions.values().filter(|_| !matches!(spec.which, Which::Version(_))).find(is_it);
-        Some(now).filter(is_it).or_else(others).map(Version::loaded).transpose()
+        let others = || entry.versions.values().filter(|_| !matches!(spec.version, VersionSelector::Version(_))).find(matches);
+        Some(now).filter(matches).or_else(others).map(VersionEntry::loaded).transpose()
     }
 
-    /// What is known of the version that `spec` names.
+    /// Describes the version that `spec` resolves to.
     ///
     /// # Errors
     /// [`Error::Unknown`].
-    pub fn describe(&self, spec: &PolicySpec) -> Result<Described, Error> {
+    pub fn describe(&self, spec: &PolicySpec) -> Result<PolicyDetails, Error> {
         let entries = self.read();
-        let found = entries.get(&spec.name).and_then(|entry| Some(entry.describe(entry.meant_by(&spec.which)?)));
+        let found = entries.get(&spec.name).and_then(|entry| Some(entry.describe(entry.resolve(&spec.version)?)));
         found.ok_or_else(|| Error::unknown("policy", spec.to_string()))
     }
 
-    /// Aliases of `name` with the versions that they mean.
+    /// Aliases of `name`, with the versions that they point to.
     ///
     /// # Errors
     /// [`Error::Unknown`].
@@ -254,24 +254,25 @@ impl Registry {
         entries.get(name).map(|entry| entry.aliases.clone()).ok_or_else(|| Error::unknown("policy", name))
     }
 
-    /// The newest version of each name after `after`, at most `limit`, in order of names, and whether there are more.
-    pub fn list(&self, after: &str, limit: usize) -> (Vec<Described>, bool) {
+    /// The newest versions of at most `limit` names after `after`, in order of names, and whether there are more.
+    pub fn list(&self, after: &str, limit: usize) -> (Vec<PolicyDetails>, bool) {
         use std::ops::Bound::{Excluded, Unbounded};
         let entries = self.read();
-        let newest = |(_, entry): (_, &Entry)| entry.meant_by(&Which::Newest).map(|version| entry.describe(version));
+        let newest =
+            |(_, entry): (_, &PolicyEntry)| entry.resolve(&VersionSelector::Newest).map(|version| entry.describe(version));
         let mut rest = entries.range::<str, _>((Excluded(after), Unbounded)).filter_map(newest);
         let page = rest.by_ref().take(limit).collect();
         (page, rest.next().is_some())
     }
 
-    /// Every version in order of names and numbers, and whether it is loaded.
-    pub fn versions(&self) -> Vec<(Arc<About>, bool)> {
-        self.read().values().flat_map(Entry::all).collect()
+    /// All versions in order of names and numbers, and whether each is loaded.
+    pub fn versions(&self) -> Vec<(Arc<PolicyInfo>, bool)> {
+        self.read().values().flat_map(PolicyEntry::all).collect()
     }
 
-    /// Every version of `name` in order of numbers, and whether it is loaded.
-    pub fn versions_of(&self, name: &str) -> Vec<(Arc<About>, bool)> {
-        self.read().get(name).into_iter().flat_map(Entry::all).collect()
+    /// All versions of `name` in order of numbers, and whether each is loaded.
+    pub fn versions_of(&self, name: &str) -> Vec<(Arc<PolicyInfo>, bool)> {
+        self.read().get(name).into_iter().flat_map(PolicyEntry::all).collect()
     }
 
     /// Number of policy versions, loaded or not.
@@ -279,7 +280,7 @@ impl Registry {
         self.read().values().map(|entry| entry.versions.len()).sum()
     }
 
-    /// Whether there is no policy at all.
+    /// Whether there is no policy.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

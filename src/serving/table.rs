@@ -1,9 +1,9 @@
-//! Things that callers hold by name and that expire when idle: sessions, environments. This file owns their names and when
-//! they are gone; what one may do with them is theirs.
+//! A table of named things that expire when idle: sessions, environments. This file owns names and expiry; the entries own
+//! the requests to them.
 //!
-//! The table's lock is held for look-ups, never while anything is computed. What is idle for longer than the time to live
-//! expires: on the next look at it, or when [`Table::sweep`] comes by. A bounded number of expired names is remembered, so
-//! that a late caller is told what happened.
+//! The table's lock is held for look-ups, never during computations. An entry that has been idle for longer than the time to
+//! live expires at the next look-up or at the next [`Table::sweep`]. The table remembers a bounded number of expired names,
+//! so that a late request for one is answered with "expired" instead of "unknown".
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -19,35 +19,36 @@ use crate::error_code::ErrorCode;
 /// Limits of a table.
 #[derive(Clone, Copy, Debug)]
 pub struct Limits {
-    /// What is idle for longer expires.
+    /// Idle time after which entries expire.
     pub ttl: Duration,
-    /// Most entries; as many expired names are remembered.
+    /// Most entries, and most expired names that are remembered.
     pub max: usize,
 }
 
-/// What a table holds.
-pub trait Entry {
-    /// What it is called: `session`.
-    const WHAT: &'static str;
-    /// The code of the error for an expired entry.
+/// An entry of a table.
+pub trait TableEntry {
+    /// The kind of entry in error messages, for example `session`.
+    const KIND: &'static str;
+    /// Error code for entries that have expired.
     const EXPIRED: ErrorCode;
 
     /// Its name.
     fn id(&self) -> &str;
 
-    /// Its last use.
-    fn used(&self) -> &LastUse;
+    /// When it was last used.
+    fn last_use(&self) -> &LastUse;
 
-    /// Whether it is kept only for callers that repeat its last request; it goes after [`GRACE`], or when there is no room.
-    fn over(&self) -> bool {
+    /// Whether it has ended and is kept only to answer repetitions of its last request. The table removes it after
+    /// [`REPEAT_WINDOW`], or when it needs room.
+    fn is_ended(&self) -> bool {
         false
     }
 }
 
-/// How long what is over is kept for callers that missed its last answer.
-pub(super) const GRACE: Duration = Duration::from_secs(10);
+/// How long entries that have ended answer repetitions of their last request.
+pub(super) const REPEAT_WINDOW: Duration = Duration::from_secs(10);
 
-/// When something was used last: milliseconds of monotonic time.
+/// Time of the last use, in milliseconds of monotonic time.
 #[derive(Debug)]
 pub struct LastUse(AtomicU64);
 
@@ -65,33 +66,35 @@ impl LastUse {
     }
 }
 
-/// What [`Table::find_or_add`] found.
+/// Result of [`Table::find_or_add`].
 #[derive(Debug)]
-pub(super) enum Found<T> {
-    /// It was there.
-    Existing(Arc<T>),
-    /// It was made.
-    New(Arc<T>),
+pub(super) enum Lookup<T> {
+    /// The entry existed.
+    Found(Arc<T>),
+    /// The entry is new.
+    Added(Arc<T>),
 }
 
 #[derive(Debug)]
 struct Names<T> {
     open: HashMap<String, Arc<T>>,
-    /// Expired names, each with the number of its expiry.
+    /// Names of expired entries, each with the number of its expiry.
     expired: HashMap<String, u64>,
+    /// Expiries in order of their numbers.
     expiries: VecDeque<(u64, String)>,
-    count: u64,
+    expiry_count: u64,
 }
 
 impl<T> Names<T> {
-    fn bury(&mut self, id: String, room: usize) {
+    /// Removes entry `id` and remembers its name among the newest `capacity` expired ones.
+    fn expire(&mut self, id: String, capacity: usize) {
         self.open.remove(&id);
-        self.count += 1;
-        self.expired.insert(id.clone(), self.count);
-        self.expiries.push_back((self.count, id));
-        while self.expiries.len() > room {
-            if let Some((count, id)) = self.expiries.pop_front()
-                && self.expired.get(&id) == Some(&count)
+        self.expiry_count += 1;
+        self.expired.insert(id.clone(), self.expiry_count);
+        self.expiries.push_back((self.expiry_count, id));
+        while self.expiries.len() > capacity {
+            if let Some((number, id)) = self.expiries.pop_front()
+                && self.expired.get(&id) == Some(&number)
             {
                 self.expired.remove(&id);
             }
@@ -99,7 +102,7 @@ impl<T> Names<T> {
     }
 }
 
-/// Everything of one kind that this server holds.
+/// All entries of one kind.
 #[derive(Debug)]
 pub struct Table<T> {
     limits: Limits,
@@ -107,15 +110,15 @@ pub struct Table<T> {
     names: RwLock<Names<T>>,
 }
 
-/// A name that nobody else has chosen.
-pub(super) fn fresh_name() -> String {
+/// A new unique name.
+pub(super) fn generate_id() -> String {
     Uuid::now_v7().to_string()
 }
 
-impl<T: Entry> Table<T> {
-    /// Nothing yet.
+impl<T: TableEntry> Table<T> {
+    /// An empty table.
     pub fn new(limits: Limits, clock: Clock) -> Self {
-        let names = Names { open: HashMap::new(), expired: HashMap::new(), expiries: VecDeque::new(), count: 0 };
+        let names = Names { open: HashMap::new(), expired: HashMap::new(), expiries: VecDeque::new(), expiry_count: 0 };
         Self { limits, clock, names: RwLock::new(names) }
     }
 
@@ -129,7 +132,7 @@ impl<T: Entry> Table<T> {
     }
 
     fn is_idle(&self, entry: &T, now: Duration) -> bool {
-        entry.used().idle(now) > self.limits.ttl
+        entry.last_use().idle(now) > self.limits.ttl
     }
 
     /// Idle time after which entries expire.
@@ -137,28 +140,28 @@ impl<T: Entry> Table<T> {
         self.limits.ttl
     }
 
-    /// What entries tell the time by.
+    /// The clock that decides about expiry.
     pub(super) fn clock(&self) -> &Clock {
         &self.clock
     }
 
-    /// The entry `id`, or the one that `make` makes.
+    /// Returns entry `id`. If there is none, adds the one that `make` creates.
     ///
     /// # Errors
-    /// There are too many.
-    pub(super) fn find_or_add(&self, id: &str, make: impl FnOnce() -> T) -> Result<Found<T>, Error> {
+    /// [`Error::Busy`] if the table is full.
+    pub(super) fn find_or_add(&self, id: &str, make: impl FnOnce() -> T) -> Result<Lookup<T>, Error> {
         let now = self.clock.monotonic();
         let mut names = self.write();
         if let Some(existing) = names.open.get(id).filter(|entry| !self.is_idle(entry, now)) {
-            return Ok(Found::Existing(existing.clone()));
+            return Ok(Lookup::Found(existing.clone()));
         }
-        self.insert(&mut names, id, now, make).map(Found::New)
+        self.insert(&mut names, id, now, make).map(Lookup::Added)
     }
 
-    /// The entry that `make` makes, from now on called `id`; whoever holds the one that was called so keeps it.
+    /// Adds the entry that `make` creates under the name `id`, in place of the former entry of that name, if any.
     ///
     /// # Errors
-    /// There are too many.
+    /// [`Error::Busy`] if the table is full.
     pub(super) fn replace(&self, id: &str, make: impl FnOnce() -> T) -> Result<Arc<T>, Error> {
         let now = self.clock.monotonic();
         self.insert(&mut self.write(), id, now, make)
@@ -170,7 +173,7 @@ impl<T: Entry> Table<T> {
             self.sweep_names(names, now, Duration::ZERO);
         }
         if full(names) {
-            return Err(Error::Busy(format!("{} {}s are open, the most this server holds", self.limits.max, T::WHAT)));
+            return Err(Error::Busy(format!("{} {}s are open, the limit of this server", self.limits.max, T::KIND)));
         }
         names.expired.remove(id);
         let entry = Arc::new(make());
@@ -178,74 +181,74 @@ impl<T: Entry> Table<T> {
         Ok(entry)
     }
 
-    /// The entry `id`; asking keeps it alive.
+    /// Returns entry `id`, and counts as a use of it.
     ///
     /// # Errors
-    /// It expired, or there is none.
+    /// [`TableEntry::EXPIRED`] if it has expired, [`Error::Unknown`] if there is none.
     pub fn get(&self, id: &str) -> Result<Arc<T>, Error> {
         let now = self.clock.monotonic();
         {
             let names = self.read();
             match names.open.get(id) {
                 Some(entry) if !self.is_idle(entry, now) => {
-                    entry.used().touch(now);
+                    entry.last_use().touch(now);
                     return Ok(entry.clone());
                 }
-                None if !names.expired.contains_key(id) => return Err(Error::unknown(T::WHAT, id)),
+                None if !names.expired.contains_key(id) => return Err(Error::unknown(T::KIND, id)),
                 _ => {}
             }
         }
         let mut names = self.write();
         if names.open.get(id).is_some_and(|entry| self.is_idle(entry, now)) {
-            names.bury(id.to_owned(), self.limits.max);
+            names.expire(id.to_owned(), self.limits.max);
         }
         let idle = self.limits.ttl.as_secs_f64();
-        let message = format!("{} {id:?} expired after {idle} s without a request; open a new one", T::WHAT);
+        let message = format!("{} {id:?} expired after {idle} s without a request; open a new one", T::KIND);
         Err(Error::precondition(T::EXPIRED, message))
     }
 
-    /// Forgets `entry`, unless its name is another's by now; whoever holds it keeps it.
+    /// Removes `entry`, unless another entry has taken its name.
     pub(super) fn remove(&self, entry: &Arc<T>) {
         let mut names = self.write();
-        if names.open.get(entry.id()).is_some_and(|there| Arc::ptr_eq(there, entry)) {
+        if names.open.get(entry.id()).is_some_and(|current| Arc::ptr_eq(current, entry)) {
             names.open.remove(entry.id());
         }
     }
 
-    /// Entries with names after `after`, in order, at most `limit`, and whether there are more.
+    /// At most `limit` entries with names after `after`, in order, and whether there are more.
     pub fn list(&self, after: &str, limit: usize) -> (Vec<Arc<T>>, bool) {
         let now = self.clock.monotonic();
         let names = self.read();
-        let alive = |entry: &&Arc<T>| entry.id() > after && !entry.over() && !self.is_idle(entry, now);
-        let mut entries: Vec<&Arc<T>> = names.open.values().filter(alive).collect();
+        let listed = |entry: &&Arc<T>| entry.id() > after && !entry.is_ended() && !self.is_idle(entry, now);
+        let mut entries: Vec<&Arc<T>> = names.open.values().filter(listed).collect();
         entries.sort_unstable_by(|a, b| a.id().cmp(b.id()));
         let more = entries.len() > limit;
         (entries.into_iter().take(limit).cloned().collect(), more)
     }
 
-    /// Number of entries, those included that are about to expire.
+    /// Number of entries, including idle ones that have not been removed yet.
     pub fn len(&self) -> usize {
         self.read().open.len()
     }
 
-    /// Whether there is none.
+    /// Whether there is no entry.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Forgets what is idle for too long.
+    /// Removes entries that have been idle for too long.
     pub fn sweep(&self) {
         let now = self.clock.monotonic();
-        self.sweep_names(&mut self.write(), now, GRACE);
+        self.sweep_names(&mut self.write(), now, REPEAT_WINDOW);
     }
 
-    fn sweep_names(&self, names: &mut Names<T>, now: Duration, grace: Duration) {
-        names.open.retain(|_, entry| !entry.over() || entry.used().idle(now) < grace);
-        // What somebody holds is in use, however long the slot in flight takes.
-        let gone = |entry: &Arc<T>| Arc::strong_count(entry) == 1 && self.is_idle(entry, now);
-        let gone: Vec<String> = names.open.iter().filter(|(_, entry)| gone(entry)).map(|(id, _)| id.clone()).collect();
-        for id in gone {
-            names.bury(id, self.limits.max);
+    fn sweep_names(&self, names: &mut Names<T>, now: Duration, repeat_window: Duration) {
+        names.open.retain(|_, entry| !entry.is_ended() || entry.last_use().idle(now) < repeat_window);
+        // An entry that a request holds is in use, however long the request takes.
+        let expired = |entry: &Arc<T>| Arc::strong_count(entry) == 1 && self.is_idle(entry, now);
+        let expired: Vec<String> = names.open.iter().filter(|(_, entry)| expired(entry)).map(|(id, _)| id.clone()).collect();
+        for id in expired {
+            names.expire(id, self.limits.max);
         }
     }
 }

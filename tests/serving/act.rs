@@ -1,4 +1,4 @@
-//! The rules of `Act` over gRPC.
+//! `Act` over gRPC: steps, repetitions, runs, expiry, memory that the caller keeps.
 
 use std::sync::Arc;
 
@@ -12,7 +12,7 @@ use tonic::Code;
 use super::harness::*;
 
 #[tokio::test]
-async fn a_session_flies_and_repeats() {
+async fn session_answers_steps_and_repetitions() {
     let server = Server::start().await;
     let mut client = server.grpc().await;
     let session = client.open_session(open("sweep", "s")).await.unwrap().into_inner();
@@ -25,15 +25,15 @@ async fn a_session_flies_and_repeats() {
         assert_eq!(answer.step, step);
         assert_eq!(answer.actions.len(), 3);
         assert!(answer.actions.iter().all(|a| a.heading_deg == Some(45.0 * f64::from(a.heading_index)) && a.q_values.is_empty()));
-        assert!(answer.recurrent_state.is_empty(), "memory stays on the server");
+        assert!(answer.recurrent_state.is_empty(), "the server keeps the memory");
         assert_eq!(answer.policy.as_ref().unwrap(), &pinned);
         assert_eq!(answer.timings.as_ref().unwrap().batch_size, 1);
         last = Some(answer);
     }
-    let again = client.act(in_session("s", Some(2), scene(3, 5, 2))).await.unwrap().into_inner();
-    assert_eq!(Some(&again), last.as_ref());
+    let repeated = client.act(in_session("s", Some(2), scene(3, 5, 2))).await.unwrap().into_inner();
+    assert_eq!(Some(&repeated), last.as_ref());
     let other = client.act(in_session("s", Some(2), scene(3, 5, 77))).await.unwrap().into_inner();
-    assert_eq!(Some(other), last, "the slot has been flown, whatever the retry observes");
+    assert_eq!(Some(other), last, "a repetition returns the first response, whatever it observes");
     for wrong in [0, 1, 4, u64::MAX] {
         let (code, reason, _) = refused(client.act(in_session("s", Some(wrong), scene(3, 5, 0))).await);
         assert_eq!((code, reason.as_str()), (Code::FailedPrecondition, "wrong_step"));
@@ -43,22 +43,22 @@ async fn a_session_flies_and_repeats() {
     assert_eq!(refused(client.act(in_session("s", None, scene(3, 5, 3))).await).0, Code::NotFound);
 }
 
-/// Headings of `slots` slots of policy `name`, asked directly.
+/// Headings of `slots` slots of policy `name`, computed without a server.
 fn offline(name: &str, slots: u64, seed: u64) -> Vec<Vec<u8>> {
     let policy = by_name(name, EnvParams::default()).unwrap();
     let mut memory = vec![0.0; policy.memory_len(3, 5)];
     policy.start(3, 5, seed, &mut memory);
-    let fly = |step| {
+    let decide = |step| {
         let slot = Observation::try_from(scene(3, 5, step)).unwrap().into_slot(&*policy).unwrap();
         let mut headings = vec![0; 3];
         policy.act(&mut [FleetStep { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
         headings
     };
-    (0..slots).map(fly).collect()
+    (0..slots).map(decide).collect()
 }
 
 #[tokio::test]
-async fn a_session_equals_memory_kept_by_the_caller_equals_the_policy_itself() {
+async fn session_and_recurrent_state_give_the_headings_of_the_policy() {
     let server = Server::start().await;
     let mut client = server.grpc().await;
     for baseline in &LIST {
@@ -79,13 +79,13 @@ async fn a_session_equals_memory_kept_by_the_caller_equals_the_policy_itself() {
 }
 
 #[tokio::test]
-async fn memory_kept_by_the_caller_is_judged() {
+async fn recurrent_state_is_checked() {
     let server = Server::start().await;
     let mut client = server.grpc().await;
     let first = client.act(held("sweep", Bytes::new(), scene(3, 5, 0))).await.unwrap().into_inner();
     let state = first.recurrent_state.clone();
-    let again = client.act(held("sweep", Bytes::new(), scene(3, 5, 0))).await.unwrap().into_inner();
-    assert_eq!(again.recurrent_state, state, "the same request, the same answer");
+    let repeated = client.act(held("sweep", Bytes::new(), scene(3, 5, 0))).await.unwrap().into_inner();
+    assert_eq!(repeated.recurrent_state, state, "equal requests have equal responses");
 
     let late = v1::ActRequest { step: Some(1), ..held("sweep", Bytes::new(), scene(3, 5, 1)) };
     assert_eq!(refused(client.act(late).await).1, "wrong_step");
@@ -112,7 +112,7 @@ async fn memory_kept_by_the_caller_is_judged() {
 }
 
 #[tokio::test]
-async fn an_episode_stays_with_its_version() {
+async fn episode_stays_on_its_version() {
     let server = Server::start().await;
     server.add("p", 1, Arc::new(Deed::Count));
     server.app.registry.set_alias("p", "prod", 1);
@@ -124,8 +124,8 @@ async fn an_episode_stays_with_its_version() {
     let version = |answer: v1::ActResponse| answer.policy.unwrap().version;
     let pinned = v1::ActRequest { policy: "p@prod".into(), ..in_session("s", None, scene(3, 5, 0)) };
     assert_eq!(version(client.act(pinned).await.unwrap().into_inner()), 1);
-    let held_on = client.act(held("p", first.recurrent_state.clone(), scene(3, 5, 1))).await.unwrap().into_inner();
-    assert_eq!(version(held_on), 1);
+    let continued = client.act(held("p", first.recurrent_state.clone(), scene(3, 5, 1))).await.unwrap().into_inner();
+    assert_eq!(version(continued), 1);
     assert_eq!(version(client.act(held("p", Bytes::new(), scene(3, 5, 0))).await.unwrap().into_inner()), 2);
     assert_eq!(refused(client.act(held("p:2", first.recurrent_state, scene(3, 5, 1))).await).0, Code::InvalidArgument);
     for other in ["p:2", "sweep"] {
@@ -135,13 +135,13 @@ async fn an_episode_stays_with_its_version() {
 }
 
 #[tokio::test]
-async fn ids_come_in_any_order_and_are_matched() {
+async fn ids_may_come_in_any_order() {
     let server = Server::start().await;
     let mut client = server.grpc().await;
     for id in ["straight", "shuffled"] {
         client.open_session(open("sweep", id)).await.unwrap();
     }
-    // Eleven UAVs: bytewise, uav-10 would come before uav-2.
+    // With eleven UAVs, bytewise order would put uav-10 before uav-2.
     for step in 0..12 {
         let straight = scene(11, 6, step);
         let mut shuffled = straight.clone();
@@ -161,7 +161,7 @@ async fn ids_come_in_any_order_and_are_matched() {
 }
 
 #[tokio::test]
-async fn a_new_run_resets_and_fences_the_former() {
+async fn new_run_restarts_the_session_and_fences_the_former_run() {
     let server = Server::start().await;
     let mut client = server.grpc().await;
     client.open_session(open("sweep", "s")).await.unwrap();
@@ -177,7 +177,7 @@ async fn a_new_run_resets_and_fences_the_former() {
 }
 
 #[tokio::test]
-async fn idle_sessions_expire_and_say_so() {
+async fn idle_session_expires_with_its_own_error() {
     let server = Server::start().await;
     let mut client = server.grpc().await;
     client.open_session(open("sweep", "s")).await.unwrap();
@@ -192,7 +192,7 @@ async fn idle_sessions_expire_and_say_so() {
 }
 
 #[tokio::test]
-async fn q_values_on_request_and_hovering_without_degrees() {
+async fn q_values_are_optional_and_hovering_has_no_degrees() {
     let server = Server::start().await;
     server.add("p", 1, Arc::new(Deed::Count));
     let mut client = server.grpc().await;

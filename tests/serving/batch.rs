@@ -1,4 +1,4 @@
-//! Many slots at once: `ActBatch`, `ActStream`, and the engine that puts fleets together.
+//! Many slots at once: `ActBatch`, `ActStream`, and batches of the engine.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -6,7 +6,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use futures::StreamExt;
 use qedgix::wire::v1;
-use qedgix::wire::v1::act_result::Result as Told;
+use qedgix::wire::v1::act_result::Result as SlotResult;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Code;
@@ -15,40 +15,44 @@ use super::harness::*;
 
 fn answered(result: v1::ActResult) -> v1::ActResponse {
     match result.result {
-        Some(Told::Response(response)) => response,
+        Some(SlotResult::Response(response)) => response,
         other => panic!("{other:?} instead of an answer"),
     }
 }
 
 fn error(result: v1::ActResult) -> (i32, String) {
     match result.result {
-        Some(Told::Error(error)) => (error.status, error.code),
+        Some(SlotResult::Error(error)) => (error.status, error.code),
         other => panic!("{other:?} instead of an error"),
     }
 }
 
 #[tokio::test]
-async fn each_slot_of_a_batch_is_answered_or_refused_on_its_own() {
+async fn slots_of_a_batch_succeed_or_fail_independently() {
     let server = Server::start().await;
     let mut client = server.grpc().await;
     client.open_session(open("qedgix", "s")).await.unwrap();
-    let mut nonsense = held("sweep", Bytes::new(), scene(3, 5, 1));
-    nonsense.observation = None;
-    let alone = client.act(held("qedgix", Bytes::new(), scene(3, 5, 2))).await.unwrap().into_inner();
+    let mut empty = held("sweep", Bytes::new(), scene(3, 5, 1));
+    empty.observation = None;
+    let single = client.act(held("qedgix", Bytes::new(), scene(3, 5, 2))).await.unwrap().into_inner();
     let requests = vec![
         in_session("s", Some(0), scene(3, 5, 1)),
-        nonsense,
+        empty,
         held("qedgix", Bytes::new(), scene(3, 5, 2)),
         in_session("nobody", Some(0), scene(3, 5, 1)),
         held("sweep", Bytes::new(), scene(2, 9, 3)),
         in_session("s", Some(7), scene(3, 5, 1)),
     ];
     let results = client.act_batch(v1::ActBatchRequest { requests }).await.unwrap().into_inner().results;
-    let [first, nonsense, same, nobody, sweep, ahead] = <[_; 6]>::try_from(results).unwrap();
+    let [first, empty, same, nobody, sweep, ahead] = <[_; 6]>::try_from(results).unwrap();
     assert_eq!(answered(first).step, 0);
-    assert_eq!(error(nonsense), (Code::InvalidArgument.into(), "invalid_argument".into()));
+    assert_eq!(error(empty), (Code::InvalidArgument.into(), "invalid_argument".into()));
     let same = answered(same);
-    assert_eq!((headings(&same), same.recurrent_state), (headings(&alone), alone.recurrent_state), "the bits of a call alone");
+    assert_eq!(
+        (headings(&same), same.recurrent_state),
+        (headings(&single), single.recurrent_state),
+        "bit-identical to a single call"
+    );
     assert_eq!(error(nobody), (Code::NotFound.into(), "not_found".into()));
     assert_eq!(answered(sweep).actions.len(), 2);
     assert_eq!(error(ahead), (Code::FailedPrecondition.into(), "wrong_step".into()));
@@ -59,39 +63,39 @@ async fn each_slot_of_a_batch_is_answered_or_refused_on_its_own() {
 }
 
 #[tokio::test]
-async fn a_stream_flies_episodes_and_outlives_refused_slots() {
+async fn stream_continues_after_rejected_slots() {
     let mut server = Server::start().await;
     let mut client = server.grpc().await;
     for id in ["a", "b"] {
         client.open_session(open("qedgix", id)).await.unwrap();
-        client.open_session(open("qedgix", &format!("{id}-alone"))).await.unwrap();
+        client.open_session(open("qedgix", &format!("{id}-single"))).await.unwrap();
     }
-    let (ask, asked) = mpsc::channel(8);
-    let mut answers = client.act_stream(ReceiverStream::new(asked)).await.unwrap().into_inner();
+    let (requests, receiver) = mpsc::channel(8);
+    let mut answers = client.act_stream(ReceiverStream::new(receiver)).await.unwrap().into_inner();
     for step in 0..10 {
         for id in ["a", "b"] {
-            ask.send(in_session(id, Some(step), scene(3, 5, step))).await.unwrap();
+            requests.send(in_session(id, Some(step), scene(3, 5, step))).await.unwrap();
         }
-        ask.send(in_session("a", Some(step + 5), scene(3, 5, step))).await.unwrap();
+        requests.send(in_session("a", Some(step + 5), scene(3, 5, step))).await.unwrap();
         for id in ["a", "b"] {
-            let told = answered(soon(answers.next()).await.unwrap().unwrap());
-            let alone = client.act(in_session(&format!("{id}-alone"), None, scene(3, 5, step))).await.unwrap().into_inner();
-            assert_eq!((told.step, headings(&told)), (step, headings(&alone)), "session {id}");
+            let streamed = answered(soon(answers.next()).await.unwrap().unwrap());
+            let single = client.act(in_session(&format!("{id}-single"), None, scene(3, 5, step))).await.unwrap().into_inner();
+            assert_eq!((streamed.step, headings(&streamed)), (step, headings(&single)), "session {id}");
         }
         let (status, code) = error(soon(answers.next()).await.unwrap().unwrap());
         assert_eq!((status, code.as_str()), (Code::FailedPrecondition.into(), "wrong_step"));
     }
-    // A server that drains ends the stream when everything asked before is answered.
+    // A draining server ends the stream after it has answered all earlier requests.
     server.begin_stop();
     while let Some(rest) = soon(answers.next()).await {
-        assert!(rest.is_ok_and(|r| matches!(r.result, Some(Told::Error(_)))), "nothing was asked");
+        assert!(rest.is_ok_and(|r| matches!(r.result, Some(SlotResult::Error(_)))), "only errors can follow");
     }
-    drop(ask);
+    drop(requests);
     soon(server.stopped()).await;
 }
 
 #[tokio::test]
-async fn fleets_that_wait_for_one_policy_fly_together_and_alone_alike() {
+async fn batched_fleets_get_the_decisions_of_single_calls() {
     let server = Server::with(|config| (config.engine.threads, config.engine.max_batch) = (1, 4)).await;
     let gate = Arc::new(Gate::default());
     server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
@@ -110,26 +114,26 @@ async fn fleets_that_wait_for_one_policy_fly_together_and_alone_alike() {
     }
     gate.open();
     soon(blocked).await.unwrap();
-    // All are waited for before one is asked alone, or it would fly with those that are left.
+    // Waits for all of them, so that the single calls below do not join a batch.
     let learned: Vec<_> = soon(futures::future::join_all(learned)).await.into_iter().map(Result::unwrap).collect();
     let mut sizes = Vec::new();
-    for (seed, together) in learned.into_iter().enumerate() {
-        let alone = client.clone().act(held("qedgix", Bytes::new(), scene(3, 5, seed as u64))).await.unwrap().into_inner();
-        assert_eq!((headings(&together), &together.recurrent_state), (headings(&alone), &alone.recurrent_state));
-        sizes.push(together.timings.unwrap().batch_size);
-        assert_eq!(alone.timings.unwrap().batch_size, 1);
+    for (seed, batched) in learned.into_iter().enumerate() {
+        let single = client.clone().act(held("qedgix", Bytes::new(), scene(3, 5, seed as u64))).await.unwrap().into_inner();
+        assert_eq!((headings(&batched), &batched.recurrent_state), (headings(&single), &single.recurrent_state));
+        sizes.push(batched.timings.unwrap().batch_size);
+        assert_eq!(single.timings.unwrap().batch_size, 1);
     }
     sizes.sort_unstable();
-    assert_eq!(sizes, [2, 2, 4, 4, 4, 4], "at most four at a time, the rest after them");
-    assert_eq!(soon(other).await.unwrap().timings.unwrap().batch_size, 1, "another policy flies apart");
+    assert_eq!(sizes, [2, 2, 4, 4, 4, 4], "at most four fleets per batch");
+    assert_eq!(soon(other).await.unwrap().timings.unwrap().batch_size, 1, "another policy has a batch of its own");
 }
 
 #[tokio::test]
-async fn a_fleet_that_may_wait_for_company_leaves_when_the_batch_is_full_or_time_is_up() {
+async fn batch_with_delay_starts_when_it_is_full_or_the_delay_has_passed() {
     let delay = |config: &mut qedgix::config::Config, delay| {
         (config.engine.threads, config.engine.max_batch, config.engine.max_batch_delay) = (2, 2, delay);
     };
-    // Nobody waits ten seconds: the second fleet fills the batch.
+    // The second fleet fills the batch, so the delay of ten seconds does not apply.
     let server = Server::with(|config| delay(config, Duration::from_secs(10))).await;
     let client = server.grpc().await;
     let ask = || {
@@ -140,12 +144,12 @@ async fn a_fleet_that_may_wait_for_company_leaves_when_the_batch_is_full_or_time
     assert_eq!(soon(one).await.unwrap().timings.unwrap().batch_size, 2);
     assert_eq!(soon(two).await.unwrap().timings.unwrap().batch_size, 2);
     let server = Server::with(|config| delay(config, Duration::from_millis(1))).await;
-    let alone = soon(async { server.grpc().await.act(held("sweep", Bytes::new(), scene(2, 2, 0))).await }).await.unwrap();
-    assert_eq!(alone.into_inner().timings.unwrap().batch_size, 1);
+    let single = soon(async { server.grpc().await.act(held("sweep", Bytes::new(), scene(2, 2, 0))).await }).await.unwrap();
+    assert_eq!(single.into_inner().timings.unwrap().batch_size, 1);
 }
 
 #[tokio::test]
-async fn sessions_are_shown_page_by_page() {
+async fn sessions_are_listed_in_pages() {
     let server = Server::start().await;
     let mut client = server.grpc().await;
     for id in ["c", "a", "b"] {

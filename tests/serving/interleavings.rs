@@ -13,7 +13,7 @@ use proptest::test_runner::TestRunner;
 use qedgix::invalid::Invalid;
 use qedgix::policy::{FleetStep, Policy, RequiredInput};
 use qedgix::service::{App, Error, act, sessions};
-use qedgix::serving::{Observation, Opened};
+use qedgix::serving::{Observation, SessionOptions};
 
 use super::harness::{Server, scene};
 
@@ -205,7 +205,7 @@ impl Model {
             self.lives.len() - 1
         });
         let (app, policy) = (self.app.clone(), self.policy.parse().unwrap());
-        let how = Opened { id: Some(self.session(name)), run_id: run.map(|run| run.to_string()), seed: Some(seed) };
+        let how = SessionOptions { id: Some(self.session(name)), run_id: run.map(|run| run.to_string()), seed: Some(seed) };
         let answer = async move { sessions::open(&app, &policy, how).await.map(|_| None) }.boxed();
         self.begin(Call { life, asked: Asked::Open { seed, run, fresh: known.is_none() }, answer });
     }
@@ -230,10 +230,10 @@ impl Model {
         let app = self.app.clone();
         let answer = async move {
             let answer = act::act(&app, request, None).await?;
-            let values: [f32; 3] = answer.q_values[..3].try_into().unwrap();
-            assert_eq!(answer.q_values[3..], values, "one fleet, one memory");
-            assert_eq!(answer.headings, [values[0] as u8 % 3; 2]);
-            Ok(Some((answer.step, values)))
+            let values: [f32; 3] = answer.decision.q_values[..3].try_into().unwrap();
+            assert_eq!(answer.decision.q_values[3..], values, "one fleet, one memory");
+            assert_eq!(answer.decision.headings, [values[0] as u8 % 3; 2]);
+            Ok(Some((answer.decision.step, values)))
         }
         .boxed();
         self.start(found, Asked::Act { step, run }, answer);

@@ -1,4 +1,4 @@
-//! A fleet of 1 000 UAVs among 10 000 users is an ordinary one.
+//! A fleet of 1 000 UAVs and 10 000 users, as scene and as graph.
 
 use bytes::Bytes;
 use qedgix::policy::FleetStep;
@@ -10,8 +10,8 @@ use super::harness::*;
 /// The detection range, in sides of the square.
 const RANGE: f64 = 0.05;
 
-/// A scene whose coordinates are multiples of 2^-17, so that sums and differences are exact, in lengths that make
-/// `range` a bit more than [`RANGE`] sides.
+/// A scene in which `range` is slightly more than [`RANGE`] sides of the square. Coordinates are multiples of 2^-17, so that
+/// their sums and differences are exact.
 fn wide_scene(uavs: usize, users: usize, range: f64) -> v1::Scene {
     let mut scene = scene(uavs, users, 5);
     let side = (2.0 * range / RANGE).floor() / 2.0;
@@ -22,7 +22,7 @@ fn wide_scene(uavs: usize, users: usize, range: f64) -> v1::Scene {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_thousand_uavs_among_ten_thousand_users_are_answered() {
+async fn thousand_uavs_and_ten_thousand_users_are_answered() {
     let server = Server::start().await;
     let loaded = server.app.registry.resolve(&"qedgix".parse().unwrap()).unwrap();
     let policy = &loaded.policy;
@@ -31,7 +31,7 @@ async fn a_thousand_uavs_among_ten_thousand_users_are_answered() {
     let graph = graph(&scene, policy.detection_range(), false);
     let slot = Observation::try_from(graph.clone()).unwrap().into_slot(&**policy).unwrap();
     let whole = Observation::try_from(scene.clone()).unwrap().into_slot(&**policy).unwrap();
-    // UAVs detect the same either way; users, told nothing, detect whom they see together with a UAV.
+    // UAVs have the same detections in both forms. Users detect the nodes that the detections of UAVs imply.
     for uav in 0..uavs {
         assert_eq!(slot.detections(uav), whole.detections(uav), "UAV {uav}");
     }
@@ -50,10 +50,10 @@ async fn a_thousand_uavs_among_ten_thousand_users_are_answered() {
     let mut request = held("qedgix", Bytes::new(), v1::Scene::default());
     request.observation = Some(v1::act_request::Observation::Graph(graph));
     let answer = server.grpc().await.act(request).await.unwrap().into_inner();
-    // The harness numbers ids, and canonical order is that of numbers.
-    let told: Vec<u8> = answer.actions.iter().map(|a| a.heading_index as u8).collect();
-    assert_eq!(told, expected);
-    assert!(told.iter().any(|heading| *heading != told[0]), "fleets of this size do not all fly alike");
+    // The canonical order of the harness's ids is the order of their numbers.
+    let served: Vec<u8> = answer.actions.iter().map(|a| a.heading_index as u8).collect();
+    assert_eq!(served, expected);
+    assert!(served.iter().any(|heading| *heading != served[0]), "headings differ");
     let by_scene = server.grpc().await.act(held("qedgix", Bytes::new(), scene)).await.unwrap().into_inner();
     assert_eq!(by_scene.actions.len(), uavs);
 }

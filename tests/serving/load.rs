@@ -1,4 +1,4 @@
-//! `qedgix bench act` from outside: what it says, not how fast it is.
+//! `qedgix bench act` as a command: its output and its errors, not its speed.
 
 use std::process::{Command, Output};
 
@@ -9,7 +9,7 @@ fn bench(flags: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_qedgix")).args(short).args(flags).output().unwrap()
 }
 
-fn figures(flags: &[&str]) -> Value {
+fn results(flags: &[&str]) -> Value {
     let output = bench(&[flags, &["--json"]].concat());
     assert!(output.status.success(), "{flags:?}: {}", String::from_utf8_lossy(&output.stderr));
     serde_json::from_slice(&output.stdout).unwrap()
@@ -23,7 +23,7 @@ fn act_and_echo_are_measured_in_one_run() {
         &["--stream", "--sessions", "2", "--policy", "sweep"],
         &["--rate", "200", "--sessions", "2"],
     ] {
-        let document = figures(flags);
+        let document = results(flags);
         for side in ["act", "echo"] {
             assert!(document[side]["answers"].as_u64().unwrap() > 0, "{flags:?}: {document}");
             for field in ["throughput_per_s", "p50_us", "p99_us", "p999_us", "max_us"] {
@@ -39,17 +39,17 @@ fn act_and_echo_are_measured_in_one_run() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_server_elsewhere_is_measured_beside_an_echo_elsewhere() {
+async fn remote_server_is_measured_beside_an_echo_server() {
     let server = super::harness::Server::start().await;
     let address = server.endpoints.grpc.to_string();
     let text = tokio::task::spawn_blocking(move || bench(&["--server", &address])).await.unwrap();
     let text = String::from_utf8(text.stdout).unwrap();
     assert!(text.contains("Act / echo"), "{text}");
-    assert_eq!(server.app.sessions.len(), 0, "sessions are closed");
+    assert_eq!(server.app.sessions.len(), 0, "the benchmark closes its sessions");
 }
 
 #[test]
-fn what_cannot_be_measured_is_said() {
+fn errors_name_the_option_at_fault() {
     for (flags, hint) in [
         (["--policy", "nobody"], "nobody"),
         (["--server", "127.0.0.1:1"], "127.0.0.1:1"),

@@ -1,5 +1,4 @@
-//! Serving from the outside: policies, sessions and errors over real gRPC and REST, on free ports, with a clock that the
-//! tests move.
+//! Tests of a whole server over gRPC and REST, on free ports, with a clock that the tests control.
 
 mod act;
 mod batch;

@@ -236,11 +236,11 @@ async fn same_as_the_store(app: &App, name: &str) {
     assert_eq!(served, now);
     let unloaded = app.store.unloaded_policies().await.unwrap().into_iter().filter(|(n, _)| n == name);
     let versions = app.registry.versions_of(name);
-    let resting = versions.iter().filter(|(_, ready)| !ready).map(|(about, _)| (name.to_owned(), about.reference.version));
+    let resting = versions.iter().filter(|(_, ready)| !ready).map(|(info, _)| (name.to_owned(), info.reference.version));
     assert_eq!(resting.collect::<Vec<_>>(), unloaded.collect::<Vec<_>>());
     let stored = app.store.policy_versions().await.unwrap().into_iter().filter(|(n, _)| n == name);
     assert_eq!(
-        versions.iter().map(|(about, _)| about.reference.version).collect::<Vec<_>>(),
+        versions.iter().map(|(info, _)| info.reference.version).collect::<Vec<_>>(),
         stored.map(|(_, v)| v).collect::<Vec<_>>()
     );
 }

@@ -9,7 +9,7 @@ use crate::env::EpisodeMetrics;
 use crate::invalid::Invalid;
 use crate::policy::Slot;
 use crate::service::{Error, environments::Create};
-use crate::serving::{CopyState, EnvironmentInfo, Finished, Flight, Reset, Sight, State};
+use crate::serving::{CopyState, EnvironmentInfo, EnvironmentReset, EnvironmentState, EnvironmentStep, FinishedEpisode, Scene};
 use crate::wire::v1;
 
 /// What `CreateEnvironment` asks for.
@@ -34,13 +34,13 @@ pub fn create_from(id: String, environment: Value, seed: u64, count: Option<u32>
     Ok(Create { id, environment, seed, count: count.unwrap_or(1) as usize, auto_reset })
 }
 
-impl From<v1::ResetRequest> for Reset {
+impl From<v1::ResetRequest> for EnvironmentReset {
     fn from(request: v1::ResetRequest) -> Self {
         Self { seed: request.seed, episode: request.episode, graph: request.return_graph }
     }
 }
 
-impl From<v1::StepRequest> for Flight {
+impl From<v1::StepRequest> for EnvironmentStep {
     fn from(request: v1::StepRequest) -> Self {
         let actions = request.actions.into_iter().map(|copy| copy.headings).collect();
         Self { actions, step: request.step, graph: request.return_graph }
@@ -49,18 +49,18 @@ impl From<v1::StepRequest> for Flight {
 
 impl From<EnvironmentInfo> for v1::Environment {
     fn from(info: EnvironmentInfo) -> Self {
-        let EnvironmentInfo { id, blueprint, progress, created_at, ttl } = info;
-        let config = serde_json::to_value(&blueprint.config).expect("a configuration is plain data");
+        let EnvironmentInfo { id, spec, cursor, created_at, ttl } = info;
+        let config = serde_json::to_value(&spec.config).expect("a configuration is plain data");
         Self {
             environment_id: id,
             environment: to_struct(&config),
-            seed: progress.seed,
-            count: blueprint.copies as u32,
-            auto_reset: blueprint.auto_reset,
-            headings: blueprint.config.headings() as u32,
-            episode: progress.episode,
-            slot: progress.slot as u32,
-            step: progress.step,
+            seed: cursor.seed,
+            count: spec.copies as u32,
+            auto_reset: spec.auto_reset,
+            headings: spec.config.headings() as u32,
+            episode: cursor.episode,
+            slot: cursor.slot as u32,
+            step: cursor.step,
             created_at: Some(timestamp(created_at)),
             ttl: Some(duration(ttl)),
         }
@@ -71,29 +71,29 @@ impl From<EnvironmentInfo> for v1::Environment {
 ///
 /// # Errors
 /// The process is ending.
-pub async fn state(id: String, state: State) -> Result<v1::EnvironmentState, Error> {
+pub async fn state(id: String, state: EnvironmentState) -> Result<v1::EnvironmentState, Error> {
     /// Nodes and detections of what is written down in place.
     const SMALL: usize = 2048;
-    let size: usize = state.copies.iter().map(|copy| copy.sight.size()).sum();
+    let size: usize = state.copies.iter().map(|copy| copy.observation.size()).sum();
     if size <= SMALL {
         return Ok(write(id, state));
     }
     tokio::task::spawn_blocking(move || write(id, state)).await.map_err(Error::internal)
 }
 
-fn write(id: String, state: State) -> v1::EnvironmentState {
-    let State { step, episode, slot, copies } = state;
+fn write(id: String, state: EnvironmentState) -> v1::EnvironmentState {
+    let EnvironmentState { step, episode, slot, copies } = state;
     let copies = copies.into_iter().map(Into::into).collect();
     v1::EnvironmentState { environment_id: id, step, episode, slot: slot as u32, copies }
 }
 
 impl From<CopyState> for v1::CopyState {
     fn from(copy: CopyState) -> Self {
-        let CopyState { sight, seed, reward, finished } = copy;
+        let CopyState { observation, seed, reward, finished } = copy;
         let truncated = finished.is_some();
         Self {
-            graph: sight.graph.as_ref().map(graph),
-            scene: Some(scene(&sight)),
+            graph: observation.graph.as_ref().map(graph),
+            scene: Some(scene(&observation.scene)),
             reward,
             truncated,
             seed,
@@ -102,14 +102,14 @@ impl From<CopyState> for v1::CopyState {
     }
 }
 
-impl From<Finished> for v1::FinishedEpisode {
-    fn from(finished: Finished) -> Self {
-        let Finished { seed, metrics, sight } = finished;
+impl From<FinishedEpisode> for v1::FinishedEpisode {
+    fn from(finished: FinishedEpisode) -> Self {
+        let FinishedEpisode { seed, metrics, observation } = finished;
         Self {
             seed,
             metrics: Some(metrics.into()),
-            graph: sight.as_ref().and_then(|sight| sight.graph.as_ref()).map(graph),
-            scene: sight.as_ref().map(scene),
+            graph: observation.as_ref().and_then(|last| last.graph.as_ref()).map(graph),
+            scene: observation.as_ref().map(|last| scene(&last.scene)),
         }
     }
 }
@@ -129,9 +129,9 @@ fn user_id(j: usize) -> String {
     format!("user-{j}")
 }
 
-fn scene(sight: &Sight) -> v1::Scene {
-    let uavs = sight.uavs.iter().enumerate();
-    let users = sight.users.iter().zip(&sight.aoi).enumerate();
+fn scene(scene: &Scene) -> v1::Scene {
+    let uavs = scene.uavs.iter().enumerate();
+    let users = scene.users.iter().zip(&scene.aoi).enumerate();
     v1::Scene {
         uavs: uavs.map(|(i, &[x, y])| v1::SceneUav { id: uav_id(i), x, y }).collect(),
         users: users.map(|(j, (&[x, y], &aoi))| v1::SceneUser { id: user_id(j), x, y, aoi: f64::from(aoi) }).collect(),

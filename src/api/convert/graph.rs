@@ -8,7 +8,7 @@ use std::collections::HashMap;
 use super::fleet::{check_counts, check_nodes, distinct, index, request_order};
 use super::{Ids, aoi, finite, point};
 use crate::invalid::Invalid;
-use crate::serving::{Fleet, Graph, GraphForm, Observation, Seen, Sighting};
+use crate::serving::{Fleet, Graph, GraphForm, Observation, ReportedDetection, SceneOrGraph};
 use crate::wire::v1;
 
 /// Two reports of one pair may differ by this much: callers may compute in f32.
@@ -41,7 +41,7 @@ impl TryFrom<v1::Graph> for Observation {
             builder.node(node, place as usize, std::mem::take(&mut nodes[place as usize]), &by_id)?;
         }
         let graph = mirror(builder.graph)?;
-        Ok(Self { uav_order: request_order(&uav_places), seen: Seen::Graph(graph), fleet: Fleet { uavs, users } })
+        Ok(Self { uav_order: request_order(&uav_places), content: SceneOrGraph::Graph(graph), fleet: Fleet { uavs, users } })
     }
 }
 
@@ -109,7 +109,7 @@ impl Builder {
                 (None, Some(value)) => return Err(Invalid::new(field("aoi"), value, "no value, because the target is a UAV")),
                 (None, None) => {}
             }
-            list.push(Sighting { target, rel, place: i as u32, mirrored: false });
+            list.push(ReportedDetection { target, rel, place: i as u32, mirrored: false });
         }
         list.sort_by_key(|s| s.target);
         if let Some(pair) = list.windows(2).find(|pair| pair[0].target == pair[1].target) {
@@ -137,25 +137,25 @@ impl Builder {
 pub(super) fn mirror(mut graph: Graph) -> Result<Graph, Invalid> {
     let mut mirrored = Vec::new();
     for (node, list) in graph.detections.iter().enumerate() {
-        for sighting in list {
-            let back = [-sighting.rel[0], -sighting.rel[1]];
-            let other = &graph.detections[sighting.target as usize];
+        for detection in list {
+            let back = [-detection.rel[0], -detection.rel[1]];
+            let other = &graph.detections[detection.target as usize];
             let Ok(at) = other.binary_search_by_key(&(node as u32), |s| s.target) else {
-                let back = Sighting { target: node as u32, rel: back, place: 0, mirrored: true };
-                mirrored.push((sighting.target as usize, back));
+                let back = ReportedDetection { target: node as u32, rel: back, place: 0, mirrored: true };
+                mirrored.push((detection.target as usize, back));
                 continue;
             };
             let [x, y] = other[at].rel;
             if (x - back[0]).abs() > AGREEMENT || (y - back[1]).abs() > AGREEMENT {
-                let field = graph.rel_field(sighting.target as usize, other[at].place);
+                let field = graph.rel_field(detection.target as usize, other[at].place);
                 let expected =
                     format!("about ({}, {}), the negation of the position that the other node reports", back[0], back[1]);
                 return Err(Invalid::new(field, format!("({x}, {y})"), expected));
             }
         }
     }
-    for (node, sighting) in mirrored {
-        graph.detections[node].push(sighting);
+    for (node, detection) in mirrored {
+        graph.detections[node].push(detection);
     }
     for list in &mut graph.detections {
         list.sort_by_key(|s| s.target);

@@ -3,7 +3,7 @@
 use super::name;
 use crate::invalid::Invalid;
 use crate::service::act;
-use crate::serving::{Observation, Opened, PolicySpec};
+use crate::serving::{Observation, PolicySpec, SessionOptions};
 use crate::wire::v1;
 
 impl TryFrom<v1::ActRequest> for act::Request {
@@ -17,8 +17,8 @@ impl TryFrom<v1::ActRequest> for act::Request {
                 name("session_id", &id)?;
                 act::Memory::Session(id)
             }
-            Some(Memory::RecurrentState(state)) => act::Memory::Held(state),
-            None => act::Memory::Held(bytes::Bytes::new()),
+            Some(Memory::RecurrentState(state)) => act::Memory::RecurrentState(state),
+            None => act::Memory::RecurrentState(bytes::Bytes::new()),
         };
         if let Some(run_id) = &request.run_id {
             name("run_id", run_id)?;
@@ -36,7 +36,7 @@ impl TryFrom<v1::ActRequest> for act::Request {
 ///
 /// # Errors
 /// A field that cannot be used.
-pub fn open_session(request: v1::OpenSessionRequest) -> Result<(PolicySpec, Opened), Invalid> {
+pub fn open_session(request: v1::OpenSessionRequest) -> Result<(PolicySpec, SessionOptions), Invalid> {
     let policy = request.policy.parse()?;
     let id = Some(request.session_id).filter(|id| !id.is_empty());
     if let Some(id) = &id {
@@ -45,5 +45,5 @@ pub fn open_session(request: v1::OpenSessionRequest) -> Result<(PolicySpec, Open
     if let Some(run_id) = &request.run_id {
         name("run_id", run_id)?;
     }
-    Ok((policy, Opened { id, run_id: request.run_id, seed: request.seed }))
+    Ok((policy, SessionOptions { id, run_id: request.run_id, seed: request.seed }))
 }

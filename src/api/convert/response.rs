@@ -7,7 +7,7 @@ use jiff::Timestamp;
 use super::structs::to_struct;
 use crate::policy::RequiredInput;
 use crate::service::act;
-use crate::serving::{Described, Kind, PolicyRef, SessionInfo};
+use crate::serving::{Decision, PolicyDetails, PolicyKind, PolicyRef, SessionInfo};
 use crate::wire::v1;
 
 /// Degrees between two headings.
@@ -21,8 +21,9 @@ pub fn degrees(heading: u8) -> Option<f64> {
 }
 
 /// The answer, with Q-values if `values` were asked for and the policy has them.
-pub fn act_response(answer: act::Answer, values: bool) -> v1::ActResponse {
-    let act::Answer { policy, uavs, order, step, headings, q_values, state, timings } = answer;
+pub fn act_response(answer: act::Response, values: bool) -> v1::ActResponse {
+    let act::Response { policy, uavs, order, decision, recurrent_state } = answer;
+    let Decision { step, headings, q_values, timings } = decision;
     let actions = policy.policy.actions();
     let mut ids = uavs;
     let actions = order
@@ -43,7 +44,7 @@ pub fn act_response(answer: act::Answer, values: bool) -> v1::ActResponse {
         actions,
         policy: Some((&policy.reference).into()),
         step,
-        recurrent_state: state.unwrap_or_default(),
+        recurrent_state: recurrent_state.unwrap_or_default(),
         timings: Some(v1::Timings {
             queue: Some(duration(timings.queue)),
             compute: Some(duration(timings.compute)),
@@ -70,34 +71,34 @@ impl From<SessionInfo> for v1::Session {
     }
 }
 
-impl From<Described> for v1::Policy {
-    fn from(described: Described) -> Self {
-        let Described { about, loaded, aliases, versions } = described;
-        let needs = match about.needs {
+impl From<PolicyDetails> for v1::Policy {
+    fn from(described: PolicyDetails) -> Self {
+        let PolicyDetails { info, loaded, aliases, versions } = described;
+        let needs = match info.needs {
             RequiredInput::Detections => v1::Needs::Detections,
             RequiredInput::OwnPositions => v1::Needs::OwnPositions,
             RequiredInput::FullScene => v1::Needs::FullScene,
         };
-        let kind = match about.kind {
-            Kind::Checkpoint => v1::PolicyKind::Checkpoint,
-            Kind::Baseline => v1::PolicyKind::Baseline,
+        let kind = match info.kind {
+            PolicyKind::Checkpoint => v1::PolicyKind::Checkpoint,
+            PolicyKind::Baseline => v1::PolicyKind::Baseline,
         };
         Self {
-            r#ref: Some((&about.reference).into()),
+            r#ref: Some((&info.reference).into()),
             kind: kind.into(),
-            description: about.description.clone(),
-            uavs: about.uavs,
-            users: about.users,
-            headings: about.headings as u32,
+            description: info.description.clone(),
+            uavs: info.uavs,
+            users: info.users,
+            headings: info.headings as u32,
             needs: needs.into(),
-            detection_range: about.detection_range,
+            detection_range: info.detection_range,
             aliases,
             loaded,
             loaded_versions: versions.iter().filter(|(_, loaded)| *loaded).map(|(version, _)| *version).collect(),
             versions: versions.into_iter().map(|(version, _)| version).collect(),
-            config: to_struct(&about.config),
-            metrics: to_struct(&about.metrics),
-            created_at: Some(timestamp(about.created_at)),
+            config: to_struct(&info.config),
+            metrics: to_struct(&info.metrics),
+            created_at: Some(timestamp(info.created_at)),
         }
     }
 }

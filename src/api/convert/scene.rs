@@ -3,7 +3,7 @@
 use super::fleet::{check_counts, distinct, request_order};
 use super::{Ids, aoi, point};
 use crate::invalid::Invalid;
-use crate::serving::{Fleet, Observation, Seen};
+use crate::serving::{Fleet, Observation, Scene, SceneOrGraph};
 use crate::wire::v1;
 
 impl TryFrom<v1::Scene> for Observation {
@@ -31,11 +31,11 @@ impl TryFrom<v1::Scene> for Observation {
         })?;
         Ok(Self {
             uav_order: request_order(&uav_places),
-            seen: Seen::Scene {
+            content: SceneOrGraph::Scene(Scene {
                 uavs: uav_places.iter().map(|&place| uavs[place as usize]).collect(),
                 users: user_places.iter().map(|&place| users[place as usize].0).collect(),
                 aoi: user_places.iter().map(|&place| users[place as usize].1).collect(),
-            },
+            }),
             fleet: Fleet { uavs: uav_ids, users: user_ids },
         })
     }

@@ -17,7 +17,7 @@ use tonic_health::pb::{HealthCheckRequest, HealthCheckResponse};
 
 use super::SERVICES;
 use crate::draining::Draining;
-use crate::service::operations::{Vitals, vitals, vitals_changed};
+use crate::service::operations::{ServerHealth, server_health, server_health_changed};
 use crate::service::{App, Error};
 use crate::wire::v1;
 
@@ -52,8 +52,8 @@ impl Health {
     }
 
     /// Says which services answer while the server is in this state.
-    pub fn report(&self, vitals: Vitals) {
-        let Vitals { database, policies, scheduler } = vitals;
+    pub fn report(&self, health: ServerHealth) {
+        let ServerHealth { database, policies, scheduler } = health;
         self.set("", database && policies);
         for &service in SERVICES {
             let serving = match service {
@@ -70,8 +70,8 @@ impl Health {
     /// Reports the server's state again and again.
     pub async fn follow(self, app: Arc<App>) {
         loop {
-            vitals_changed(&app).await;
-            self.report(vitals(&app).await);
+            server_health_changed(&app).await;
+            self.report(server_health(&app).await);
         }
     }
 
@@ -178,15 +178,15 @@ mod tests {
     fn a_service_depends_on_what_it_needs() {
         let health = Health::new(Draining::default(), CancellationToken::new());
         let of = |service: &str| health.status(service).map(|status| status == ServingStatus::Serving);
-        let all = Vitals { database: true, policies: true, scheduler: true };
+        let all = ServerHealth { database: true, policies: true, scheduler: true };
         let cases = [
             (all, [true; 5]),
-            (Vitals { scheduler: false, ..all }, [true, true, true, false, true]),
-            (Vitals { policies: false, ..all }, [false, false, true, true, true]),
-            (Vitals { database: false, ..all }, [false, true, true, false, false]),
+            (ServerHealth { scheduler: false, ..all }, [true, true, true, false, true]),
+            (ServerHealth { policies: false, ..all }, [false, false, true, true, true]),
+            (ServerHealth { database: false, ..all }, [false, true, true, false, false]),
         ];
-        for (vitals, expected) in cases {
-            health.report(vitals);
+        for (components, expected) in cases {
+            health.report(components);
             let services = [
                 "",
                 "qedgix.v1.PolicyService",
@@ -194,7 +194,7 @@ mod tests {
                 "qedgix.v1.JobService",
                 "qedgix.v1.WorkerService",
             ];
-            assert_eq!(services.map(|service| of(service).unwrap()), expected, "{vitals:?}");
+            assert_eq!(services.map(|service| of(service).unwrap()), expected, "{components:?}");
         }
         assert_eq!(of("nobody"), None);
     }

@@ -32,7 +32,7 @@ struct Handlers(Arc<App>);
 /// Answers one slot, however it came.
 async fn answer(app: &App, request: v1::ActRequest, deadline: Option<Instant>) -> Result<v1::ActResponse, Error> {
     let values = request.return_q_values;
-    let request = if nodes(&request) < act::LARGE {
+    let request = if nodes(&request) < act::INLINE_NODES {
         act::Request::try_from(request)?
     } else {
         tokio::task::spawn_blocking(|| act::Request::try_from(request)).await.map_err(Error::internal)??

@@ -85,7 +85,7 @@ pub async fn infer(app: &App, request: InferRequest, deadline: Option<Instant>) 
         tokio::task::spawn_blocking(|| read(inputs)).await.map_err(Error::internal)??
     };
     let memory = match (sequence, state) {
-        (None, state) => Memory::Held(state.unwrap_or_default()),
+        (None, state) => Memory::RecurrentState(state.unwrap_or_default()),
         (Some(sequence), None) => Memory::Sequence(sequence),
         (Some(_), Some(_)) => {
             let expected = "no value beside sequence_id, because the server keeps the state of a sequence";
@@ -97,7 +97,7 @@ pub async fn infer(app: &App, request: InferRequest, deadline: Option<Instant>) 
     let request = act::Request { policy: Some(spec.clone()), observation, memory, step, run_id: None, seed };
     let answer = act::act(app, request, deadline).await.map_err(|error| model_error(&spec, error))?;
     let reference = &answer.policy.reference;
-    let (version, digest, step) = (reference.version, reference.digest_hex(), answer.step);
+    let (version, digest, step) = (reference.version, reference.digest_hex(), answer.decision.step);
     Ok(InferResponse { model, version, id, step, digest, outputs: outputs.tensors(answer) })
 }
 

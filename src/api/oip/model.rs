@@ -7,7 +7,7 @@ use crate::invalid::Invalid;
 use crate::policy::RequiredInput;
 use crate::service::policies::{self, IndexEntry};
 use crate::service::{App, Error};
-use crate::serving::{Kind, PolicySpec, Which};
+use crate::serving::{PolicyKind, PolicySpec, VersionSelector};
 
 /// A model as metadata and configuration show it.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -35,10 +35,10 @@ pub(super) fn policy_spec(name: &str, version: &str) -> Result<PolicySpec, Inval
     let digits = version.bytes().all(|b| b.is_ascii_digit());
     let number = version.parse().ok().filter(|&number: &u64| digits && number > 0);
     let number = number.ok_or_else(|| invalid("a whole number from 1, or no value for the newest".into()))?;
-    match spec.which {
-        Which::Newest => spec.which = Which::Version(number),
-        Which::Version(named) if named == number => {}
-        Which::Version(_) | Which::Alias(_) => {
+    match spec.version {
+        VersionSelector::Newest => spec.version = VersionSelector::Version(number),
+        VersionSelector::Version(named) if named == number => {}
+        VersionSelector::Version(_) | VersionSelector::Alias(_) => {
             return Err(invalid(format!("no value, because model_name selects the version: {spec}")));
         }
     }
@@ -69,9 +69,9 @@ pub fn describe(app: &App, name: &str, version: &str) -> Result<Model, Error> {
     if !described.loaded {
         return Err(not_loaded(&spec));
     }
-    let policy = &described.about;
+    let policy = &described.info;
     let loaded = || described.versions.iter().filter(|(_, loaded)| *loaded).map(|(version, _)| *version).collect();
-    let versions: Vec<u64> = if spec.which == Which::Newest { loaded() } else { vec![policy.reference.version] };
+    let versions: Vec<u64> = if spec.version == VersionSelector::Newest { loaded() } else { vec![policy.reference.version] };
     let size = |size: Option<u32>| size.map_or(-1, i64::from);
     let (uavs, users) = (size(policy.uavs), size(policy.users));
     let needs = policy.needs;
@@ -94,7 +94,7 @@ pub fn describe(app: &App, name: &str, version: &str) -> Result<Model, Error> {
         (needs != RequiredInput::FullScene || !of_graph).then_some(input)
     };
     let state = TensorShape { name: STATE, datatype: Datatype::Bytes, shape: vec![1], optional: true };
-    let outputs = outputs::shapes(uavs, policy.headings as i64, policy.kind == Kind::Checkpoint);
+    let outputs = outputs::shapes(uavs, policy.headings as i64, policy.kind == PolicyKind::Checkpoint);
     Ok(Model {
         name: name.to_owned(),
         versions: versions.iter().map(u64::to_string).collect(),

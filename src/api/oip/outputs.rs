@@ -4,7 +4,7 @@ use super::STATE;
 use crate::api::convert::response::degrees;
 use crate::api::convert::tensors::{Data, Datatype, Tensor, TensorShape};
 use crate::invalid::Invalid;
-use crate::service::act::Answer;
+use crate::service::act::Response;
 
 const NAMES: [&str; 4] = [INDEX, DEGREES, Q_VALUES, STATE];
 const INDEX: &str = "heading_index";
@@ -36,10 +36,10 @@ impl OutputSelection {
     }
 
     /// The selected tensors, with the UAVs in the order of the request.
-    pub(super) fn tensors(self, answer: Answer) -> Vec<Tensor> {
+    pub(super) fn tensors(self, answer: Response) -> Vec<Tensor> {
         let names = if self.0.is_empty() {
-            let values = answer.q_values.iter().all(|value| !value.is_nan());
-            let available = |name: &&str| (*name != Q_VALUES || values) && (*name != STATE || answer.state.is_some());
+            let values = answer.decision.q_values.iter().all(|value| !value.is_nan());
+            let available = |name: &&str| (*name != Q_VALUES || values) && (*name != STATE || answer.recurrent_state.is_some());
             NAMES.iter().filter(|name| available(name)).map(|name| (*name).to_owned()).collect()
         } else {
             self.0
@@ -48,20 +48,20 @@ impl OutputSelection {
     }
 }
 
-fn output(name: String, answer: &Answer) -> Tensor {
+fn output(name: String, answer: &Response) -> Tensor {
     let uavs = answer.order.len() as i64;
     let order = answer.order.iter().map(|&uav| uav as usize);
-    let heading = |uav: usize| answer.headings[uav];
+    let heading = |uav: usize| answer.decision.headings[uav];
     let actions = answer.policy.policy.actions();
     let (shape, data) = match name.as_str() {
         INDEX => (vec![uavs], Data::Int32(order.map(|uav| i32::from(heading(uav))).collect())),
         // Hovering has no direction.
         DEGREES => (vec![uavs], Data::Fp32(order.map(|uav| degrees(heading(uav)).map_or(f32::NAN, |x| x as f32)).collect())),
         Q_VALUES => {
-            let values = order.flat_map(|uav| answer.q_values[uav * actions..(uav + 1) * actions].iter().copied());
+            let values = order.flat_map(|uav| answer.decision.q_values[uav * actions..(uav + 1) * actions].iter().copied());
             (vec![uavs, actions as i64], Data::Fp32(values.collect()))
         }
-        _ => (vec![1], Data::Bytes(vec![answer.state.clone().unwrap_or_default()])),
+        _ => (vec![1], Data::Bytes(vec![answer.recurrent_state.clone().unwrap_or_default()])),
     };
     let datatype = data.datatype().map_or("", |datatype| datatype.name()).to_owned();
     Tensor { name, datatype, shape, data }

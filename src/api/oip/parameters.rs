@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use crate::invalid::Invalid;
-use crate::service::sequences::{Sequence, SequenceId};
+use crate::service::act::{Sequence, SequenceId};
 use crate::serving::Fleet;
 
 /// The value of a parameter.

@@ -85,19 +85,19 @@ async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Error> {
 )]
 async fn metrics(State(app): State<Arc<App>>, Extension(render): Extension<fn() -> String>) -> impl IntoResponse {
     // What is there is counted when it is asked for.
-    let figures = operations::figures(&app).await;
+    let metrics = operations::server_metrics(&app).await;
     for (name, value) in [
-        ("qedgix_sessions", figures.sessions),
-        ("qedgix_environments", figures.environments),
-        ("qedgix_policy_versions", figures.policy_versions),
-        ("qedgix_engine_queue_depth", figures.engine_queue),
-        ("qedgix_training_threads_busy", figures.threads_busy),
-        ("qedgix_training_threads", figures.threads),
-        ("qedgix_job_watchers", figures.watchers),
+        ("qedgix_sessions", metrics.sessions),
+        ("qedgix_environments", metrics.environments),
+        ("qedgix_policy_versions", metrics.policy_versions),
+        ("qedgix_engine_queue_depth", metrics.engine_queue),
+        ("qedgix_training_threads_busy", metrics.threads_busy),
+        ("qedgix_training_threads", metrics.threads),
+        ("qedgix_job_watchers", metrics.watchers),
     ] {
         metrics::gauge!(name).set(value as f64);
     }
-    for (state, jobs) in figures.jobs {
+    for (state, jobs) in metrics.jobs {
         metrics::gauge!("qedgix_jobs", "state" => state.as_str()).set(jobs as f64);
     }
     ([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], render())

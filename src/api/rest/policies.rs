@@ -19,7 +19,7 @@ use super::schemas;
 use super::wording::Policy;
 use crate::service::keys::Caller;
 use crate::service::{App, Error, PageRequest, policies};
-use crate::serving::{Described, PolicySpec};
+use crate::serving::{PolicyDetails, PolicySpec};
 use crate::store::Promotion;
 use crate::wire::v1;
 
@@ -143,7 +143,7 @@ async fn one(State(app): Shared, Path(policy): Path<String>) -> Result<Json<Poli
     Ok(Json(shown(policies::get(&app, &spec)?)))
 }
 
-fn shown(described: Described) -> Policy {
+fn shown(described: PolicyDetails) -> Policy {
     v1::Policy::from(described).into()
 }
 
@@ -213,7 +213,7 @@ async fn upload(
         kind => return Err(extract::unsupported(kind, "application/octet-stream, or application/json with a checkpoint_id")),
     };
     let (described, new) = policies::upload(&app, policies::PolicyUpload { name, source, alias, by: by(caller) }).await?;
-    let location = [(header::LOCATION, format!("/v1/policies/{}", described.about.reference))];
+    let location = [(header::LOCATION, format!("/v1/policies/{}", described.info.reference))];
     Ok((if new { StatusCode::CREATED } else { StatusCode::OK }, location, Json(shown(described))))
 }
 

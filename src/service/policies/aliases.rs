@@ -7,7 +7,7 @@ use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::service::paging::number;
 use crate::service::{App, Error, Page, PageRequest};
-use crate::serving::{Kind, PolicyRef, PolicySpec, Registry, Which, check_name};
+use crate::serving::{PolicyKind, PolicyRef, PolicySpec, Registry, VersionSelector, check_name};
 use crate::store::{AliasMove, Promotion, PromotionFilter};
 
 /// Most aliases of one policy.
@@ -46,16 +46,16 @@ pub async fn set_alias(app: &App, change: AliasChange, version: u64) -> Result<O
     let at = app.clock.now();
     serialized(app, async move |PolicyStores { store, registry }| {
         let AliasChange { name, alias, by, .. } = &change;
-        let spec = PolicySpec { name: name.clone(), which: Which::Version(version) };
+        let spec = PolicySpec { name: name.clone(), version: VersionSelector::Version(version) };
         let found = registry.describe(&spec)?;
-        if found.about.kind == Kind::Baseline {
+        if found.info.kind == PolicyKind::Baseline {
             let message = format!("{name} is a baseline, which has one version and no aliases");
             return Err(Error::Precondition { code: ErrorCode::NoCheckpoint, message });
         }
         check_expected(&registry, &change)?;
         check_alias(&registry, name, alias)?;
         if !found.loaded {
-            return Err(unloaded(&found.about.reference));
+            return Err(unloaded(&found.info.reference));
         }
         let m = AliasMove { name, alias, to: Some(version), at, by: by.as_deref() };
         let previous = store.move_policy_alias(m).await?;

@@ -11,7 +11,7 @@ use crate::invalid::Invalid;
 use crate::policy::baselines::{self, EnvParams};
 use crate::service::{App, Error};
 use crate::serving::bundled::BUNDLED;
-use crate::serving::{About, Kind, LoadedPolicy, PolicyRef, PolicySpec, Registry, Which};
+use crate::serving::{LoadedPolicy, PolicyInfo, PolicyKind, PolicyRef, PolicySpec, Registry, VersionSelector};
 
 /// A version and whether it is loaded.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -34,7 +34,7 @@ pub fn index(app: &App) -> Vec<IndexEntry> {
         ready,
         reason: if ready { String::new() } else { "unloaded".to_owned() },
     };
-    app.registry.versions().iter().map(|(about, ready)| entry(&about.reference, *ready)).collect()
+    app.registry.versions().iter().map(|(info, ready)| entry(&info.reference, *ready)).collect()
 }
 
 /// Loads every version of a policy (`NAME`) or one (`NAME:VERSION`). Loaded versions stay as they are.
@@ -46,16 +46,16 @@ pub async fn load_policy(app: &App, name: &str) -> Result<(), Error> {
     let now = app.clock.now();
     serialized(app, async move |PolicyStores { store, registry }| {
         let mut loaded = Vec::new();
-        for (about, ready) in versions(&registry, &spec)? {
-            loaded.push(match (ready, about.kind) {
+        for (info, ready) in versions(&registry, &spec)? {
+            loaded.push(match (ready, info.kind) {
                 (true, _) => continue,
-                (false, Kind::Baseline) => {
-                    let missing = || Error::not_found("policy", about.reference.to_string());
+                (false, PolicyKind::Baseline) => {
+                    let missing = || Error::not_found("policy", info.reference.to_string());
                     let policy = baselines::by_name(&spec.name, EnvParams::default()).ok_or_else(missing)?;
-                    LoadedPolicy { about, policy }
+                    LoadedPolicy { info, policy }
                 }
-                (false, Kind::Checkpoint) => {
-                    StoredVersion::read(&store, &spec.name, about.reference.version).await?.load().await?
+                (false, PolicyKind::Checkpoint) => {
+                    StoredVersion::read(&store, &spec.name, info.reference.version).await?.load().await?
                 }
             });
         }
@@ -80,7 +80,7 @@ pub async fn unload_policy(app: &App, name: &str) -> Result<(), Error> {
     let now = app.clock.now();
     serialized(app, async move |PolicyStores { store, registry }| {
         let all = versions(&registry, &spec)?;
-        let numbers: Vec<u64> = all.iter().filter(|(_, ready)| *ready).map(|(about, _)| about.reference.version).collect();
+        let numbers: Vec<u64> = all.iter().filter(|(_, ready)| *ready).map(|(info, _)| info.reference.version).collect();
         store.set_policy_versions_loaded(&spec.name, &numbers, false, now).await?;
         for version in numbers {
             registry.unload(&spec.name, version);
@@ -93,17 +93,17 @@ pub async fn unload_policy(app: &App, name: &str) -> Result<(), Error> {
 
 fn spec_of(name: &str) -> Result<PolicySpec, Invalid> {
     let spec: PolicySpec = name.parse()?;
-    if matches!(spec.which, Which::Alias(_)) {
+    if matches!(spec.version, VersionSelector::Alias(_)) {
         return Err(Invalid::new("policy", format!("{name:?}"), "NAME for all versions, or NAME:VERSION"));
     }
     Ok(spec)
 }
 
 /// The versions that `spec` names, and whether each is loaded.
-fn versions(registry: &Registry, spec: &PolicySpec) -> Result<Vec<(Arc<About>, bool)>, Error> {
+fn versions(registry: &Registry, spec: &PolicySpec) -> Result<Vec<(Arc<PolicyInfo>, bool)>, Error> {
     let mut found = registry.versions_of(&spec.name);
-    if let Which::Version(version) = spec.which {
-        found.retain(|(about, _)| about.reference.version == version);
+    if let VersionSelector::Version(version) = spec.version {
+        found.retain(|(info, _)| info.reference.version == version);
     }
     if found.is_empty() { Err(Error::not_found("policy", spec.to_string())) } else { Ok(found) }
 }

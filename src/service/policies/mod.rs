@@ -16,24 +16,24 @@ pub use publish::{CheckpointSource, PolicyUpload, check_publishable, publish, up
 use super::paging::json_bytes;
 use super::{App, Error, Page, PageRequest};
 use crate::error_code::ErrorCode;
-use crate::serving::{Described, Kind, PolicyRef, PolicySpec, Registry};
+use crate::serving::{PolicyDetails, PolicyKind, PolicyRef, PolicySpec, Registry};
 use crate::store::Store;
 
 /// A page of policies in order of names, each in its newest version.
 ///
 /// # Errors
 /// [`Error::Invalid`]: the page size is out of range.
-pub fn list(app: &App, page: &PageRequest) -> Result<Page<Described>, Error> {
+pub fn list(app: &App, page: &PageRequest) -> Result<Page<PolicyDetails>, Error> {
     let (policies, more) = app.registry.list(&page.token, page.usual_limit()?);
-    let bytes = |policy: &Described| json_bytes(&policy.about.config) + json_bytes(&policy.about.metrics);
-    Ok(Page::bounded(policies, more, bytes, |policy| policy.about.reference.name.clone()))
+    let bytes = |policy: &PolicyDetails| json_bytes(&policy.info.config) + json_bytes(&policy.info.metrics);
+    Ok(Page::bounded(policies, more, bytes, |policy| policy.info.reference.name.clone()))
 }
 
 /// The version that `spec` names, loaded or not.
 ///
 /// # Errors
 /// [`Error::NotFound`].
-pub fn get(app: &App, spec: &PolicySpec) -> Result<Described, Error> {
+pub fn get(app: &App, spec: &PolicySpec) -> Result<PolicyDetails, Error> {
     Ok(app.registry.describe(spec)?)
 }
 
@@ -42,9 +42,9 @@ pub fn get(app: &App, spec: &PolicySpec) -> Result<Described, Error> {
 /// # Errors
 /// [`Error::NotFound`], or [`Error::Precondition`] for a baseline, which has no checkpoint.
 pub async fn export(app: &App, spec: &PolicySpec) -> Result<(PolicyRef, Vec<u8>), Error> {
-    let about = app.registry.describe(spec)?.about;
-    let PolicyRef { name, version, .. } = &about.reference;
-    if about.kind == Kind::Baseline {
+    let info = app.registry.describe(spec)?.info;
+    let PolicyRef { name, version, .. } = &info.reference;
+    if info.kind == PolicyKind::Baseline {
         let message = format!("{name} is a baseline, which has no checkpoint to export");
         return Err(Error::Precondition { code: ErrorCode::NoCheckpoint, message });
     }
@@ -66,7 +66,7 @@ where
     let registry = app.registry.clone();
     let change = change(PolicyStores { store: app.store.clone(), registry: registry.clone() });
     let task = tokio::spawn(async move {
-        let _turn = registry.turn().await;
+        let _turn = registry.lock_changes().await;
         change.await
     });
     task.await.map_err(Error::internal)?

@@ -13,7 +13,7 @@ use crate::invalid::Invalid;
 use crate::policy::baselines;
 use crate::policy::{Identity, ObservationKind, Policy};
 use crate::service::{App, Error, jobs};
-use crate::serving::{About, Described, Kind, LoadedPolicy, PolicyRef, PolicySpec, Which, check_name};
+use crate::serving::{LoadedPolicy, PolicyDetails, PolicyInfo, PolicyKind, PolicyRef, PolicySpec, VersionSelector, check_name};
 use crate::store::{NewPolicyVersion, PolicyVersion, Store};
 
 /// The checkpoint to publish.
@@ -65,7 +65,7 @@ pub async fn publish(app: &App, name: &str, bytes: Vec<u8>) -> Result<PolicyRef,
 /// # Errors
 /// As [`publish`]; [`Error::NotFound`] for an unknown checkpoint, [`Error::Precondition`] for an alias to an unloaded version,
 /// [`Error::Draining`].
-pub async fn upload(app: &App, upload: PolicyUpload) -> Result<(Described, bool), Error> {
+pub async fn upload(app: &App, upload: PolicyUpload) -> Result<(PolicyDetails, bool), Error> {
     app.admit()?;
     let PolicyUpload { name, source, alias, by } = upload;
     check_publishable(&name)?;
@@ -77,7 +77,7 @@ pub async fn upload(app: &App, upload: PolicyUpload) -> Result<(Described, bool)
         CheckpointSource::Job(id) => jobs::checkpoint(app, &id).await?.1,
     };
     let (reference, new) = store_version(app, &name, bytes, alias, by).await?;
-    let spec = PolicySpec { name, which: Which::Version(reference.version) };
+    let spec = PolicySpec { name, version: VersionSelector::Version(reference.version) };
     Ok((app.registry.describe(&spec)?, new))
 }
 
@@ -94,11 +94,11 @@ async fn store_version(
     let now = app.clock.now();
     serialized(app, async move |PolicyStores { store, registry }| {
         let of_name = registry.versions_of(&reference.name);
-        let known = of_name.into_iter().find(|(about, _)| about.reference.digest == reference.digest);
+        let known = of_name.into_iter().find(|(info, _)| info.reference.digest == reference.digest);
         if let Some(alias) = &alias {
             check_alias(&registry, &reference.name, alias)?;
-            if let Some((about, false)) = &known {
-                return Err(unloaded(&about.reference));
+            if let Some((info, false)) = &known {
+                return Err(unloaded(&info.reference));
             }
         }
         let new = NewPolicyVersion {
@@ -159,9 +159,9 @@ impl ParsedCheckpoint {
             all.extend(evaluated);
         }
         let (uavs, users) = (environment.uavs, environment.users);
-        let about = About {
+        let info = PolicyInfo {
             reference,
-            kind: Kind::Checkpoint,
+            kind: PolicyKind::Checkpoint,
             description: format!("{:?}, trained for {step} slots with {uavs} UAVs and {users} users.", config.algorithm),
             uavs: (flat || training.identity == Identity::Onehot).then_some(uavs as u32),
             users: flat.then_some(users as u32),
@@ -172,7 +172,7 @@ impl ParsedCheckpoint {
             metrics,
             created_at: Timestamp::from_millisecond(created_at).unwrap_or_default(),
         };
-        LoadedPolicy { about: Arc::new(about), policy: self.policy }
+        LoadedPolicy { info: Arc::new(info), policy: self.policy }
     }
 }
 

@@ -1,99 +1,101 @@
-//! One forward pass over a batch of fleets of one policy version. In steady state it allocates nothing: buffers are the
-//! tasks' own or are kept between batches.
+//! One forward pass over a batch of fleets of one policy version. In steady state it allocates nothing: output buffers belong
+//! to the tasks, other buffers are kept between batches.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::{Duration, Instant};
 
-use super::reply::Promise;
-use super::{Outcome, Task, Timings};
+use super::metrics::EngineMetrics;
+use super::reply::Sender;
+use super::task::{Task, TaskOutput, Timings};
 use crate::policy::FleetStep;
-use crate::serving::meters::Meters;
 use crate::serving::{Error, LoadedPolicy};
 
-/// A fleet that waits.
+/// A task in the queue.
 pub(super) struct Queued {
     pub(super) task: Task,
     pub(super) since: Instant,
     pub(super) deadline: Option<Instant>,
-    pub(super) promise: Promise,
+    pub(super) reply: Sender,
 }
 
-/// Fleets to be computed together, and room kept from one batch to the next.
+/// Tasks to compute together, and buffers that are kept from one batch to the next.
 #[derive(Default)]
 pub(super) struct Batch {
-    pub(super) fleets: Vec<Queued>,
+    pub(super) tasks: Vec<Queued>,
     turns: Vec<FleetStep<'static>>,
 }
 
 impl Batch {
-    /// Computes all fleets that somebody still waits for, and answers them. Returns how many that were.
-    pub(super) fn compute(&mut self, meters: &Meters) -> usize {
-        let begun = Instant::now();
-        let Some(policy) = self.fleets.first().map(|first| first.task.policy.clone()) else { return 0 };
-        let meter = meters.policy(&policy.reference.name);
-        let asked = self.fleets.len();
-        let in_time = |queued: &Queued| queued.deadline.is_none_or(|deadline| begun < deadline);
-        if !self.fleets.iter().all(|queued| in_time(queued) && !queued.promise.is_void()) {
-            for late in self.fleets.extract_if(.., |queued| !in_time(queued)) {
-                late.promise.keep(Err(Error::Deadline("in the engine's queue")));
+    /// Computes all tasks whose callers still wait, and replies to them. Returns the number of tasks computed.
+    pub(super) fn run(&mut self, metrics: &EngineMetrics) -> usize {
+        let started = Instant::now();
+        let Some(policy) = self.tasks.first().map(|first| first.task.policy().clone()) else { return 0 };
+        let counters = metrics.policy(&policy.reference.name);
+        let queued = self.tasks.len();
+        let in_time = |queued: &Queued| queued.deadline.is_none_or(|deadline| started < deadline);
+        if !self.tasks.iter().all(|queued| in_time(queued) && !queued.reply.is_closed()) {
+            for late in self.tasks.extract_if(.., |queued| !in_time(queued)) {
+                late.reply.send(Err(Error::Deadline("in the engine's queue")));
             }
-            self.fleets.retain(|queued| !queued.promise.is_void());
+            self.tasks.retain(|queued| !queued.reply.is_closed());
         }
-        let size = self.fleets.len();
-        meter.failure.increment((asked - size) as u64);
+        let size = self.tasks.len();
+        counters.failure.increment((queued - size) as u64);
         if size == 0 {
             return 0;
         }
-        let mut turns = recycled(std::mem::take(&mut self.turns));
-        turns.extend(self.fleets.iter_mut().map(|queued| queued.task.turn()));
-        // What is half-written after a panic is dropped below.
-        let decided = catch_unwind(AssertUnwindSafe(|| policy.policy.act(&mut turns)));
-        self.turns = recycled(turns);
-        let compute = begun.elapsed();
-        if decided.is_err() {
-            meter.failure.increment(size as u64);
-            for queued in self.fleets.drain(..) {
-                queued.promise.keep(Err(panicked(&policy)));
+        let mut turns = recycle(std::mem::take(&mut self.turns));
+        turns.extend(self.tasks.iter_mut().map(|queued| queued.task.turn()));
+        // Unwind safe: after a panic, the outputs are dropped below.
+        let result = catch_unwind(AssertUnwindSafe(|| policy.policy.act(&mut turns)));
+        self.turns = recycle(turns);
+        let compute = started.elapsed();
+        if result.is_err() {
+            counters.failure.increment(size as u64);
+            for queued in self.tasks.drain(..) {
+                queued.reply.send(Err(panicked(&policy)));
             }
             return size;
         }
-        meters.pass(&meter, size);
-        let mut answered = 0;
-        for Queued { task, since, promise, .. } in self.fleets.drain(..) {
-            let timings = Timings { queue: begun - since, compute, batch_size: size as u32 };
-            meters.times(timings.queue, timings.compute);
-            // A caller that left meanwhile needs no answer.
-            answered += u64::from(promise.keep(Ok(task.done(timings))));
+        metrics.record_batch(&counters, size);
+        let mut received = 0;
+        for Queued { task, since, reply, .. } in self.tasks.drain(..) {
+            let timings = Timings { queue: started - since, compute, batch_size: size as u32 };
+            metrics.record_times(timings.queue, timings.compute);
+            // The caller may have stopped waiting during the forward pass.
+            received += u64::from(reply.send(Ok(task.finish(timings))));
         }
-        meter.success.increment(answered);
-        meter.failure.increment(size as u64 - answered);
+        counters.success.increment(received);
+        counters.failure.increment(size as u64 - received);
         size
     }
 }
 
-/// Computes one fleet for its caller.
-pub(super) fn alone(mut task: Task, meters: &Meters) -> Result<Outcome, Error> {
-    let begun = Instant::now();
-    let meter = meters.policy(&task.policy.reference.name);
-    // What is half-written after a panic is dropped.
-    let decided = catch_unwind(AssertUnwindSafe(|| task.policy.clone().policy.act(&mut [task.turn()])));
-    if decided.is_err() {
-        meter.failure.increment(1);
-        return Err(panicked(&task.policy));
+/// Computes one task on the caller's thread.
+pub(super) fn run_single(mut task: Task, metrics: &EngineMetrics) -> Result<TaskOutput, Error> {
+    let started = Instant::now();
+    let policy = task.policy().clone();
+    let counters = metrics.policy(&policy.reference.name);
+    // Unwind safe: after a panic, the output is dropped.
+    let result = catch_unwind(AssertUnwindSafe(|| policy.policy.act(&mut [task.turn()])));
+    if result.is_err() {
+        counters.failure.increment(1);
+        return Err(panicked(&policy));
     }
-    meters.pass(&meter, 1);
-    meter.success.increment(1);
-    let timings = Timings { queue: Duration::ZERO, compute: begun.elapsed(), batch_size: 1 };
-    meters.times(timings.queue, timings.compute);
-    Ok(task.done(timings))
+    metrics.record_batch(&counters, 1);
+    counters.success.increment(1);
+    let timings = Timings { queue: Duration::ZERO, compute: started.elapsed(), batch_size: 1 };
+    metrics.record_times(timings.queue, timings.compute);
+    Ok(task.finish(timings))
 }
 
 fn panicked(policy: &LoadedPolicy) -> Error {
     Error::Fault(format!("policy {} panicked", policy.reference))
 }
 
-/// The room of `turns`, for turns of another time: a vector that is collected from its own elements keeps its allocation.
-fn recycled<'to>(mut turns: Vec<FleetStep<'_>>) -> Vec<FleetStep<'to>> {
+/// An empty vector with the allocation of `turns`, for elements of another lifetime: a vector that is collected from its own
+/// elements keeps its allocation.
+fn recycle<'to>(mut turns: Vec<FleetStep<'_>>) -> Vec<FleetStep<'to>> {
     turns.clear();
-    turns.into_iter().map(|_| unreachable!("it was cleared")).collect()
+    turns.into_iter().map(|_| unreachable!("the vector is empty")).collect()
 }

@@ -1,15 +1,22 @@
-//! Where headings are computed: threads of its own behind a bounded queue, so that a large fleet delays no I/O.
+//! Runs policies on threads of its own behind a bounded queue, so that a large fleet does not delay I/O.
 //!
-//! A thread takes the fleet that waits longest and, with it, whatever waits for the same policy version, into one forward
-//! pass; answers are the same bits as alone. By default nobody waits for company: a batch is what has gathered while the
-//! threads were busy. Handing a fleet over and its answer back wakes two threads, which takes longer than a small fleet's
-//! forward pass: small fleets are computed by the first caller among them, if no more than `threads` compute then.
+//! A thread takes the task that has waited longest, adds waiting tasks of the same policy version, and computes them in one
+//! forward pass; results are bit-identical to computing each alone. By default a batch consists of the tasks that arrived
+//! while the threads were busy; no task waits for others to join.
 //!
-//! A caller that gave up (its future was dropped, or its deadline passed) is not computed for. A policy that panics is a
-//! fault of the server, told to the callers of the batch; the thread goes on.
+//! Handing a task to another thread and its result back takes longer than the forward pass of a small fleet. Small fleets are
+//! therefore computed inline, on the thread of the first caller among them, as long as no more than `threads` computations
+//! run at once.
+//!
+//! A task is not computed if its caller stopped waiting (its future was dropped, or its deadline passed). If a policy panics,
+//! all callers of the batch receive [`Error::Fault`] and the thread continues.
 
 mod batch;
+mod metrics;
 mod reply;
+mod task;
+
+pub use task::{Decision, OutputBuffers, Task, TaskOutput, Timings};
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -17,116 +24,32 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use batch::{Batch, Queued};
-use reply::{Expected, Places};
+use metrics::EngineMetrics;
+use reply::{Receiver, ReplySlots};
 
-use super::meters::Meters;
-use super::{Error, LoadedPolicy};
-use crate::policy::{FleetStep, Slot};
+use super::Error;
 
-/// Work of a batch beyond which no further fleet joins it: company must not make a small fleet wait for large ones.
-const WORK: usize = 1 << 17;
-/// Most work of a batch that a caller computes: well below a millisecond, for its thread serves connections, too.
-const SMALL: usize = 1 << 13;
-/// What a UAV costs, in units of what a detection does.
-const UAV: usize = 32;
-/// Small fleets one after another without company, after which the next ones do not look for any: looking costs as much as a
-/// forward pass.
-const LONELY: u32 = 4;
-/// Of those, one in so many looks all the same.
-const PROBE: u32 = 16;
+/// Most work of a batch. A higher limit would delay small fleets that share a batch with large ones.
+const MAX_BATCH_WORK: usize = 1 << 17;
+/// Most work of a batch that is computed inline: well below a millisecond, because the caller's thread also serves
+/// connections.
+const MAX_INLINE_WORK: usize = 1 << 13;
+/// After this many inline batches of one, small fleets skip the batching check, which costs as much as a forward pass.
+const MAX_SINGLES: u32 = 4;
+/// Of the small fleets that skip the check, one in this many makes it nevertheless.
+const BATCHING_PROBE_INTERVAL: u32 = 16;
 
 /// Limits of an engine.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct EngineConfig {
-    /// Threads that compute.
+    /// Computing threads.
     pub threads: usize,
-    /// Fleets that may wait; more are refused.
+    /// Most tasks in the queue; more are rejected.
     pub queue: usize,
     /// Most fleets of a batch.
     pub max_batch: usize,
-    /// How long the oldest fleet of a batch may wait for company; zero: not at all.
+    /// How long the oldest task may wait for others to join its batch; zero: not at all.
     pub max_batch_delay: Duration,
-}
-
-/// One fleet's turn, and room for what comes out.
-#[derive(Debug)]
-pub struct Task {
-    /// Who decides.
-    policy: Arc<LoadedPolicy>,
-    /// What is seen.
-    slot: Slot,
-    /// Slots since the episode began.
-    step: u64,
-    out: Outcome,
-}
-
-impl Task {
-    /// The turn of a fleet with this memory. Headings and values are written into the room of `used`.
-    pub fn new(policy: Arc<LoadedPolicy>, slot: Slot, step: u64, memory: Vec<f32>, used: Room) -> Self {
-        let Room { mut headings, mut q_values } = used;
-        headings.clear();
-        headings.resize(slot.uavs(), 0);
-        q_values.clear();
-        q_values.resize(slot.uavs() * policy.policy.actions(), f32::NAN);
-        Self { policy, slot, step, out: Outcome { memory, headings, q_values, timings: Timings::default() } }
-    }
-
-    /// Who decides.
-    pub fn policy(&self) -> &LoadedPolicy {
-        &self.policy
-    }
-
-    fn turn(&mut self) -> FleetStep<'_> {
-        let Outcome { memory, headings, q_values, .. } = &mut self.out;
-        FleetStep { slot: &self.slot, step: self.step, memory, headings, q_values: Some(q_values) }
-    }
-
-    fn done(self, timings: Timings) -> Outcome {
-        Outcome { timings, ..self.out }
-    }
-
-    /// About what it costs, in units of what a detection does.
-    fn work(&self) -> usize {
-        UAV * self.slot.uavs() + self.slot.users() + self.slot.detection_count()
-    }
-
-    /// Whether a caller may compute it.
-    fn is_small(&self) -> bool {
-        self.policy.policy.is_cheap() && self.work() <= SMALL
-    }
-}
-
-/// Vectors whose contents nobody needs any more.
-#[derive(Debug, Default)]
-pub struct Room {
-    /// For headings.
-    pub headings: Vec<u8>,
-    /// For values.
-    pub q_values: Vec<f32>,
-}
-
-/// What came out.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Outcome {
-    /// The memory after the slot.
-    pub memory: Vec<f32>,
-    /// Heading index of each UAV.
-    pub headings: Vec<u8>,
-    /// Q-values, A per UAV; NaN where the policy has none.
-    pub q_values: Vec<f32>,
-    /// How long it took.
-    pub timings: Timings,
-}
-
-/// How long an answer took.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Timings {
-    /// Waiting for the engine.
-    pub queue: Duration,
-    /// Computing.
-    pub compute: Duration,
-    /// Fleets computed together.
-    pub batch_size: u32,
 }
 
 #[derive(Default)]
@@ -134,30 +57,32 @@ struct Queue {
     waiting: VecDeque<Queued>,
     /// Batches that are being computed.
     running: usize,
-    /// Room of batches that are over.
-    rooms: Vec<Batch>,
+    /// Batches that were computed inline, kept for their buffers.
+    spare_batches: Vec<Batch>,
     closed: bool,
 }
 
+/// State that callers and threads share.
 struct Shared {
     queue: Mutex<Queue>,
-    filled: Condvar,
-    places: Arc<Places>,
-    /// Small fleets computed since the last that had company.
-    lonely: AtomicU32,
+    /// Notified when a thread may have work.
+    queued: Condvar,
+    replies: Arc<ReplySlots>,
+    /// Inline batches of one since the last inline batch of several.
+    singles: AtomicU32,
     config: EngineConfig,
-    meters: Meters,
+    metrics: EngineMetrics,
 }
 
 impl Shared {
     fn lock(&self) -> MutexGuard<'_, Queue> {
-        // Policies run outside the lock; the queue is whole at every step.
+        // Policies run outside the lock, and nothing else panics while holding it.
         self.queue.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Waits for work and puts it into `batch`: fleets of one policy version, the oldest first. False when the engine was
+    /// Waits for work and moves tasks of one policy version into `batch`, the oldest first. Returns false if the engine was
     /// dropped.
-    fn next(&self, batch: &mut Batch) -> bool {
+    fn next_batch(&self, batch: &mut Batch) -> bool {
         let EngineConfig { max_batch, max_batch_delay, .. } = self.config;
         let mut queue = self.lock();
         loop {
@@ -165,158 +90,164 @@ impl Shared {
                 return false;
             }
             let Some(oldest) = queue.waiting.front() else {
-                queue = self.filled.wait(queue).unwrap_or_else(PoisonError::into_inner);
+                queue = self.queued.wait(queue).unwrap_or_else(PoisonError::into_inner);
                 continue;
             };
             let rest = max_batch_delay.saturating_sub(oldest.since.elapsed());
-            let alike = |q: &&Queued| Arc::ptr_eq(&q.task.policy, &oldest.task.policy);
-            if !rest.is_zero() && queue.waiting.iter().filter(alike).count() < max_batch {
-                queue = self.filled.wait_timeout(queue, rest).unwrap_or_else(PoisonError::into_inner).0;
+            let same_policy = |q: &&Queued| Arc::ptr_eq(q.task.policy(), oldest.task.policy());
+            if !rest.is_zero() && queue.waiting.iter().filter(same_policy).count() < max_batch {
+                queue = self.queued.wait_timeout(queue, rest).unwrap_or_else(PoisonError::into_inner).0;
                 continue;
             }
-            self.gather(&mut queue, batch, WORK);
-            // Notices may have been meant for what is left.
+            self.fill(&mut queue, batch, MAX_BATCH_WORK);
+            // This thread may have consumed the notification for a task that is still in the queue.
             if !queue.waiting.is_empty() {
-                self.filled.notify_one();
+                self.queued.notify_one();
             }
             return true;
         }
     }
 
-    /// Takes the oldest and what joins it up to `most` work, each at its first chance; the others keep their order.
-    fn gather(&self, queue: &mut Queue, batch: &mut Batch, most: usize) {
+    /// Moves the oldest task and the tasks of its policy version into `batch`, up to `max_work`. Other tasks keep their order.
+    fn fill(&self, queue: &mut Queue, batch: &mut Batch, max_work: usize) {
         let Some(oldest) = queue.waiting.pop_front() else { return };
         queue.running += 1;
         let mut work = oldest.task.work();
-        let fleets = &mut batch.fleets;
-        fleets.push(oldest);
+        let tasks = &mut batch.tasks;
+        tasks.push(oldest);
         let mut i = 0;
-        while i < queue.waiting.len() && fleets.len() < self.config.max_batch {
+        while i < queue.waiting.len() && tasks.len() < self.config.max_batch {
             let next = &queue.waiting[i].task;
-            if Arc::ptr_eq(&next.policy, &fleets[0].task.policy) && work + next.work() <= most {
+            if Arc::ptr_eq(next.policy(), tasks[0].task.policy()) && work + next.work() <= max_work {
                 work += next.work();
-                fleets.extend(queue.waiting.remove(i));
+                tasks.extend(queue.waiting.remove(i));
             } else {
                 i += 1;
             }
         }
     }
 
-    /// Counts a fleet that leaves without having been computed for.
-    fn unanswered(&self, task: &Task) {
-        self.meters.policy(&task.policy.reference.name).failure.increment(1);
+    /// Counts a task that leaves the queue without being computed.
+    fn count_failure(&self, task: &Task) {
+        self.metrics.policy(&task.policy().reference.name).failure.increment(1);
     }
 
-    /// Lets the caller compute its small fleet at once, if nothing else is to be done; then it calls [`Shared::alone`].
-    fn may_compute(&self) -> bool {
+    /// Reserves one of the concurrent computations for [`Shared::run_inline`], if nothing waits.
+    fn reserve_inline(&self) -> bool {
         let mut queue = self.lock();
-        let may = queue.waiting.is_empty() && queue.running < self.config.threads;
-        queue.running += usize::from(may);
-        may
+        let free = queue.waiting.is_empty() && queue.running < self.config.threads;
+        queue.running += usize::from(free);
+        free
     }
 
-    fn alone(&self, task: Task) -> Result<Outcome, Error> {
-        let outcome = batch::alone(task, &self.meters);
-        self.lonely.fetch_add(1, Ordering::Relaxed);
+    /// Computes one task on this thread. [`Shared::reserve_inline`] has returned true.
+    fn run_inline(&self, task: Task) -> Result<TaskOutput, Error> {
+        let output = batch::run_single(task, &self.metrics);
+        self.singles.fetch_add(1, Ordering::Relaxed);
         self.lock().running -= 1;
-        outcome
+        output
     }
 
-    /// Computes a batch for the caller and others if the oldest fleet is small and not too many compute; whether it did.
-    fn lead(&self) -> bool {
+    /// Computes a batch on this thread, if the oldest task is small and fewer than `threads` computations run. Returns
+    /// whether it did.
+    fn run_batch_inline(&self) -> bool {
         let mut batch = {
             let mut queue = self.lock();
-            let small = queue.waiting.front().is_some_and(|oldest| oldest.task.is_small());
+            let small = queue.waiting.front().is_some_and(|oldest| is_small(&oldest.task));
             if !small || queue.running >= self.config.threads {
                 return false;
             }
-            let mut batch = queue.rooms.pop().unwrap_or_default();
-            self.gather(&mut queue, &mut batch, SMALL);
+            let mut batch = queue.spare_batches.pop().unwrap_or_default();
+            self.fill(&mut queue, &mut batch, MAX_INLINE_WORK);
             batch
         };
-        let size = batch.compute(&self.meters);
+        let size = batch.run(&self.metrics);
         if size > 1 {
-            self.lonely.store(0, Ordering::Relaxed);
+            self.singles.store(0, Ordering::Relaxed);
         } else {
-            self.lonely.fetch_add(1, Ordering::Relaxed);
+            self.singles.fetch_add(1, Ordering::Relaxed);
         }
         let mut queue = self.lock();
         queue.running -= 1;
-        queue.rooms.push(batch);
+        queue.spare_batches.push(batch);
         true
     }
 
-    /// Whether a call should let others that are ready ask before it computes: where some did lately, and now and then.
-    fn expects_company(&self) -> bool {
-        let lonely = self.lonely.load(Ordering::Relaxed);
-        lonely < LONELY || lonely.is_multiple_of(PROBE)
+    /// Whether a small task should give others a chance to join its batch: after a recent batch of several, and in regular
+    /// intervals.
+    fn expects_batch(&self) -> bool {
+        let singles = self.singles.load(Ordering::Relaxed);
+        singles < MAX_SINGLES || singles.is_multiple_of(BATCHING_PROBE_INTERVAL)
     }
 
-    /// Puts a fleet into the queue.
-    fn enqueue(&self, task: Task, deadline: Option<Instant>) -> Result<Expected, Error> {
+    fn enqueue(&self, task: Task, deadline: Option<Instant>) -> Result<Receiver, Error> {
         let mut queue = self.lock();
         let capacity = self.config.queue;
         if queue.waiting.len() >= capacity {
-            // Who gave up makes room.
+            // Remove tasks whose callers stopped waiting.
             queue.waiting.retain(|queued| {
-                let wanted = !queued.promise.is_void();
-                if !wanted {
-                    self.unanswered(&queued.task);
+                let closed = queued.reply.is_closed();
+                if closed {
+                    self.count_failure(&queued.task);
                 }
-                wanted
+                !closed
             });
         }
         if queue.waiting.len() >= capacity {
-            self.unanswered(&task);
+            self.count_failure(&task);
             return Err(Error::Busy(format!("the engine's queue is full ({capacity} fleets)")));
         }
-        let (promise, expected) = self.places.pair();
-        queue.waiting.push_back(Queued { task, since: Instant::now(), deadline, promise });
-        Ok(expected)
+        let (reply, receiver) = self.replies.channel();
+        queue.waiting.push_back(Queued { task, since: Instant::now(), deadline, reply });
+        Ok(receiver)
     }
 }
 
-/// A caller that waits. Dropped, its fleet leaves the queue soon.
-struct Caller<'a> {
-    shared: &'a Shared,
-    answered: bool,
+/// Whether a task may be computed inline.
+fn is_small(task: &Task) -> bool {
+    task.policy().policy.is_cheap() && task.work() <= MAX_INLINE_WORK
 }
 
-impl Drop for Caller<'_> {
+/// Wakes a thread when a caller stops waiting, so that its task leaves the queue soon.
+struct AbandonGuard<'a> {
+    shared: &'a Shared,
+    replied: bool,
+}
+
+impl Drop for AbandonGuard<'_> {
     fn drop(&mut self) {
-        if !self.answered {
-            // Nobody else may come by to see that this one is gone.
-            self.shared.filled.notify_one();
+        if !self.replied {
+            self.shared.queued.notify_one();
         }
     }
 }
 
-/// The engine; dropping it ends its threads after the work they have begun.
+/// The engine. Dropping it stops its threads after their current batches.
 pub struct Engine {
     shared: Arc<Shared>,
 }
 
 impl Engine {
-    /// Starts its threads.
+    /// Starts the engine's threads.
     ///
     /// # Errors
-    /// The system refuses a thread.
+    /// If the system cannot create a thread.
     pub fn start(config: EngineConfig) -> std::io::Result<Self> {
         let shared = Arc::new(Shared {
             queue: Mutex::default(),
-            filled: Condvar::new(),
-            places: Arc::default(),
-            lonely: AtomicU32::new(0),
+            queued: Condvar::new(),
+            replies: Arc::default(),
+            singles: AtomicU32::new(0),
             config,
-            meters: Meters::new(),
+            metrics: EngineMetrics::new(),
         });
         let engine = Self { shared: shared.clone() };
         for i in 0..config.threads {
             let shared = shared.clone();
             let work = move || {
                 let mut batch = Batch::default();
-                while shared.next(&mut batch) {
-                    batch.compute(&shared.meters);
+                while shared.next_batch(&mut batch) {
+                    batch.run(&shared.metrics);
                     shared.lock().running -= 1;
                 }
             };
@@ -325,61 +256,62 @@ impl Engine {
         Ok(engine)
     }
 
-    /// Fleets that wait.
+    /// Number of tasks in the queue.
     pub fn waiting(&self) -> usize {
         self.shared.lock().waiting.len()
     }
 
-    /// Computes one turn.
+    /// Runs the policy of `task`.
     ///
     /// # Errors
-    /// The queue is full, the deadline passed, or the policy panicked.
-    pub async fn run(&self, task: Task, deadline: Option<Instant>) -> Result<Outcome, Error> {
+    /// [`Error::Busy`] if the queue is full, [`Error::Deadline`] if the deadline passes, [`Error::Fault`] if the policy
+    /// panics.
+    pub async fn run(&self, task: Task, deadline: Option<Instant>) -> Result<TaskOutput, Error> {
         let shared = &*self.shared;
         if deadline.is_some_and(|deadline| deadline <= Instant::now()) {
             return Err(Error::Deadline("before the engine's queue"));
         }
-        let small = task.is_small() && shared.config.max_batch_delay.is_zero();
-        let company = small && shared.expects_company();
-        if small && !company && shared.may_compute() {
-            return shared.alone(task);
+        let small = is_small(&task) && shared.config.max_batch_delay.is_zero();
+        let expects_batch = small && shared.expects_batch();
+        if small && !expects_batch && shared.reserve_inline() {
+            return shared.run_inline(task);
         }
-        let mut caller = Caller { shared, answered: false };
-        let mut answer = shared.enqueue(task, deadline)?;
+        let mut guard = AbandonGuard { shared, replied: false };
+        let mut receiver = shared.enqueue(task, deadline)?;
         if small {
-            if company {
-                // Callers that are ready to ask do so before the first of them computes for all.
+            if expects_batch {
+                // Lets other callers that are ready enqueue their tasks before the first of them computes all.
                 tokio::task::yield_now().await;
             }
             loop {
-                if let Some(answer) = answer.look() {
-                    caller.answered = true;
-                    return answer;
+                if let Some(result) = receiver.try_recv() {
+                    guard.replied = true;
+                    return result;
                 }
-                if !shared.lead() {
-                    // A thread will; it is told only now, because until now it was not needed.
+                if !shared.run_batch_inline() {
                     break;
                 }
             }
         }
-        shared.filled.notify_one();
-        let answer = match deadline {
-            None => answer.await,
+        // Only now is a thread needed.
+        shared.queued.notify_one();
+        let result = match deadline {
+            None => receiver.await,
             Some(deadline) => {
                 let late = |_| Err(Error::Deadline("in the engine's queue"));
-                tokio::time::timeout_at(deadline.into(), answer).await.unwrap_or_else(late)
+                tokio::time::timeout_at(deadline.into(), receiver).await.unwrap_or_else(late)
             }
         };
-        caller.answered = !matches!(answer, Err(Error::Deadline(_)));
-        answer
+        guard.replied = !matches!(result, Err(Error::Deadline(_)));
+        result
     }
 }
 
 impl Drop for Engine {
     fn drop(&mut self) {
         self.shared.lock().closed = true;
-        // Not joined: nobody waits for an answer any more, and a policy that hangs must not keep the process.
-        self.shared.filled.notify_all();
+        // Not joined: no caller waits any more, and a policy that hangs must not keep the process alive.
+        self.shared.queued.notify_all();
     }
 }
 

@@ -1,6 +1,6 @@
 //! Where an answer is left for its caller. Used again and again, so that an `Act` in steady state allocates nothing here.
 //!
-//! Two hold a place: the caller ([`Expected`]) and whoever computes ([`Promise`]). Whoever is the second to be done with it
+//! Two hold a slot: the caller ([`Receiver`]) and whoever computes ([`Sender`]). Whoever is the second to be done with it
 //! gives it back; until then nobody else is given it.
 
 use std::future::Future;
@@ -8,160 +8,160 @@ use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll, Waker};
 
-use super::Outcome;
+use super::task::TaskOutput;
 use crate::serving::Error;
 
-/// Most places kept for later.
+/// Most slots kept for later.
 const KEPT: usize = 1024;
 
 #[derive(Default)]
-enum State {
+enum ReplyState {
     /// Nobody looked yet.
     #[default]
-    Open,
+    Pending,
     /// The caller waits.
-    Awaited(Waker),
+    Waiting(Waker),
     /// The answer is there.
-    Kept(Result<Outcome, Error>),
+    Ready(Result<TaskOutput, Error>),
     /// The caller left.
-    Left,
+    Closed,
 }
 
 #[derive(Default)]
-struct Place(Mutex<State>);
+struct ReplySlot(Mutex<ReplyState>);
 
-impl Place {
-    fn lock(&self) -> MutexGuard<'_, State> {
+impl ReplySlot {
+    fn lock(&self) -> MutexGuard<'_, ReplyState> {
         // A state is replaced whole.
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// Places that nobody holds.
+/// ReplySlots that nobody holds.
 #[derive(Default)]
-pub(super) struct Places(Mutex<Vec<Arc<Place>>>);
+pub(super) struct ReplySlots(Mutex<Vec<Arc<ReplySlot>>>);
 
-impl Places {
-    fn lock(&self) -> MutexGuard<'_, Vec<Arc<Place>>> {
+impl ReplySlots {
+    fn lock(&self) -> MutexGuard<'_, Vec<Arc<ReplySlot>>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// A place, from both sides.
-    pub(super) fn pair(self: &Arc<Self>) -> (Promise, Expected) {
-        let place = self.lock().pop().unwrap_or_default();
-        (Promise { place: Some(place.clone()), places: self.clone() }, Expected { place: Some(place), places: self.clone() })
+    /// A slot, from both sides.
+    pub(super) fn channel(self: &Arc<Self>) -> (Sender, Receiver) {
+        let slot = self.lock().pop().unwrap_or_default();
+        (Sender { slot: Some(slot.clone()), slots: self.clone() }, Receiver { slot: Some(slot), slots: self.clone() })
     }
 
-    fn take_back(&self, place: Arc<Place>) {
+    fn take_back(&self, slot: Arc<ReplySlot>) {
         let mut free = self.lock();
         if free.len() < KEPT {
-            free.push(place);
+            free.push(slot);
         }
     }
 }
 
 /// The duty to answer; dropped without an answer it tells of a fault.
-pub(super) struct Promise {
-    place: Option<Arc<Place>>,
-    places: Arc<Places>,
+pub(super) struct Sender {
+    slot: Option<Arc<ReplySlot>>,
+    slots: Arc<ReplySlots>,
 }
 
-impl Promise {
+impl Sender {
     /// Whether nobody waits any more.
-    pub(super) fn is_void(&self) -> bool {
-        self.place.as_ref().is_none_or(|place| matches!(*place.lock(), State::Left))
+    pub(super) fn is_closed(&self) -> bool {
+        self.slot.as_ref().is_none_or(|slot| matches!(*slot.lock(), ReplyState::Closed))
     }
 
     /// Answers; whether somebody was there to hear it.
-    pub(super) fn keep(mut self, answer: Result<Outcome, Error>) -> bool {
+    pub(super) fn send(mut self, answer: Result<TaskOutput, Error>) -> bool {
         self.settle(answer)
     }
 
-    fn settle(&mut self, answer: Result<Outcome, Error>) -> bool {
-        let Some(place) = self.place.take() else { return false };
-        let mut state = place.lock();
+    fn settle(&mut self, answer: Result<TaskOutput, Error>) -> bool {
+        let Some(slot) = self.slot.take() else { return false };
+        let mut state = slot.lock();
         match std::mem::take(&mut *state) {
-            State::Left => {
+            ReplyState::Closed => {
                 drop(state);
-                self.places.take_back(place);
+                self.slots.take_back(slot);
                 return false;
             }
-            State::Awaited(waker) => {
-                *state = State::Kept(answer);
+            ReplyState::Waiting(waker) => {
+                *state = ReplyState::Ready(answer);
                 drop(state);
                 waker.wake();
             }
-            State::Open | State::Kept(_) => *state = State::Kept(answer),
+            ReplyState::Pending | ReplyState::Ready(_) => *state = ReplyState::Ready(answer),
         }
         true
     }
 }
 
-impl Drop for Promise {
+impl Drop for Sender {
     fn drop(&mut self) {
-        if self.place.is_some() {
+        if self.slot.is_some() {
             self.settle(Err(Error::Fault("the engine lost a request".into())));
         }
     }
 }
 
 /// The answer to come; dropped, nobody waits for it.
-pub(super) struct Expected {
-    place: Option<Arc<Place>>,
-    places: Arc<Places>,
+pub(super) struct Receiver {
+    slot: Option<Arc<ReplySlot>>,
+    slots: Arc<ReplySlots>,
 }
 
-impl Expected {
+impl Receiver {
     /// The answer, if it is there.
-    pub(super) fn look(&mut self) -> Option<Result<Outcome, Error>> {
-        let mut state = self.place.as_ref()?.lock();
-        if !matches!(*state, State::Kept(_)) {
+    pub(super) fn try_recv(&mut self) -> Option<Result<TaskOutput, Error>> {
+        let mut state = self.slot.as_ref()?.lock();
+        if !matches!(*state, ReplyState::Ready(_)) {
             return None;
         }
-        let State::Kept(answer) = std::mem::take(&mut *state) else { return None };
+        let ReplyState::Ready(answer) = std::mem::take(&mut *state) else { return None };
         drop(state);
         self.give_back();
         Some(answer)
     }
 
     fn give_back(&mut self) {
-        if let Some(place) = self.place.take() {
-            self.places.take_back(place);
+        if let Some(slot) = self.slot.take() {
+            self.slots.take_back(slot);
         }
     }
 }
 
-impl Future for Expected {
-    type Output = Result<Outcome, Error>;
+impl Future for Receiver {
+    type Output = Result<TaskOutput, Error>;
 
     fn poll(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Self::Output> {
-        if let Some(answer) = self.look() {
+        if let Some(answer) = self.try_recv() {
             return Poll::Ready(answer);
         }
-        let Some(place) = &self.place else { return Poll::Ready(Err(Error::Fault("an answer was taken twice".into()))) };
-        let mut state = place.lock();
-        if let State::Kept(_) = *state {
+        let Some(slot) = &self.slot else { return Poll::Ready(Err(Error::Fault("an answer was taken twice".into()))) };
+        let mut state = slot.lock();
+        if let ReplyState::Ready(_) = *state {
             // It came between the two looks.
             drop(state);
-            return self.look().map_or(Poll::Pending, Poll::Ready);
+            return self.try_recv().map_or(Poll::Pending, Poll::Ready);
         }
-        *state = State::Awaited(context.waker().clone());
+        *state = ReplyState::Waiting(context.waker().clone());
         Poll::Pending
     }
 }
 
-impl Drop for Expected {
+impl Drop for Receiver {
     fn drop(&mut self) {
-        let Some(place) = &self.place else { return };
-        let mut state = place.lock();
-        match std::mem::replace(&mut *state, State::Left) {
-            State::Kept(_) => {
-                *state = State::Open;
+        let Some(slot) = &self.slot else { return };
+        let mut state = slot.lock();
+        match std::mem::replace(&mut *state, ReplyState::Closed) {
+            ReplyState::Ready(_) => {
+                *state = ReplyState::Pending;
                 drop(state);
                 self.give_back();
             }
             // Who computes gives it back.
-            State::Open | State::Awaited(_) | State::Left => {}
+            ReplyState::Pending | ReplyState::Waiting(_) | ReplyState::Closed => {}
         }
     }
 }
@@ -170,42 +170,42 @@ impl Drop for Expected {
 mod tests {
     use super::*;
 
-    fn fault(text: &str) -> Result<Outcome, Error> {
+    fn fault(text: &str) -> Result<TaskOutput, Error> {
         Err(Error::Fault(text.into()))
     }
 
-    fn told(answer: Result<Outcome, Error>) -> String {
+    fn told(answer: Result<TaskOutput, Error>) -> String {
         answer.expect_err("only faults are sent here").to_string()
     }
 
     #[tokio::test]
     async fn a_place_is_given_again_only_when_both_sides_are_done() {
-        let places = Arc::new(Places::default());
-        let free = || places.lock().len();
-        let (promise, mut expected) = places.pair();
-        assert!(expected.look().is_none() && !promise.is_void());
-        promise.keep(fault("1"));
+        let slots = Arc::new(ReplySlots::default());
+        let free = || slots.lock().len();
+        let (sender, mut receiver) = slots.channel();
+        assert!(receiver.try_recv().is_none() && !sender.is_closed());
+        sender.send(fault("1"));
         assert_eq!(free(), 0);
-        assert!(told(expected.await).contains('1'));
+        assert!(told(receiver.await).contains('1'));
         assert_eq!(free(), 1);
         // Who leaves first does not free it.
-        let (promise, expected) = places.pair();
-        drop(expected);
+        let (sender, receiver) = slots.channel();
+        drop(receiver);
         assert_eq!(free(), 0);
-        assert!(promise.is_void());
-        promise.keep(fault("2"));
+        assert!(sender.is_closed());
+        sender.send(fault("2"));
         assert_eq!(free(), 1);
         // Nothing of the answer nobody took is left for the next.
-        let (promise, mut expected) = places.pair();
-        assert!(expected.look().is_none());
-        promise.keep(fault("3"));
-        drop(expected);
+        let (sender, mut receiver) = slots.channel();
+        assert!(receiver.try_recv().is_none());
+        sender.send(fault("3"));
+        drop(receiver);
         assert_eq!(free(), 1);
-        let (promise, mut expected) = places.pair();
-        assert!(expected.look().is_none() && !promise.is_void());
-        let waiting = tokio::spawn(expected);
+        let (sender, mut receiver) = slots.channel();
+        assert!(receiver.try_recv().is_none() && !sender.is_closed());
+        let waiting = tokio::spawn(receiver);
         tokio::task::yield_now().await;
-        drop(promise);
+        drop(sender);
         assert!(told(waiting.await.unwrap()).contains("lost"));
         assert_eq!(free(), 1);
     }

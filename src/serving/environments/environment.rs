@@ -1,71 +1,59 @@
-//! One hosted environment: its copies, its episode and its step. One reset or step is in flight at a time; others wait and
-//! are judged afterwards, so that a retry that overtakes its first attempt gets the first attempt's answer.
+//! One hosted environment. Only one reset or step runs at a time. Others wait and are checked afterwards, so a retry that
+//! arrives before its first attempt has finished returns the result of the first attempt.
 
-use std::sync::{Arc, Mutex as Lock, MutexGuard, PoisonError};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex as SyncMutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use jiff::Timestamp;
 use tokio::sync::{Mutex, OwnedMutexGuard, OwnedSemaphorePermit};
 
-use super::blueprint::{Blueprint, check_seed, episode_seed};
-use super::state::{CopyState, Finished, Sight, State};
+use super::simulation::{EpisodeCursor, Simulation};
+use super::spec::{EnvironmentSpec, check_seed};
+use super::state::EnvironmentState;
 use crate::clock::Clock;
-use crate::env::{BatchEnv, EpisodeMetrics};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::serving::Error;
-use crate::serving::table::{Entry, LastUse};
+use crate::serving::table::{LastUse, TableEntry};
 
-/// Environments with more work per step are stepped away from the threads that serve connections.
-pub(super) const LARGE: usize = 16_384;
+/// Environments with more work per step are stepped on blocking threads, not on those that serve connections.
+pub(super) const MAX_INLINE_WORK: usize = 16_384;
 
-/// What a caller is told of an environment.
+/// Description of an environment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EnvironmentInfo {
     /// Its name.
     pub id: String,
-    /// What it was made of; the seed is the one of the last reset that gave one.
-    pub blueprint: Blueprint,
-    /// Where it is.
-    pub progress: Progress,
+    /// Its specification, with the seed of the last reset that gave one.
+    pub spec: EnvironmentSpec,
+    /// Its current episode, slot and step.
+    pub cursor: EpisodeCursor,
     /// When it was created.
     pub created_at: Timestamp,
     /// Idle time after which it expires.
     pub ttl: Duration,
 }
 
-/// Where an environment is.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Progress {
-    /// The seed of copy 0's episode 0.
-    pub seed: u64,
-    /// Number of the episode.
-    pub episode: u64,
-    /// Slots flown in it.
-    pub slot: usize,
-    /// Slots flown since the last reset.
-    pub step: u64,
-}
-
-/// Which episode a reset is to begin.
+/// A reset request.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Reset {
+pub struct EnvironmentReset {
     /// A new seed.
     pub seed: Option<u64>,
-    /// The number of the episode.
+    /// The number of the episode to begin.
     pub episode: Option<u64>,
-    /// Whether graphs are asked for.
+    /// Whether to return graphs.
     pub graph: bool,
 }
 
-/// A slot to fly.
+/// A step request.
 #[derive(Clone, Debug, Default)]
-pub struct Flight {
+pub struct EnvironmentStep {
     /// Heading indices (B, M).
     pub actions: Vec<Vec<u32>>,
-    /// The step, where the caller counts.
+    /// The step's index, if the caller counts steps.
     pub step: Option<u64>,
-    /// Whether graphs are asked for.
+    /// Whether to return graphs.
     pub graph: bool,
 }
 
@@ -73,232 +61,149 @@ pub struct Flight {
 #[derive(Debug)]
 pub struct Environment {
     id: String,
-    blueprint: Blueprint,
+    spec: EnvironmentSpec,
     created_at: Timestamp,
     clock: Clock,
-    used: LastUse,
-    /// Copy of `World::progress`, readable while a step is in flight.
-    progress: Lock<Progress>,
-    world: Arc<Mutex<World>>,
-    /// Its share of the memory for environments.
-    _share: OwnedSemaphorePermit,
-}
-
-/// What a reset or a step changes.
-#[derive(Debug)]
-pub(super) struct World {
-    ended: bool,
-    env: BatchEnv,
-    progress: Progress,
-    /// Whether it is as it was created.
-    untouched: bool,
-    last: Option<Last>,
-}
-
-/// What the last step answered, besides what the copies still show.
-#[derive(Debug)]
-struct Last {
-    rewards: Vec<f32>,
-    /// The last slot of an episode.
-    finished: Option<Ended>,
-}
-
-/// The end of an episode.
-#[derive(Debug)]
-struct Ended {
-    /// Its number.
-    episode: u64,
-    metrics: Vec<EpisodeMetrics>,
-    /// The copies then, where a new episode has begun since: (B, M, 2), (B, N, 2), (B, N).
-    scene: Option<[Vec<f32>; 3]>,
-}
-
-impl World {
-    /// The copies of `blueprint` at slot 0 of episode 0. Costs time and memory in proportion to their nodes.
-    pub(super) fn new(blueprint: &Blueprint) -> Result<Self, Invalid> {
-        let env = BatchEnv::new(&blueprint.config, blueprint.copies)?;
-        let mut world = Self { ended: false, env, progress: Progress::default(), untouched: true, last: None };
-        world.begin(blueprint.seed, 0);
-        Ok(world)
-    }
-
-    fn seeds(&self, episode: u64) -> impl Iterator<Item = u64> {
-        let seed = self.progress.seed;
-        (0..self.env.copies() as u64).map(move |b| episode_seed(seed + b, episode))
-    }
-
-    fn begin(&mut self, seed: u64, episode: u64) {
-        self.progress = Progress { seed, episode, slot: 0, ..self.progress };
-        let seeds: Vec<u64> = self.seeds(episode).collect();
-        self.env.reset(&seeds);
-    }
-
-    fn reset(&mut self, reset: Reset) {
-        let Progress { seed, episode, slot, .. } = self.progress;
-        match reset {
-            Reset { seed: Some(seed), episode, .. } => self.begin(seed, episode.unwrap_or(0)),
-            Reset { episode: Some(episode), .. } => self.begin(seed, episode),
-            _ if slot > 0 => self.begin(seed, episode.saturating_add(1)),
-            _ => {}
-        }
-        self.progress.step = 0;
-        self.last = None;
-        self.untouched = self.untouched && reset.seed.is_none() && reset.episode.is_none();
-    }
-
-    fn fly(&mut self, headings: &[u8], auto_reset: bool) {
-        let rewards = self.env.step(headings).to_vec();
-        self.untouched = false;
-        self.progress.step += 1;
-        self.progress.slot = self.env.slot();
-        let Progress { seed, episode, .. } = self.progress;
-        let finished = self.env.done().then(|| Ended {
-            episode,
-            metrics: (0..self.env.copies()).map(|b| self.env.metrics(b)).collect(),
-            scene: auto_reset.then(|| [self.env.uav_xy().to_vec(), self.env.user_xy().to_vec(), self.env.aoi().to_vec()]),
-        });
-        if auto_reset && finished.is_some() {
-            self.begin(seed, episode.saturating_add(1));
-        }
-        self.last = Some(Last { rewards, finished });
-    }
-
-    fn state(&self, graph: bool) -> State {
-        let config = self.env.config();
-        let sights = Sight::all(config, self.env.uav_xy(), self.env.user_xy(), self.env.aoi(), graph);
-        let mut copies: Vec<CopyState> = sights
-            .zip(self.seeds(self.progress.episode))
-            .map(|(sight, seed)| CopyState { sight, seed, reward: 0.0, finished: None })
-            .collect();
-        if let Some(last) = &self.last {
-            copies.iter_mut().zip(&last.rewards).for_each(|(copy, &reward)| copy.reward = reward);
-            if let Some(ended) = &last.finished {
-                let seeds = self.seeds(ended.episode);
-                for ((copy, &metrics), seed) in copies.iter_mut().zip(&ended.metrics).zip(seeds) {
-                    copy.finished = Some(Finished { seed, metrics, sight: None });
-                }
-                if let Some([uavs, users, aoi]) = &ended.scene {
-                    let sights = Sight::all(config, uavs, users, aoi, graph);
-                    let finished = copies.iter_mut().filter_map(|copy| copy.finished.as_mut());
-                    finished.zip(sights).for_each(|(finished, sight)| finished.sight = Some(sight));
-                }
-            }
-        }
-        let Progress { episode, slot, step, .. } = self.progress;
-        State { step, episode, slot, copies }
-    }
+    last_use: LastUse,
+    /// Copy of the simulation's cursor, readable during a step.
+    cursor: SyncMutex<EpisodeCursor>,
+    simulation: Arc<Mutex<Simulation>>,
+    /// Set while `simulation` is locked, so that whoever locks it afterwards sees the flag.
+    deleted: AtomicBool,
+    /// The environment's share of the memory for environments.
+    _memory: OwnedSemaphorePermit,
 }
 
 impl Environment {
-    pub(super) fn new(id: String, blueprint: Blueprint, world: World, share: OwnedSemaphorePermit, clock: Clock) -> Self {
+    pub(super) fn new(
+        id: String,
+        spec: EnvironmentSpec,
+        simulation: Simulation,
+        memory: OwnedSemaphorePermit,
+        clock: Clock,
+    ) -> Self {
         let created_at = clock.now();
         Self {
             id,
-            blueprint,
+            spec,
             created_at,
-            used: LastUse::at(clock.monotonic()),
+            last_use: LastUse::at(clock.monotonic()),
             clock,
-            progress: Lock::new(world.progress),
-            world: Arc::new(Mutex::new(world)),
-            _share: share,
+            cursor: SyncMutex::new(simulation.cursor()),
+            simulation: Arc::new(Mutex::new(simulation)),
+            deleted: AtomicBool::new(false),
+            _memory: memory,
         }
     }
 
-    fn progress(&self) -> MutexGuard<'_, Progress> {
-        // Nothing panics while holding it.
-        self.progress.lock().unwrap_or_else(PoisonError::into_inner)
+    fn cursor(&self) -> MutexGuard<'_, EpisodeCursor> {
+        // Nothing panics while holding the lock.
+        self.cursor.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What a caller is told of it.
+    /// Describes the environment.
     pub fn info(&self, ttl: Duration) -> EnvironmentInfo {
-        let progress = *self.progress();
-        let blueprint = Blueprint { seed: progress.seed, ..self.blueprint.clone() };
-        EnvironmentInfo { id: self.id.clone(), blueprint, progress, created_at: self.created_at, ttl }
+        let cursor = *self.cursor();
+        let spec = EnvironmentSpec { seed: cursor.seed, ..self.spec.clone() };
+        EnvironmentInfo { id: self.id.clone(), spec, cursor, created_at: self.created_at, ttl }
     }
 
-    /// What creating it with its name a second time does.
-    pub(super) async fn recreate(&self, blueprint: &Blueprint) -> Result<(), Error> {
-        let world = self.world.lock().await;
-        let why = match &*world {
-            world if world.ended => "and is being deleted",
-            _ if self.blueprint != *blueprint => "and was created differently",
-            world if !world.untouched => "and has flown or been reset",
-            _ => {
-                self.used.touch(self.clock.monotonic());
-                return Ok(());
-            }
+    /// Handles a second creation under the same name: a retry if the environment was created from `spec` and is unused.
+    ///
+    /// # Errors
+    /// [`Error::Exists`] otherwise.
+    pub(super) async fn recreate(&self, spec: &EnvironmentSpec) -> Result<(), Error> {
+        let simulation = self.simulation.lock().await;
+        let reason = if self.deleted.load(Ordering::Relaxed) {
+            "and is being deleted"
+        } else if self.spec != *spec {
+            "with another configuration"
+        } else if !simulation.is_untouched() {
+            "and has been stepped or reset"
+        } else {
+            self.last_use.touch(self.clock.monotonic());
+            return Ok(());
         };
-        Err(Error::Exists(format!("environment {:?} exists {why}; delete it, or choose another name", self.id)))
+        Err(Error::Exists(format!("environment {:?} exists {reason}; delete it, or choose another name", self.id)))
     }
 
-    pub(super) async fn end(&self) {
-        self.world.lock().await.ended = true;
+    /// Rejects all later requests. Waits for the step in flight.
+    pub(super) async fn delete(&self) {
+        let _simulation = self.simulation.lock().await;
+        self.deleted.store(true, Ordering::Relaxed);
     }
 
     /// Begins an episode.
     ///
     /// # Errors
-    /// A seed that is out of range, graphs that are too large, or it has ended.
-    pub async fn reset(self: &Arc<Self>, reset: Reset) -> Result<State, Error> {
+    /// [`Error::Invalid`] if the seed is out of range or graphs would be too large, [`Error::Unknown`] if the environment
+    /// has been deleted.
+    pub async fn reset(self: &Arc<Self>, reset: EnvironmentReset) -> Result<EnvironmentState, Error> {
         reset.seed.map_or(Ok(()), check_seed)?;
         self.check_graph(reset.graph)?;
-        let mut world = self.enter().await?;
-        self.work(move |environment| {
-            world.reset(reset);
-            environment.leave(&world, reset.graph)
+        let mut simulation = self.lock_simulation().await?;
+        self.compute(move |environment| {
+            simulation.reset(reset.seed, reset.episode);
+            environment.finish(&simulation, reset.graph)
         })
         .await
     }
 
-    /// Flies one slot. The last step again gets the same answer, whatever its actions: it has been flown.
+    /// Advances every copy by one slot. Repeating the last step returns the same result without stepping, whatever the
+    /// actions.
     ///
     /// # Errors
-    /// Actions that do not fit, a step that is neither the last nor the next, an episode that is over, graphs that are too
-    /// large, or it has ended.
-    pub async fn step(self: &Arc<Self>, flight: Flight) -> Result<State, Error> {
-        let headings = self.blueprint.headings(&flight.actions)?;
-        self.check_graph(flight.graph)?;
-        let mut world = self.enter().await?;
-        let next = world.progress.step;
-        let step = flight.step.unwrap_or(next);
-        let repeated = world.last.is_some() && step.checked_add(1) == Some(next);
+    /// [`Error::Invalid`] if the actions do not fit or graphs would be too large, `wrong_step` for a step that is neither
+    /// the last nor the next, `episode_over` after the episode's last slot, [`Error::Unknown`] if the environment has been
+    /// deleted.
+    pub async fn step(self: &Arc<Self>, request: EnvironmentStep) -> Result<EnvironmentState, Error> {
+        let headings = self.spec.headings(&request.actions)?;
+        self.check_graph(request.graph)?;
+        let mut simulation = self.lock_simulation().await?;
+        let next = simulation.cursor().step;
+        let step = request.step.unwrap_or(next);
+        let repeated = simulation.is_last_step(step);
         if !repeated && step != next {
             return Err(wrong_step(&self.id, next, step));
         }
-        if !repeated && world.env.done() {
-            let slots = self.blueprint.config.slots;
-            let message = format!("the episode of environment {:?} is over after {slots} slots; Reset begins another", self.id);
+        if !repeated && simulation.is_done() {
+            let slots = self.spec.config.slots;
+            let message = format!("the episode of environment {:?} ended after {slots} slots; reset the environment", self.id);
             return Err(Error::precondition(ErrorCode::EpisodeOver, message));
         }
-        self.work(move |environment| {
+        self.compute(move |environment| {
             if !repeated {
-                world.fly(&headings, environment.blueprint.auto_reset);
+                simulation.step(&headings, environment.spec.auto_reset);
             }
-            environment.leave(&world, flight.graph)
+            environment.finish(&simulation, request.graph)
         })
         .await
     }
 
-    fn check_graph(&self, wanted: bool) -> Result<(), Invalid> {
-        if wanted { self.blueprint.check_graph() } else { Ok(()) }
+    fn check_graph(&self, requested: bool) -> Result<(), Invalid> {
+        if requested { self.spec.check_graph() } else { Ok(()) }
     }
 
-    /// Waits for what is in flight.
-    async fn enter(&self) -> Result<OwnedMutexGuard<World>, Error> {
-        let world = self.world.clone().lock_owned().await;
-        if world.ended { Err(Error::unknown(Self::WHAT, &self.id)) } else { Ok(world) }
+    /// Waits for the reset or step in flight.
+    async fn lock_simulation(&self) -> Result<OwnedMutexGuard<Simulation>, Error> {
+        let simulation = self.simulation.clone().lock_owned().await;
+        if self.deleted.load(Ordering::Relaxed) { Err(Error::unknown(Self::KIND, &self.id)) } else { Ok(simulation) }
     }
 
-    /// Shows what is the case now.
-    fn leave(&self, world: &World, graph: bool) -> State {
-        *self.progress() = world.progress;
-        self.used.touch(self.clock.monotonic());
-        world.state(graph)
+    /// Publishes the cursor after a reset or step, and returns the state.
+    fn finish(&self, simulation: &Simulation, graph: bool) -> EnvironmentState {
+        *self.cursor() = simulation.cursor();
+        self.last_use.touch(self.clock.monotonic());
+        simulation.state(graph)
     }
 
-    /// Does `work` where it blocks nobody. Once begun it comes to its end, whether or not the caller waits.
-    async fn work(self: &Arc<Self>, work: impl FnOnce(&Self) -> State + Send + 'static) -> Result<State, Error> {
-        if self.blueprint.work() <= LARGE {
+    /// Runs `work` on this thread if it is short, on a blocking thread otherwise. Once begun, it completes even if the
+    /// caller stops waiting.
+    async fn compute(
+        self: &Arc<Self>,
+        work: impl FnOnce(&Self) -> EnvironmentState + Send + 'static,
+    ) -> Result<EnvironmentState, Error> {
+        if self.spec.work() <= MAX_INLINE_WORK {
             return Ok(work(self));
         }
         let environment = self.clone();
@@ -307,23 +212,23 @@ impl Environment {
     }
 }
 
-impl Entry for Environment {
-    const WHAT: &'static str = "environment";
+impl TableEntry for Environment {
+    const KIND: &'static str = "environment";
     const EXPIRED: ErrorCode = ErrorCode::EnvironmentExpired;
 
     fn id(&self) -> &str {
         &self.id
     }
 
-    fn used(&self) -> &LastUse {
-        &self.used
+    fn last_use(&self) -> &LastUse {
+        &self.last_use
     }
 }
 
 fn wrong_step(id: &str, next: u64, step: u64) -> Error {
     let message = match next {
-        0 => format!("step {step} does not follow: environment {id:?} has not flown since its reset; send step 0"),
-        _ => format!("step {step} does not follow in environment {id:?}; send {next}, or {} to repeat the last", next - 1),
+        0 => format!("step {step} is out of order: environment {id:?} has not been stepped since its reset; send step 0"),
+        _ => format!("step {step} is out of order in environment {id:?}; send {next}, or {} to repeat the last step", next - 1),
     };
     Error::precondition(ErrorCode::WrongStep, message)
 }

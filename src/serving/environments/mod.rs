@@ -1,32 +1,34 @@
-//! Environments that learners elsewhere fly. This file owns how they begin and end and how much memory they take together;
-//! `environment` what one may do, and the table which there are.
+//! Environments that the server hosts for callers that train elsewhere. This file owns their creation, their deletion and the
+//! memory that they may take together; `environment` owns the requests to one of them.
 
-mod blueprint;
 mod environment;
+mod simulation;
+mod spec;
 mod state;
 
-pub use blueprint::Blueprint;
-pub use environment::{Environment, EnvironmentInfo, Flight, Progress, Reset};
-pub use state::{CopyState, Finished, Sight, State};
+pub use environment::{Environment, EnvironmentInfo, EnvironmentReset, EnvironmentStep};
+pub use simulation::EpisodeCursor;
+pub use spec::EnvironmentSpec;
+pub use state::{CopyObservation, CopyState, EnvironmentState, FinishedEpisode};
 
 use std::sync::Arc;
 
 use tokio::sync::Semaphore;
 
-use super::table::{Found, Table, fresh_name};
+use super::table::{Lookup, Table, generate_id};
 use super::{Error, Limits};
 use crate::clock::Clock;
-use environment::World;
+use simulation::Simulation;
 
-/// Bytes that are accounted for together.
+/// Unit of memory accounting, in bytes.
 const PAGE: usize = 1024;
 
 /// Limits of environments.
 #[derive(Clone, Copy, Debug)]
 pub struct EnvironmentsConfig {
-    /// How many, and for how long.
+    /// Their number and time to live.
     pub limits: Limits,
-    /// Bytes that all may take together.
+    /// Bytes that all environments may take together.
     pub memory: usize,
 }
 
@@ -34,85 +36,85 @@ pub struct EnvironmentsConfig {
 #[derive(Debug)]
 pub struct Environments {
     table: Table<Environment>,
-    /// Pages that are free.
+    /// One permit per free page.
     pages: Arc<Semaphore>,
     memory: usize,
 }
 
 impl Environments {
-    /// No environments yet.
+    /// An empty set of environments.
     pub fn new(config: EnvironmentsConfig, clock: Clock) -> Self {
         let pages = (config.memory / PAGE).min(Semaphore::MAX_PERMITS);
         Self { table: Table::new(config.limits, clock), pages: Arc::new(Semaphore::new(pages)), memory: config.memory }
     }
 
-    /// Which there are.
+    /// The environments by name.
     pub fn table(&self) -> &Table<Environment> {
         &self.table
     }
 
-    /// Creates an environment called `id`, or by a name of its own. With the name of one that was created alike and has not
-    /// been used it is a retry.
+    /// Creates an environment named `id`, or with a generated name. If an unused environment of that name was created from
+    /// the same `spec`, the call is a retry and returns that environment.
     ///
     /// # Errors
-    /// The name is taken, or there are too many or too large environments.
-    pub async fn create(&self, id: Option<String>, blueprint: Blueprint) -> Result<EnvironmentInfo, Error> {
-        let id = id.unwrap_or_else(fresh_name);
-        // A retry takes no memory, and is told from a name that is taken, even where there is none left.
+    /// [`Error::Exists`] if the name is taken, [`Error::Busy`] if the number or the memory of environments is exhausted.
+    pub async fn create(&self, id: Option<String>, spec: EnvironmentSpec) -> Result<EnvironmentInfo, Error> {
+        let id = id.unwrap_or_else(generate_id);
+        // First of all, so that a retry and a name that is taken are recognised even when no memory is left.
         let environment = match self.table.get(&id) {
             Ok(existing) => {
-                existing.recreate(&blueprint).await?;
+                existing.recreate(&spec).await?;
                 existing
             }
-            Err(_) => self.build(id, blueprint).await?,
+            Err(_) => self.build(id, spec).await?,
         };
         Ok(environment.info(self.table.ttl()))
     }
 
-    async fn build(&self, id: String, blueprint: Blueprint) -> Result<Arc<Environment>, Error> {
-        let pages = u32::try_from(blueprint.bytes().div_ceil(PAGE)).unwrap_or(u32::MAX);
-        let share = || self.pages.clone().try_acquire_many_owned(pages);
-        let share = share().or_else(|_| {
-            // Those that nobody uses make room.
+    async fn build(&self, id: String, spec: EnvironmentSpec) -> Result<Arc<Environment>, Error> {
+        let pages = u32::try_from(spec.bytes().div_ceil(PAGE)).unwrap_or(u32::MAX);
+        let acquire = || self.pages.clone().try_acquire_many_owned(pages);
+        let memory = acquire().or_else(|_| {
+            // Removing idle environments frees memory.
             self.table.sweep();
-            share()
+            acquire()
         });
-        let share = share.map_err(|_| {
-            let (size, memory) = (blueprint.bytes() >> 10, self.memory >> 10);
-            Error::Busy(format!("no room for an environment of {size} KiB in the {memory} KiB that this server has for all"))
+        let memory = memory.map_err(|_| {
+            let (size, memory) = (spec.bytes() >> 10, self.memory >> 10);
+            Error::Busy(format!("no memory for an environment of {size} KiB; all environments together may take {memory} KiB"))
         })?;
-        let wanted = blueprint.clone();
-        let world = if blueprint.work() <= environment::LARGE {
-            World::new(&wanted)?
+        let requested = spec.clone();
+        let simulation = if spec.work() <= environment::MAX_INLINE_WORK {
+            Simulation::new(&requested)?
         } else {
-            let built = tokio::task::spawn_blocking(move || World::new(&wanted));
+            let built = tokio::task::spawn_blocking(move || Simulation::new(&requested));
             built.await.map_err(|e| Error::Fault(e.to_string()))??
         };
         let clock = self.table.clock().clone();
-        let make = || Environment::new(id.clone(), blueprint.clone(), world, share, clock);
+        let make = || Environment::new(id.clone(), spec.clone(), simulation, memory, clock);
         match self.table.find_or_add(&id, make)? {
-            Found::New(environment) => Ok(environment),
-            // Two asked for the same name at once.
-            Found::Existing(environment) => environment.recreate(&blueprint).await.map(|()| environment),
+            Lookup::Added(environment) => Ok(environment),
+            // A concurrent call created it.
+            Lookup::Found(environment) => environment.recreate(&spec).await.map(|()| environment),
         }
     }
 
-    /// What a caller is told of environment `id`; asking keeps it alive.
+    /// Describes environment `id`, and counts as a use of it.
     ///
     /// # Errors
-    /// It expired, or there is none.
+    /// `environment_expired`, or [`Error::Unknown`].
     pub fn describe(&self, id: &str) -> Result<EnvironmentInfo, Error> {
         Ok(self.table.get(id)?.info(self.table.ttl()))
     }
 
-    /// Ends environment `id` after the step in flight, if there is one.
+    /// Deletes environment `id`. Waits for the step in flight.
     ///
     /// # Errors
-    /// It expired, or there is none.
+    /// `environment_expired`, or [`Error::Unknown`].
     pub async fn delete(&self, id: &str) -> Result<EnvironmentInfo, Error> {
         let environment = self.table.get(id)?;
         self.table.remove(&environment);
-        environment.end().await;
+        environment.delete().await;
         Ok(environment.info(self.table.ttl()))
     }
 }

@@ -1,61 +1,58 @@
-//! What an environment answers: what each copy shows, and what its last slot brought.
+//! What a reset or a step of an environment returns, per copy.
 
-use crate::env::{EnvConfig, EpisodeMetrics, Point, points};
+use crate::env::{EnvConfig, EpisodeMetrics, points};
 use crate::policy::Slot;
+use crate::serving::Scene;
 
 /// All copies after a reset or a step.
 #[derive(Clone, Debug, PartialEq)]
-pub struct State {
-    /// Slots flown since the last reset.
+pub struct EnvironmentState {
+    /// Steps since the last reset.
     pub step: u64,
-    /// Number of the episode that is shown.
+    /// Number of the current episode.
     pub episode: u64,
-    /// Slots flown in it.
+    /// Slots of the current episode that have passed.
     pub slot: usize,
-    /// B of them.
+    /// B copies.
     pub copies: Vec<CopyState>,
 }
 
 /// One copy.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CopyState {
-    /// What is seen.
-    pub sight: Sight,
-    /// Seed of the episode that is seen.
+    /// The current observation.
+    pub observation: CopyObservation,
+    /// Seed of the current episode.
     pub seed: u64,
-    /// Of the slot that was flown; 0 after a reset.
+    /// Reward of the last step; 0 after a reset.
     pub reward: f32,
-    /// The episode that the slot ended.
-    pub finished: Option<Finished>,
+    /// The episode that the last step ended.
+    pub finished: Option<FinishedEpisode>,
 }
 
-/// An episode that is over.
+/// An episode that has ended.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Finished {
+pub struct FinishedEpisode {
     /// Its seed.
     pub seed: u64,
-    /// Its figures.
+    /// Its metrics.
     pub metrics: EpisodeMetrics,
-    /// What was seen at its end, where an automatic reset took its place.
-    pub sight: Option<Sight>,
+    /// Its last observation, if an automatic reset has begun the next episode.
+    pub observation: Option<CopyObservation>,
 }
 
-/// A scene, and who detects whom in it where that was asked for.
+/// The scene of one copy and, if requested, the graph of detections in it.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Sight {
-    /// Position of each UAV.
-    pub uavs: Vec<Point>,
-    /// Position of each user.
-    pub users: Vec<Point>,
-    /// AoI of each user in slots.
-    pub aoi: Vec<f32>,
+pub struct CopyObservation {
+    /// Positions and AoI.
+    pub scene: Scene,
     /// Detections within the environment's detection range.
     pub graph: Option<Slot>,
 }
 
-impl Sight {
-    /// What is seen in each copy, from (B, M, 2) and (B, N, 2) positions and (B, N) AoI.
-    pub(super) fn all(
+impl CopyObservation {
+    /// The observation of each copy, from (B, M, 2) and (B, N, 2) positions and (B, N) AoI.
+    pub(super) fn of_copies(
         config: &EnvConfig,
         uav_xy: &[f32],
         user_xy: &[f32],
@@ -63,17 +60,17 @@ impl Sight {
         graph: bool,
     ) -> impl Iterator<Item = Self> {
         let (m, n, range) = (config.uavs, config.users, config.detection_range);
-        let fleets = uav_xy.chunks_exact(2 * m).zip(user_xy.chunks_exact(2 * n)).zip(aoi.chunks_exact(n));
-        fleets.map(move |((uavs, users), aoi)| {
-            let (uavs, users): (Vec<Point>, Vec<Point>) = (points(uavs).collect(), points(users).collect());
-            let graph = graph.then(|| Slot::from_scene(&uavs, &users, aoi, range));
-            Self { uavs, users, aoi: aoi.to_vec(), graph }
+        let copies = uav_xy.chunks_exact(2 * m).zip(user_xy.chunks_exact(2 * n)).zip(aoi.chunks_exact(n));
+        copies.map(move |((uavs, users), aoi)| {
+            let scene = Scene { uavs: points(uavs).collect(), users: points(users).collect(), aoi: aoi.to_vec() };
+            let graph = graph.then(|| Slot::from_scene(&scene.uavs, &scene.users, &scene.aoi, range));
+            Self { scene, graph }
         })
     }
 
-    /// Nodes and detections: what it costs to write it down.
+    /// Nodes plus detections: a measure of the cost of encoding it.
     pub fn size(&self) -> usize {
-        let nodes = self.uavs.len() + self.users.len();
+        let nodes = self.scene.uavs.len() + self.scene.users.len();
         nodes + self.graph.as_ref().map_or(0, |graph| (0..nodes).map(|i| graph.detections(i).len()).sum())
     }
 }

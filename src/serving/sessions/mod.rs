@@ -1,43 +1,15 @@
-//! Sessions: fleets whose memory the server keeps. This file owns how they begin and end; `session` what one may do, and
-//! the table which there are.
+//! Sessions: fleets whose memory the server keeps. This file owns their beginning and end; `session` owns the steps of one of
+//! them.
 
+mod seed;
 mod session;
 
-pub use session::{Answered, Session, Turn};
+pub use session::{PendingStep, Session, SessionInfo, SessionOptions, StepStart};
 
 use std::sync::Arc;
-use std::time::Duration;
 
-use jiff::Timestamp;
-
-use super::table::{Found, Table, fresh_name};
-use super::{Error, LoadedPolicy, PolicyRef};
-
-/// What a caller is told of a session.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct SessionInfo {
-    /// Its name.
-    pub id: String,
-    /// The policy version it is pinned to.
-    pub policy: PolicyRef,
-    /// Slots answered in the current run.
-    pub steps: u64,
-    /// When it was opened.
-    pub opened_at: Timestamp,
-    /// Idle time after which it expires.
-    pub ttl: Duration,
-}
-
-/// How to open a session.
-#[derive(Clone, Debug, Default)]
-pub struct Opened {
-    /// Chosen by the server when absent.
-    pub id: Option<String>,
-    /// The run it begins with.
-    pub run_id: Option<String>,
-    /// Fixes what is random about the policy; when absent, session and run do.
-    pub seed: Option<u64>,
-}
+use super::table::{Lookup, Table, generate_id};
+use super::{Error, LoadedPolicy};
 
 /// All sessions of this server.
 pub type Sessions = Table<Session>;
@@ -45,55 +17,56 @@ pub type Sessions = Table<Session>;
 impl Sessions {
     /// Opens a session pinned to `policy`.
     ///
-    /// With the name of an open session it is a retry if that session has not flown and was opened alike; with a new
-    /// `run_id` it starts that session over, on the version it is pinned to.
+    /// If a session of that name is open, the call is a retry, provided that the session was opened with the same options and
+    /// has no step. With a new `run_id` the call restarts that session, on the version that it is pinned to.
     ///
     /// # Errors
-    /// The name is taken, the run is fenced, or there are too many sessions.
-    pub async fn open(&self, policy: Arc<LoadedPolicy>, how: Opened) -> Result<SessionInfo, Error> {
-        let id = how.id.clone().unwrap_or_else(fresh_name);
-        let make = || Session::new(id.clone(), policy.clone(), &how, self.clock().clone());
+    /// [`Error::Exists`] if the name is taken, `run_fenced` if `run_id` names a former run, [`Error::Busy`] if the number of
+    /// sessions is exhausted.
+    pub async fn open(&self, policy: Arc<LoadedPolicy>, options: SessionOptions) -> Result<SessionInfo, Error> {
+        let id = options.id.clone().unwrap_or_else(generate_id);
+        let make = || Session::new(id.clone(), policy.clone(), &options, self.clock().clone());
         let session = match self.find_or_add(&id, make)? {
-            Found::New(session) => session,
-            Found::Existing(session) => {
-                session.reopen(&policy, &how).await?;
+            Lookup::Added(session) => session,
+            Lookup::Found(session) => {
+                session.reopen(&policy, &options).await?;
                 session
             }
         };
         Ok(session.info(self.ttl()))
     }
 
-    /// Begins session `id` pinned to `policy`, whether or not there is one of that name. Slots of the former one that are in
-    /// flight are answered.
+    /// Begins session `id` pinned to `policy`, in place of the session of that name, if any. Steps of that session that are in
+    /// flight complete.
     ///
     /// # Errors
-    /// There are too many sessions.
+    /// [`Error::Busy`] if the number of sessions is exhausted.
     pub fn begin(&self, id: &str, policy: Arc<LoadedPolicy>, seed: Option<u64>) -> Result<Arc<Session>, Error> {
-        let how = Opened { seed, ..Opened::default() };
-        self.replace(id, || Session::new(id.to_owned(), policy, &how, self.clock().clone()))
+        let options = SessionOptions { seed, ..SessionOptions::default() };
+        self.replace(id, || Session::new(id.to_owned(), policy, &options, self.clock().clone()))
     }
 
-    /// Forgets a session that [`Sessions::begin`] began, unless another one was begun since.
+    /// Removes a session that [`Sessions::begin`] began, unless another session has taken its name.
     pub fn discard(&self, session: &Arc<Session>) {
         self.remove(session);
     }
 
-    /// What a caller is told of session `id`; asking keeps it alive.
+    /// Describes session `id`, and counts as a use of it.
     ///
     /// # Errors
-    /// It expired, or there is none.
+    /// `session_expired`, or [`Error::Unknown`].
     pub fn describe(&self, id: &str) -> Result<SessionInfo, Error> {
         Ok(self.get(id)?.info(self.ttl()))
     }
 
-    /// Ends session `id` after the slot in flight, if there is one.
+    /// Closes session `id`. Waits for the step in flight.
     ///
     /// # Errors
-    /// It expired, or there is none.
+    /// `session_expired`, or [`Error::Unknown`].
     pub async fn close(&self, id: &str) -> Result<SessionInfo, Error> {
         let session = self.get(id)?;
         self.remove(&session);
-        session.end().await;
+        session.close().await;
         Ok(session.info(self.ttl()))
     }
 }

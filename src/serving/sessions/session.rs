@@ -1,8 +1,7 @@
-//! One session: a fleet's memory, its step and its run. One slot is in flight at a time; others wait for it and are
-//! judged afterwards, so that a retry that overtakes its first attempt gets the first attempt's answer.
+//! One session: a fleet's memory, its step and its run. Only one step runs at a time. Others wait and are checked afterwards,
+//! so a retry that arrives before its first attempt has finished returns the result of the first attempt.
 
 use std::collections::VecDeque;
-use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
@@ -10,14 +9,40 @@ use std::time::Duration;
 use jiff::Timestamp;
 use tokio::sync::{Mutex, MutexGuard};
 
-use super::{Opened, SessionInfo};
+use super::seed::{run_hash, session_seed};
 use crate::clock::Clock;
 use crate::error_code::ErrorCode;
-use crate::serving::table::{Entry, LastUse};
-use crate::serving::{Error, Fleet, LoadedPolicy, Outcome, Room, Timings};
+use crate::serving::table::{LastUse, TableEntry};
+use crate::serving::{Decision, Error, Fleet, LoadedPolicy, OutputBuffers, PolicyRef, TaskOutput};
 
-/// Former runs that a session remembers, to refuse them.
-const FORMER_RUNS: usize = 64;
+/// Most former runs that a session remembers in order to reject them.
+const MAX_FORMER_RUNS: usize = 64;
+
+/// Description of a session.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SessionInfo {
+    /// Its name.
+    pub id: String,
+    /// The policy version that it is pinned to.
+    pub policy: PolicyRef,
+    /// Steps of the current run.
+    pub steps: u64,
+    /// When it was opened.
+    pub opened_at: Timestamp,
+    /// Idle time after which it expires.
+    pub ttl: Duration,
+}
+
+/// Options of opening a session.
+#[derive(Clone, Debug, Default)]
+pub struct SessionOptions {
+    /// The session's name; generated if absent.
+    pub id: Option<String>,
+    /// The first run.
+    pub run_id: Option<String>,
+    /// Seed of the policy's random choices; derived from session and run if absent.
+    pub seed: Option<u64>,
+}
 
 /// A fleet whose memory the server keeps, pinned to one policy version.
 #[derive(Debug)]
@@ -26,117 +51,111 @@ pub struct Session {
     policy: Arc<LoadedPolicy>,
     opened_at: Timestamp,
     clock: Clock,
-    used: LastUse,
-    /// Copy of `State::steps`, readable while a slot is in flight.
+    last_use: LastUse,
+    /// Copy of `SessionState::steps`, readable during a step.
     steps: AtomicU64,
-    /// Copy of `State::finished`.
-    over: AtomicBool,
-    state: Mutex<State>,
+    /// Copy of `SessionState::ended`.
+    ended: AtomicBool,
+    state: Mutex<SessionState>,
 }
 
 #[derive(Debug)]
-struct State {
-    ended: bool,
+struct SessionState {
+    /// All requests are rejected.
+    closed: bool,
     /// Only the last step may be repeated.
-    finished: bool,
+    ended: bool,
     run_id: Option<String>,
     /// Hashes of former runs, newest last.
-    former: VecDeque<u64>,
+    former_runs: VecDeque<u64>,
     seed: Option<u64>,
-    /// Slots answered.
+    /// Steps of the current run.
     steps: u64,
-    /// Fixed by the first slot.
+    /// The ids of the run's first step.
     fleet: Option<Fleet>,
     memory: Vec<f32>,
-    last: Option<Answered>,
-    /// Room of slots before the last.
-    used_memory: Vec<f32>,
-    used: Room,
+    last: Option<Decision>,
+    /// Buffers of earlier steps, for reuse.
+    spare_memory: Vec<f32>,
+    spare_buffers: OutputBuffers,
 }
 
-/// What a slot was answered with; headings and values in canonical order of UAVs.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Answered {
-    /// The step.
-    pub step: u64,
-    /// Heading index of each UAV.
-    pub headings: Vec<u8>,
-    /// A values per UAV; NaN where the policy has none.
-    pub q_values: Vec<f32>,
-    /// How long it took.
-    pub timings: Timings,
-}
-
-/// What a request to a session turned out to be.
+/// How [`Session::begin_step`] classifies a request.
 #[derive(Debug)]
-pub enum Turn<'a> {
-    /// The last step again: its answer.
-    Repeat(Answered),
-    /// The next step: compute it, then [`NextTurn::commit`]. Dropped instead, the session stays as it was.
-    Next(NextTurn<'a>),
+pub enum StepStart<'a> {
+    /// The request repeats the last step, which had this decision.
+    Repeated(Decision),
+    /// The request is the next step.
+    Next(PendingStep<'a>),
 }
 
-/// The right to advance a session by one slot.
+/// The next step of a session, which is locked meanwhile. [`PendingStep::commit`] completes the step; dropping it leaves the
+/// session unchanged.
 #[derive(Debug)]
-pub struct NextTurn<'a> {
+pub struct PendingStep<'a> {
     session: &'a Session,
-    state: MutexGuard<'a, State>,
-    /// A run that starts the session over.
+    state: MutexGuard<'a, SessionState>,
+    /// The run that this step begins.
     new_run: Option<String>,
+    /// The ids, if this is the first step of a run.
     fleet: Option<Fleet>,
-    /// The step to answer.
+    /// The step's index.
     pub step: u64,
-    /// A copy of the memory before it.
+    /// A copy of the memory before the step.
     pub memory: Vec<f32>,
-    /// Room for the answer.
-    pub room: Room,
+    /// Buffers for the output.
+    pub buffers: OutputBuffers,
 }
 
 impl Session {
-    pub(super) fn new(id: String, policy: Arc<LoadedPolicy>, how: &Opened, clock: Clock) -> Self {
+    pub(super) fn new(id: String, policy: Arc<LoadedPolicy>, options: &SessionOptions, clock: Clock) -> Self {
         let opened_at = clock.now();
-        let state = State {
+        let state = SessionState {
+            closed: false,
             ended: false,
-            finished: false,
-            run_id: how.run_id.clone(),
-            former: VecDeque::new(),
-            seed: how.seed,
+            run_id: options.run_id.clone(),
+            former_runs: VecDeque::new(),
+            seed: options.seed,
             steps: 0,
             fleet: None,
             memory: Vec::new(),
             last: None,
-            used_memory: Vec::new(),
-            used: Room::default(),
+            spare_memory: Vec::new(),
+            spare_buffers: OutputBuffers::default(),
         };
-        let used = LastUse::at(clock.monotonic());
-        let (steps, over) = (AtomicU64::new(0), AtomicBool::new(false));
-        Self { id, policy, opened_at, clock, used, steps, over, state: Mutex::new(state) }
+        let last_use = LastUse::at(clock.monotonic());
+        let (steps, ended) = (AtomicU64::new(0), AtomicBool::new(false));
+        Self { id, policy, opened_at, clock, last_use, steps, ended, state: Mutex::new(state) }
     }
 
-    /// The policy version it is pinned to.
+    /// The policy version that the session is pinned to.
     pub fn policy(&self) -> &Arc<LoadedPolicy> {
         &self.policy
     }
 
-    /// Waits for the slot in flight, then judges a request for `step` of `run_id` by `fleet`.
+    /// Waits for the step in flight, then checks a request for `step` of `run_id` by `fleet`.
     ///
-    /// A repeated step gets the last answer whatever was observed: it has been flown.
+    /// A repetition of the last step returns the last decision, whatever the request observes.
     ///
     /// # Errors
-    /// A step that is neither the last nor the next, a former run, other ids than in the run's first slot, or the session
-    /// has ended.
-    pub async fn turn<'a>(&'a self, fleet: &Fleet, step: Option<u64>, run_id: Option<&str>) -> Result<Turn<'a>, Error> {
+    /// `wrong_step` if the step is neither the last nor the next, `run_fenced` if `run_id` names a former run,
+    /// [`Error::Invalid`] if the ids differ from those of the run's first step, [`Error::Unknown`] if the session is closed.
+    pub async fn begin_step<'a>(
+        &'a self,
+        fleet: &Fleet,
+        step: Option<u64>,
+        run_id: Option<&str>,
+    ) -> Result<StepStart<'a>, Error> {
         let mut state = self.state.lock().await;
-        let missed = state.last.as_ref().filter(|last| state.finished && step == Some(last.step));
-        if let (Some(last), Some(known)) = (missed, &state.fleet) {
+        let repeated = state.last.as_ref().filter(|last| state.ended && step == Some(last.step));
+        if let (Some(last), Some(known)) = (repeated, &state.fleet) {
             known.check_same(fleet)?;
-            return Ok(Turn::Repeat(last.clone()));
+            return Ok(StepStart::Repeated(last.clone()));
         }
-        if state.ended || state.finished {
-            return Err(Error::unknown(Self::WHAT, &self.id));
+        if state.closed || state.ended {
+            return Err(Error::unknown(Self::KIND, &self.id));
         }
-        let new_run = state.judge_run(&self.id, run_id)?;
-        // A run that begins on an untouched session needs no reset, but is remembered all the same.
+        let new_run = state.new_run(&self.id, run_id)?;
         let steps = if new_run.is_some() { 0 } else { state.steps };
         let step = step.unwrap_or(steps);
         if new_run.is_none() {
@@ -144,66 +163,68 @@ impl Session {
                 known.check_same(fleet)?;
             }
             if let Some(last) = state.last.as_ref().filter(|last| last.step == step) {
-                return Ok(Turn::Repeat(last.clone()));
+                return Ok(StepStart::Repeated(last.clone()));
             }
         }
         if step != steps {
             return Err(wrong_step(&self.id, steps, step, new_run.is_some()));
         }
         let first = new_run.is_some() || state.fleet.is_none();
-        let mut memory = std::mem::take(&mut state.used_memory);
+        let mut memory = std::mem::take(&mut state.spare_memory);
         memory.clear();
         if first {
             let run = new_run.as_deref().or(state.run_id.as_deref());
-            let seed = state.seed.unwrap_or_else(|| hash(&(&self.id, run)));
+            let seed = state.seed.unwrap_or_else(|| session_seed(&self.id, run));
             let (uavs, users) = (fleet.uavs.len(), fleet.users.len());
             memory.resize(self.policy.policy.memory_len(uavs, users), 0.0);
             self.policy.policy.start(uavs, users, seed, &mut memory);
         } else {
             memory.extend_from_slice(&state.memory);
         }
-        let room = std::mem::take(&mut state.used);
-        Ok(Turn::Next(NextTurn { session: self, state, new_run, fleet: first.then(|| fleet.clone()), step, memory, room }))
+        let buffers = std::mem::take(&mut state.spare_buffers);
+        let fleet = first.then(|| fleet.clone());
+        Ok(StepStart::Next(PendingStep { session: self, state, new_run, fleet, step, memory, buffers }))
     }
 
-    /// What `OpenSession` with the name of this session does.
-    pub(super) async fn reopen(&self, policy: &LoadedPolicy, how: &Opened) -> Result<(), Error> {
-        let taken = |why: &str| {
-            let message = format!("session {:?} exists {why}; close it, choose another name, or give a new run_id", self.id);
+    /// Handles a second `OpenSession` with the name of this session.
+    pub(super) async fn reopen(&self, policy: &LoadedPolicy, options: &SessionOptions) -> Result<(), Error> {
+        let taken = |reason: &str| {
+            let message = format!("session {:?} exists {reason}; close it, choose another name, or give a new run_id", self.id);
             Err(Error::Exists(message))
         };
         let mut state = self.state.lock().await;
-        if state.ended {
+        if state.closed {
             return taken("and is being closed");
         }
         if policy.reference.name != self.policy.reference.name {
             return taken(&format!("with policy {}", self.policy.reference));
         }
-        match state.judge_run(&self.id, how.run_id.as_deref())? {
+        match state.new_run(&self.id, options.run_id.as_deref())? {
             Some(run) => {
-                state.begin(run);
-                state.seed = how.seed;
+                state.begin_run(run);
+                state.seed = options.seed;
             }
-            None if state.steps > 0 => return taken(&format!("and has flown {} slots", state.steps)),
-            None if state.seed != how.seed || state.run_id != how.run_id => return taken("with another seed or run_id"),
+            None if state.steps > 0 => return taken(&format!("and has {} steps", state.steps)),
+            None if state.seed != options.seed || state.run_id != options.run_id => return taken("with another seed or run_id"),
             None => {}
         }
         self.steps.store(state.steps, Ordering::Relaxed);
-        self.used.touch(self.clock.monotonic());
+        self.last_use.touch(self.clock.monotonic());
         Ok(())
     }
 
-    pub(super) async fn end(&self) {
+    /// Rejects all later requests. Waits for the step in flight.
+    pub(super) async fn close(&self) {
+        self.state.lock().await.closed = true;
+    }
+
+    /// Rejects later steps. The last step may be repeated, by its index, for a short time.
+    pub async fn end(&self) {
         self.state.lock().await.ended = true;
+        self.ended.store(true, Ordering::Relaxed);
     }
 
-    /// No slot follows; the last one may be asked for again for a moment, by its step.
-    pub async fn finish(&self) {
-        self.state.lock().await.finished = true;
-        self.over.store(true, Ordering::Relaxed);
-    }
-
-    /// What a caller is told of it.
+    /// Describes the session.
     pub fn info(&self, ttl: Duration) -> SessionInfo {
         SessionInfo {
             id: self.id.clone(),
@@ -215,41 +236,41 @@ impl Session {
     }
 }
 
-impl Entry for Session {
-    const WHAT: &'static str = "session";
+impl TableEntry for Session {
+    const KIND: &'static str = "session";
     const EXPIRED: ErrorCode = ErrorCode::SessionExpired;
 
     fn id(&self) -> &str {
         &self.id
     }
 
-    fn used(&self) -> &LastUse {
-        &self.used
+    fn last_use(&self) -> &LastUse {
+        &self.last_use
     }
 
-    fn over(&self) -> bool {
-        self.over.load(Ordering::Relaxed)
+    fn is_ended(&self) -> bool {
+        self.ended.load(Ordering::Relaxed)
     }
 }
 
-impl State {
-    /// `Some` if `run_id` names a run that has not been seen.
-    fn judge_run(&self, id: &str, run_id: Option<&str>) -> Result<Option<String>, Error> {
+impl SessionState {
+    /// Returns `run_id` if it names a run that this session has not had.
+    fn new_run(&self, id: &str, run_id: Option<&str>) -> Result<Option<String>, Error> {
         let Some(run_id) = run_id.filter(|run_id| self.run_id.as_deref() != Some(run_id)) else { return Ok(None) };
-        if self.former.contains(&hash(&run_id)) {
-            let message =
-                format!("run {run_id:?} of session {id:?} was replaced by run {:?}", self.run_id.as_deref().unwrap_or(""));
+        if self.former_runs.contains(&run_hash(run_id)) {
+            let current = self.run_id.as_deref().unwrap_or("");
+            let message = format!("run {run_id:?} of session {id:?} was replaced by run {current:?}");
             return Err(Error::precondition(ErrorCode::RunFenced, message));
         }
         Ok(Some(run_id.to_owned()))
     }
 
-    /// Starts over as `run`.
-    fn begin(&mut self, run: String) {
+    /// Restarts the session as `run`.
+    fn begin_run(&mut self, run: String) {
         if let Some(former) = self.run_id.replace(run) {
-            self.former.push_back(hash(&former.as_str()));
-            if self.former.len() > FORMER_RUNS {
-                self.former.pop_front();
+            self.former_runs.push_back(run_hash(&former));
+            if self.former_runs.len() > MAX_FORMER_RUNS {
+                self.former_runs.pop_front();
             }
         }
         self.steps = 0;
@@ -259,41 +280,33 @@ impl State {
     }
 }
 
-impl NextTurn<'_> {
-    /// Makes `outcome` the session's last slot.
-    pub fn commit(mut self, outcome: Outcome) -> Answered {
+impl PendingStep<'_> {
+    /// Completes the step with `output`. Returns the decision.
+    pub fn commit(mut self, output: TaskOutput) -> Decision {
         if let Some(run) = self.new_run.take() {
-            self.state.begin(run);
+            self.state.begin_run(run);
         }
-        let answered =
-            Answered { step: self.step, headings: outcome.headings, q_values: outcome.q_values, timings: outcome.timings };
+        let TaskOutput { memory, decision } = output;
         let state = &mut *self.state;
         if let Some(fleet) = self.fleet.take() {
             state.fleet = Some(fleet);
         }
-        state.used_memory = std::mem::replace(&mut state.memory, outcome.memory);
+        state.spare_memory = std::mem::replace(&mut state.memory, memory);
         state.steps = self.step + 1;
-        if let Some(Answered { headings, q_values, .. }) = state.last.replace(answered.clone()) {
-            state.used = Room { headings, q_values };
+        if let Some(Decision { headings, q_values, .. }) = state.last.replace(decision.clone()) {
+            state.spare_buffers = OutputBuffers { headings, q_values };
         }
         self.session.steps.store(state.steps, Ordering::Relaxed);
-        self.session.used.touch(self.session.clock.monotonic());
-        answered
+        self.session.last_use.touch(self.session.clock.monotonic());
+        decision
     }
 }
 
 fn wrong_step(id: &str, steps: u64, step: u64, new_run: bool) -> Error {
     let message = match steps {
         0 if new_run => format!("step {step} cannot begin a new run of session {id:?}; send step 0"),
-        0 => format!("step {step} does not follow: session {id:?} has not flown yet; send step 0"),
-        _ => format!("step {step} does not follow in session {id:?}; send {steps}, or {} to repeat the last", steps - 1),
+        0 => format!("step {step} is out of order: session {id:?} has no steps yet; send step 0"),
+        _ => format!("step {step} is out of order in session {id:?}; send {steps}, or {} to repeat the last step", steps - 1),
     };
     Error::precondition(ErrorCode::WrongStep, message)
-}
-
-/// A hash that is the same in every process.
-fn hash(value: &impl Hash) -> u64 {
-    let mut hasher = DefaultHasher::new();
-    value.hash(&mut hasher);
-    hasher.finish()
 }

@@ -1,12 +1,17 @@
+use std::time::Duration;
+
+use jiff::Timestamp;
+
 use super::*;
 use crate::clock::ManualClock;
 use crate::invalid::Invalid;
 use crate::policy::{Policy, RequiredInput};
-use crate::serving::{Fleet, Limits, Outcome, Timings};
+use crate::serving::{Decision, Fleet, Limits, PolicyRef, TaskOutput};
 
-struct Nothing;
+/// Its memory is the seed at first; it decides nothing.
+struct SeedPolicy;
 
-impl Policy for Nothing {
+impl Policy for SeedPolicy {
     fn actions(&self) -> usize {
         8
     }
@@ -30,7 +35,7 @@ impl Policy for Nothing {
 
 fn policy(name: &str) -> Arc<LoadedPolicy> {
     let reference = PolicyRef { name: name.into(), version: 1, digest: [0; 32] };
-    Arc::new(LoadedPolicy::baseline(reference, "", Arc::new(Nothing), Timestamp::UNIX_EPOCH))
+    Arc::new(LoadedPolicy::baseline(reference, "", Arc::new(SeedPolicy), Timestamp::UNIX_EPOCH))
 }
 
 fn sessions(max: usize) -> (Sessions, impl Fn(u64)) {
@@ -39,8 +44,8 @@ fn sessions(max: usize) -> (Sessions, impl Fn(u64)) {
     (sessions, move |seconds| time.advance(Duration::from_secs(seconds)))
 }
 
-fn named(id: &str) -> Opened {
-    Opened { id: Some(id.into()), ..Opened::default() }
+fn named(id: &str) -> SessionOptions {
+    SessionOptions { id: Some(id.into()), ..SessionOptions::default() }
 }
 
 fn code(error: &Error) -> &'static str {
@@ -58,94 +63,94 @@ fn fleet(ids: [&str; 2]) -> Fleet {
     Fleet { uavs: ids.map(str::to_owned).to_vec(), users: vec!["user".into()] }
 }
 
-async fn fly(session: &Session, step: Option<u64>, run: Option<&str>) -> Result<(u64, Vec<f32>), &'static str> {
-    match session.turn(&fleet(["a", "b"]), step, run).await {
+async fn step_once(session: &Session, step: Option<u64>, run: Option<&str>) -> Result<(u64, Vec<f32>), &'static str> {
+    match session.begin_step(&fleet(["a", "b"]), step, run).await {
         Err(error) => Err(code(&error)),
-        Ok(Turn::Repeat(answer)) => Ok((answer.step, answer.q_values)),
-        Ok(Turn::Next(next)) => {
+        Ok(StepStart::Repeated(answer)) => Ok((answer.step, answer.q_values)),
+        Ok(StepStart::Next(next)) => {
             let memory: Vec<f32> = next.memory.iter().map(|m| m + 1.0).collect();
-            let outcome = Outcome { memory: memory.clone(), headings: vec![0, 0], q_values: memory, timings: Timings::default() };
-            let answer = next.commit(outcome);
+            let decision = Decision { step: next.step, headings: vec![0, 0], q_values: memory.clone(), ..Decision::default() };
+            let answer = next.commit(TaskOutput { memory, decision });
             Ok((answer.step, answer.q_values))
         }
     }
 }
 
 #[tokio::test]
-async fn steps_follow_each_other_and_the_last_may_be_repeated() {
+async fn steps_are_sequential_and_the_last_may_be_repeated() {
     let (sessions, _) = sessions(10);
-    sessions.open(policy("p"), Opened { seed: Some(0), ..named("s") }).await.unwrap();
+    sessions.open(policy("p"), SessionOptions { seed: Some(0), ..named("s") }).await.unwrap();
     let s = sessions.get("s").unwrap();
-    assert_eq!(fly(&s, Some(1), None).await, Err("wrong_step"));
-    assert_eq!(fly(&s, Some(0), None).await, Ok((0, vec![1.0; 2])));
-    assert_eq!(fly(&s, Some(0), None).await, Ok((0, vec![1.0; 2])));
-    assert_eq!(fly(&s, Some(1), None).await, Ok((1, vec![2.0; 2])));
-    assert_eq!(fly(&s, None, None).await, Ok((2, vec![3.0; 2])));
-    assert_eq!(fly(&s, Some(2), None).await, Ok((2, vec![3.0; 2])));
+    assert_eq!(step_once(&s, Some(1), None).await, Err("wrong_step"));
+    assert_eq!(step_once(&s, Some(0), None).await, Ok((0, vec![1.0; 2])));
+    assert_eq!(step_once(&s, Some(0), None).await, Ok((0, vec![1.0; 2])));
+    assert_eq!(step_once(&s, Some(1), None).await, Ok((1, vec![2.0; 2])));
+    assert_eq!(step_once(&s, None, None).await, Ok((2, vec![3.0; 2])));
+    assert_eq!(step_once(&s, Some(2), None).await, Ok((2, vec![3.0; 2])));
     for wrong in [0, 1, 4, u64::MAX] {
-        assert_eq!(fly(&s, Some(wrong), None).await, Err("wrong_step"), "{wrong}");
+        assert_eq!(step_once(&s, Some(wrong), None).await, Err("wrong_step"), "{wrong}");
     }
     assert_eq!(sessions.describe("s").unwrap().steps, 3);
 }
 
 #[tokio::test]
-async fn a_turn_that_is_dropped_changes_nothing() {
+async fn dropped_step_leaves_the_session_unchanged() {
     let (sessions, _) = sessions(10);
-    sessions.open(policy("p"), Opened { seed: Some(0), run_id: Some("r1".into()), ..named("s") }).await.unwrap();
+    sessions.open(policy("p"), SessionOptions { seed: Some(0), run_id: Some("r1".into()), ..named("s") }).await.unwrap();
     let s = sessions.get("s").unwrap();
-    fly(&s, Some(0), None).await.unwrap();
-    drop(s.turn(&fleet(["a", "b"]), Some(1), None).await.unwrap());
-    drop(s.turn(&fleet(["c", "d"]), Some(0), Some("r2")).await.unwrap());
-    assert_eq!(fly(&s, Some(0), Some("r1")).await, Ok((0, vec![1.0; 2])));
-    assert_eq!(fly(&s, Some(1), Some("r1")).await, Ok((1, vec![2.0; 2])));
+    step_once(&s, Some(0), None).await.unwrap();
+    drop(s.begin_step(&fleet(["a", "b"]), Some(1), None).await.unwrap());
+    drop(s.begin_step(&fleet(["c", "d"]), Some(0), Some("r2")).await.unwrap());
+    assert_eq!(step_once(&s, Some(0), Some("r1")).await, Ok((0, vec![1.0; 2])));
+    assert_eq!(step_once(&s, Some(1), Some("r1")).await, Ok((1, vec![2.0; 2])));
 }
 
 #[tokio::test]
-async fn a_new_run_starts_over_and_fences_the_former() {
+async fn new_run_restarts_the_session_and_fences_the_former_run() {
     let (sessions, _) = sessions(10);
-    sessions.open(policy("p"), Opened { seed: Some(0), run_id: Some("r1".into()), ..named("s") }).await.unwrap();
+    sessions.open(policy("p"), SessionOptions { seed: Some(0), run_id: Some("r1".into()), ..named("s") }).await.unwrap();
     let s = sessions.get("s").unwrap();
-    fly(&s, Some(0), Some("r1")).await.unwrap();
-    fly(&s, Some(1), Some("r1")).await.unwrap();
-    assert_eq!(fly(&s, Some(2), Some("r2")).await, Err("wrong_step"));
-    assert_eq!(fly(&s, Some(2), Some("r1")).await, Ok((2, vec![3.0; 2])), "a refused run resets nothing");
-    assert_eq!(fly(&s, Some(0), Some("r2")).await, Ok((0, vec![1.0; 2])));
-    assert_eq!(fly(&s, Some(3), Some("r1")).await, Err("run_fenced"));
-    assert_eq!(fly(&s, Some(0), Some("r1")).await, Err("run_fenced"));
-    assert_eq!(fly(&s, Some(1), None).await, Ok((1, vec![2.0; 2])), "no run_id means the current run");
-    let again = Opened { seed: Some(7), run_id: Some("r3".into()), ..named("s") };
-    assert_eq!(sessions.open(policy("p"), again).await.unwrap().steps, 0);
-    assert_eq!(fly(&s, Some(0), Some("r3")).await, Ok((0, vec![8.0; 2])));
-    let fenced = Opened { run_id: Some("r2".into()), ..named("s") };
+    step_once(&s, Some(0), Some("r1")).await.unwrap();
+    step_once(&s, Some(1), Some("r1")).await.unwrap();
+    assert_eq!(step_once(&s, Some(2), Some("r2")).await, Err("wrong_step"));
+    assert_eq!(step_once(&s, Some(2), Some("r1")).await, Ok((2, vec![3.0; 2])), "a rejected run does not reset the session");
+    assert_eq!(step_once(&s, Some(0), Some("r2")).await, Ok((0, vec![1.0; 2])));
+    assert_eq!(step_once(&s, Some(3), Some("r1")).await, Err("run_fenced"));
+    assert_eq!(step_once(&s, Some(0), Some("r1")).await, Err("run_fenced"));
+    assert_eq!(step_once(&s, Some(1), None).await, Ok((1, vec![2.0; 2])), "without run_id, the current run continues");
+    let restarted = SessionOptions { seed: Some(7), run_id: Some("r3".into()), ..named("s") };
+    assert_eq!(sessions.open(policy("p"), restarted).await.unwrap().steps, 0);
+    assert_eq!(step_once(&s, Some(0), Some("r3")).await, Ok((0, vec![8.0; 2])));
+    let fenced = SessionOptions { run_id: Some("r2".into()), ..named("s") };
     assert_eq!(code(&sessions.open(policy("p"), fenced).await.unwrap_err()), "run_fenced");
 }
 
 #[tokio::test]
-async fn ids_are_fixed_by_the_first_slot_of_a_run() {
+async fn ids_of_a_run_may_not_change() {
     let (sessions, _) = sessions(10);
     sessions.open(policy("p"), named("s")).await.unwrap();
     let s = sessions.get("s").unwrap();
-    fly(&s, None, None).await.unwrap();
-    let other = s.turn(&fleet(["a", "c"]), None, None).await.map(|_| ()).unwrap_err();
+    step_once(&s, None, None).await.unwrap();
+    let other = s.begin_step(&fleet(["a", "c"]), None, None).await.map(|_| ()).unwrap_err();
     assert!(matches!(&other, Error::Invalid(e) if e.field == "uavs" && e.value.as_deref() == Some("\"c\" instead of \"b\"")));
-    assert!(s.turn(&fleet(["a", "c"]), None, Some("another run")).await.is_ok());
+    assert!(s.begin_step(&fleet(["a", "c"]), None, Some("another run")).await.is_ok());
 }
 
 #[tokio::test]
-async fn opening_twice_is_a_retry_only_if_nothing_differs() {
+async fn opening_twice_is_a_retry_only_with_equal_options() {
     let (sessions, _) = sessions(10);
     let first = sessions.open(policy("p"), named("s")).await.unwrap();
     assert_eq!(sessions.open(policy("p"), named("s")).await.unwrap(), first);
     assert_eq!(code(&sessions.open(policy("q"), named("s")).await.unwrap_err()), "exists");
-    let seeded = Opened { seed: Some(1), ..named("s") };
+    let seeded = SessionOptions { seed: Some(1), ..named("s") };
     assert_eq!(code(&sessions.open(policy("p"), seeded).await.unwrap_err()), "exists");
-    fly(&sessions.get("s").unwrap(), None, None).await.unwrap();
+    step_once(&sessions.get("s").unwrap(), None, None).await.unwrap();
     assert_eq!(code(&sessions.open(policy("p"), named("s")).await.unwrap_err()), "exists");
-    assert_ne!(sessions.open(policy("p"), Opened::default()).await.unwrap().id, "s");
+    assert_ne!(sessions.open(policy("p"), SessionOptions::default()).await.unwrap().id, "s");
 }
 
 #[tokio::test]
-async fn idle_sessions_expire_and_say_so() {
+async fn idle_session_expires_with_its_own_error() {
     let (sessions, pass) = sessions(2);
     sessions.open(policy("p"), named("s")).await.unwrap();
     pass(600);
@@ -163,27 +168,39 @@ async fn idle_sessions_expire_and_say_so() {
 }
 
 #[tokio::test]
-async fn the_number_of_sessions_and_of_remembered_ones_is_bounded() {
+async fn corrected_wall_time_neither_expires_nor_keeps_sessions() {
+    let time = ManualClock::new(Timestamp::UNIX_EPOCH);
+    let sessions = Sessions::new(Limits { ttl: Duration::from_secs(600), max: 2 }, time.clock());
+    sessions.open(policy("p"), named("s")).await.unwrap();
+    time.set_wall(Timestamp::from_second(1_000_000).unwrap());
+    sessions.get("s").unwrap();
+    time.advance(Duration::from_secs(601));
+    time.set_wall(Timestamp::UNIX_EPOCH);
+    assert_eq!(code(&sessions.get("s").unwrap_err()), "session_expired");
+}
+
+#[tokio::test]
+async fn numbers_of_open_and_of_expired_sessions_are_bounded() {
     let (sessions, pass) = sessions(2);
     sessions.open(policy("p"), named("a")).await.unwrap();
     sessions.open(policy("p"), named("b")).await.unwrap();
     assert_eq!(code(&sessions.open(policy("p"), named("c")).await.unwrap_err()), "busy");
     pass(601);
     sessions.open(policy("p"), named("c")).await.unwrap();
-    assert_eq!(sessions.len(), 1, "the idle ones made room");
+    assert_eq!(sessions.len(), 1, "idle sessions were removed");
     pass(601);
     sessions.sweep();
     assert!(sessions.is_empty());
     let codes = ["a", "b", "c"].map(|id| code(&sessions.get(id).unwrap_err()));
     assert_eq!(codes.iter().filter(|c| **c == "session_expired").count(), 2);
-    assert_eq!(codes[2], "session_expired", "the last to expire is remembered");
+    assert_eq!(codes[2], "session_expired", "the newest expired name is remembered");
 }
 
 #[tokio::test]
-async fn a_waiting_caller_of_a_closed_session_is_told() {
+async fn step_of_a_closed_session_is_rejected() {
     let (sessions, _) = sessions(2);
     sessions.open(policy("p"), named("s")).await.unwrap();
     let s = sessions.get("s").unwrap();
     sessions.close("s").await.unwrap();
-    assert_eq!(fly(&s, None, None).await, Err("unknown"));
+    assert_eq!(step_once(&s, None, None).await, Err("unknown"));
 }

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use jiff::Timestamp;
-use qedgix::serving::{About, Kind, LoadedPolicy, PolicyRef};
+use qedgix::serving::{LoadedPolicy, PolicyInfo, PolicyKind, PolicyRef};
 use tonic::Code;
 
 use super::*;
@@ -285,8 +285,8 @@ async fn metadata_says_what_a_policy_takes() {
     let server = Server::start().await;
     let reference = PolicyRef { name: "fixed".into(), version: 3, digest: [3; 32] };
     let policy = LoadedPolicy::baseline(reference, "of a test", Arc::new(Deed::Count), Timestamp::UNIX_EPOCH);
-    let about = About { kind: Kind::Checkpoint, uavs: Some(3), ..(*policy.about).clone() };
-    let policy = LoadedPolicy { about: Arc::new(about), ..policy };
+    let info = PolicyInfo { kind: PolicyKind::Checkpoint, uavs: Some(3), ..(*policy.info).clone() };
+    let policy = LoadedPolicy { info: Arc::new(info), ..policy };
     server.app.registry.insert(policy);
     let mut client = client(&server).await;
     let ask = |name: &str| oip::ModelMetadataRequest { name: name.into(), version: String::new() };

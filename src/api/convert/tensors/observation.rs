@@ -7,7 +7,7 @@ use crate::api::convert::fleet::{Ids, check_counts, distinct, request_order};
 use crate::api::convert::{aoi, finite, graph::mirror, point};
 use crate::env::Point;
 use crate::invalid::Invalid;
-use crate::serving::{Fleet, Graph, GraphForm, MAX_DETECTIONS, MAX_NODES, Observation, Seen, Sighting};
+use crate::serving::{Fleet, Graph, GraphForm, MAX_DETECTIONS, MAX_NODES, Observation, ReportedDetection, Scene, SceneOrGraph};
 
 /// Inputs of which observations are made: name, datatype in which they are described, and what each dimension counts.
 pub const INPUTS: [(&str, Datatype, &[Dimension]); 8] = [
@@ -65,14 +65,14 @@ pub fn observation(tensors: &mut Vec<Tensor>) -> Result<Observation, Invalid> {
     let ages = ages.map(|(j, value)| aoi(|| format!("user_aoi[{j}]"), value)).collect::<Result<Vec<f32>, _>>()?;
     let own = uav_positions.map(|tensor| points(&tensor, "[M, 2]", uavs)).transpose()?;
     let nodes = Nodes::new(uavs, users, uav_ids.as_ref(), user_ids.as_ref())?;
-    let seen = match (user_positions, edge_index, edge_relative) {
+    let content = match (user_positions, edge_index, edge_relative) {
         (Some(tensor), None, None) => {
             let own = own.ok_or_else(|| missing("uav_positions", "the position of each UAV, [M, 2]"))?;
             let all = points(&tensor, "[N, 2]", users)?;
             let uavs = nodes.uavs.iter().map(|&place| own[place as usize]).collect();
-            Seen::Scene { uavs, users: nodes.of_users(&all), aoi: nodes.of_users(&ages) }
+            SceneOrGraph::Scene(Scene { uavs, users: nodes.of_users(&all), aoi: nodes.of_users(&ages) })
         }
-        (None, Some(index), Some(relative)) => Seen::Graph(graph(&nodes, own.as_deref(), &ages, &index, &relative)?),
+        (None, Some(index), Some(relative)) => SceneOrGraph::Graph(graph(&nodes, own.as_deref(), &ages, &index, &relative)?),
         (None, None, None) => {
             let expected = "the position of each user, [N, 2], or edge_index and edge_relative";
             return Err(missing("user_positions", expected));
@@ -84,7 +84,7 @@ pub fn observation(tensors: &mut Vec<Tensor>) -> Result<Observation, Invalid> {
             return Err(Invalid::new("user_positions", "a tensor", expected));
         }
     };
-    Ok(Observation { uav_order: request_order(&nodes.uavs), seen, fleet: nodes.fleet })
+    Ok(Observation { uav_order: request_order(&nodes.uavs), content, fleet: nodes.fleet })
 }
 
 /// M, as everything says that tells it.
@@ -190,11 +190,11 @@ fn graph(nodes: &Nodes, own: Option<&[Point]>, ages: &[f32], index: &Tensor, rel
             return Err(Invalid::new(format!("edge_index[{e}]"), format!("{ends:?}"), "two different nodes"));
         }
         let part = |axis: usize| finite(|| format!("edge_relative[{e}][{axis}]"), rel[axis]);
-        let sighting = Sighting { target, rel: [part(0)?, part(1)?], place: e as u32, mirrored: false };
-        detections[from as usize].push(sighting);
+        let detection = ReportedDetection { target, rel: [part(0)?, part(1)?], place: e as u32, mirrored: false };
+        detections[from as usize].push(detection);
     }
     for list in &mut detections {
-        list.sort_by_key(|sighting| sighting.target);
+        list.sort_by_key(|detection| detection.target);
         if let Some(pair) = list.windows(2).find(|pair| pair[0].target == pair[1].target) {
             let (first, again) = (pair[0].place, pair[1].place as usize);
             let ends = format!("{:?}", &ends[2 * again..2 * again + 2]);

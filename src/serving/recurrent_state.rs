@@ -1,8 +1,8 @@
-//! Memory that callers keep: the bytes of `recurrent_state`, sealed so that a mistake is told apart from an answer.
+//! The encoding of `recurrent_state`: memory of a policy that the caller keeps between slots.
 //!
 //! Layout (little endian): `QXRS`, format version (1 byte), policy digest (32), step (8), M (4), N (4), fingerprint of
-//! the ids (16), memory (4 each), first 8 bytes of the SHA-256 of all that. A checksum, not a signature: it finds
-//! accidents; whoever forges a state harms only the fleet that flies with it.
+//! the ids (16), memory (4 each), first 8 bytes of the SHA-256 of the preceding bytes. This is a checksum against accidental
+//! changes, not a signature: a forged state affects only the forger's own fleet.
 
 use bytes::{Buf, BufMut, Bytes, BytesMut};
 use sha2::{Digest, Sha256};
@@ -15,31 +15,31 @@ const FORMAT: u8 = 1;
 const HEADER: usize = 4 + 1 + 32 + 8 + 4 + 4 + 16;
 const CHECKSUM: usize = 8;
 
-/// The memory of a fleet between two slots.
+/// The memory of a fleet between two slots, with what is needed to check that it fits the next request.
 #[derive(Clone, Debug, PartialEq)]
-pub struct HeldState {
-    /// Policy version that wrote it.
+pub struct RecurrentState {
+    /// Digest of the policy version that wrote it.
     pub digest: [u8; 32],
     /// The next step.
     pub step: u64,
-    /// M.
+    /// M, the number of UAVs.
     pub uavs: u32,
-    /// N.
+    /// N, the number of users.
     pub users: u32,
-    /// Fingerprint of the ids.
+    /// Fingerprint of the ids ([`Fleet::fingerprint`]).
     pub fleet: [u8; 16],
     /// The policy's memory.
     pub memory: Vec<f32>,
 }
 
-impl HeldState {
-    /// Seals the memory of `fleet` before `step`.
+impl RecurrentState {
+    /// The memory of `fleet` before `step`.
     pub fn new(digest: [u8; 32], step: u64, fleet: &Fleet, memory: Vec<f32>) -> Self {
         let (uavs, users) = (fleet.uavs.len() as u32, fleet.users.len() as u32);
         Self { digest, step, uavs, users, fleet: fleet.fingerprint(), memory }
     }
 
-    /// The bytes handed to the caller.
+    /// The bytes for the caller.
     pub fn encode(&self) -> Bytes {
         let mut bytes = BytesMut::with_capacity(HEADER + 4 * self.memory.len() + CHECKSUM);
         bytes.put_slice(MAGIC);
@@ -57,10 +57,10 @@ impl HeldState {
         bytes.freeze()
     }
 
-    /// Reads bytes handed back by a caller.
+    /// Decodes bytes from a caller.
     ///
     /// # Errors
-    /// They are not the unchanged bytes of an earlier answer.
+    /// Names `recurrent_state` if the bytes are not the unchanged result of [`RecurrentState::encode`].
     pub fn decode(bytes: &[u8]) -> Result<Self, Invalid> {
         let wrong = |value: String| {
             let expected = "the unchanged recurrent_state of the previous response, or none in slot 0";
@@ -93,18 +93,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn any_changed_or_missing_byte_is_found() {
+    fn changed_or_missing_byte_is_rejected() {
         let fleet = Fleet { uavs: vec!["a".into(), "b".into()], users: vec!["u".into()] };
-        let state = HeldState::new([7; 32], 3, &fleet, vec![0.5, -1.0, f32::NAN]);
+        let state = RecurrentState::new([7; 32], 3, &fleet, vec![0.5, -1.0, f32::NAN]);
         let bytes = state.encode();
-        let back = HeldState::decode(&bytes).unwrap();
+        let back = RecurrentState::decode(&bytes).unwrap();
         assert_eq!((back.step, back.uavs, back.users, back.fleet), (3, 2, 1, fleet.fingerprint()));
         assert!(back.memory[2].is_nan());
         for i in 0..bytes.len() {
             let mut changed = bytes.to_vec();
             changed[i] ^= 1;
-            assert!(HeldState::decode(&changed).is_err(), "byte {i}");
-            assert!(HeldState::decode(&bytes[..i]).is_err(), "length {i}");
+            assert!(RecurrentState::decode(&changed).is_err(), "byte {i}");
+            assert!(RecurrentState::decode(&bytes[..i]).is_err(), "length {i}");
         }
     }
 }

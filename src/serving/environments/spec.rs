@@ -1,4 +1,4 @@
-//! What a hosted environment is made of: checked, bounded, and what fixes its episodes.
+//! The specification of a hosted environment: validation, limits, and the seeds of its episodes.
 
 use rand::RngExt;
 
@@ -9,17 +9,17 @@ use crate::train_config::EXACT;
 
 /// Most copies of one environment.
 const MAX_COPIES: usize = 1024;
-/// Most UAVs and users in all copies of one environment: an answer without graphs stays below 4 MiB.
+/// Most UAVs and users in all copies of one environment: a response without graphs stays below 4 MiB.
 const MAX_NODES: usize = 32_768;
-/// Most detections of an answer, if in every copy all nodes detect each other: some 20 MiB.
+/// Most detections of a response, if in every copy all nodes detect each other: about 20 MiB.
 const MAX_DETECTIONS: usize = 1 << 19;
 
-/// Everything that, together with the actions, fixes what an environment answers.
+/// Everything that, together with the actions, determines the states of an environment.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Blueprint {
-    /// The environment, checked.
+pub struct EnvironmentSpec {
+    /// The validated configuration.
     pub config: EnvConfig,
-    /// B.
+    /// B, the number of copies.
     pub copies: usize,
     /// Copy b's first episode has the seed `seed` + b.
     pub seed: u64,
@@ -27,11 +27,11 @@ pub struct Blueprint {
     pub auto_reset: bool,
 }
 
-impl Blueprint {
-    /// Checks everything but the name.
+impl EnvironmentSpec {
+    /// A valid specification.
     ///
     /// # Errors
-    /// The first field that is out of range, or copies and nodes that are too many together.
+    /// Names the first field that is out of range, or `count` if all copies together have too many nodes.
     pub fn new(config: EnvConfig, copies: usize, seed: u64, auto_reset: bool) -> Result<Self, Invalid> {
         config.validate().map_err(|e| e.within("environment"))?;
         in_range("count", copies, 1..=MAX_COPIES)?;
@@ -43,10 +43,10 @@ impl Blueprint {
         Ok(Self { config, copies, seed, auto_reset })
     }
 
-    /// Refuses graphs whose size would be out of bounds, whatever the positions.
+    /// Checks that graphs may be returned: their size has to be bounded for all positions.
     ///
     /// # Errors
-    /// There are too many nodes that might detect each other.
+    /// Names `return_graph` if too many pairs of nodes could detect each other.
     pub(super) fn check_graph(&self) -> Result<(), Invalid> {
         let (copies, nodes) = (self.copies, self.config.nodes());
         if copies * nodes * (nodes - 1) <= MAX_DETECTIONS {
@@ -57,10 +57,10 @@ impl Blueprint {
         Err(Invalid::new("return_graph", value, expected))
     }
 
-    /// `actions` of all copies in a row.
+    /// The headings of all copies, (B, M) flattened.
     ///
     /// # Errors
-    /// The number of copies or headings is wrong, or a heading index does not exist.
+    /// Names the part of `actions` that has a wrong length or an unknown heading index.
     pub(super) fn headings(&self, actions: &[Vec<u32>]) -> Result<Vec<u8>, Invalid> {
         if actions.len() != self.copies {
             return Err(Invalid::new("actions", format!("{} entries", actions.len()), format!("{}, one per copy", self.copies)));
@@ -83,28 +83,28 @@ impl Blueprint {
         Ok(flat)
     }
 
-    /// Distances that a step looks at, and numbers that it writes: what decides where it is computed.
+    /// Work of a step: distances that it computes plus numbers that it writes.
     pub(super) fn work(&self) -> usize {
         self.copies * (self.config.uavs * self.config.users + self.config.nodes())
     }
 
-    /// Memory that the environment takes while it is held, in bytes; a little more than it really is.
+    /// Upper estimate of the environment's memory, in bytes.
     pub(super) fn bytes(&self) -> usize {
         let env = &self.config;
-        // Position, last move and final position of a UAV; position, walk, AoI, tally and final state of a user; counts of
-        // each AoI; what is kept of a copy besides.
+        // Per UAV: position, last move, final position. Per user: position, walk, AoI, AoI statistics, final state. Per copy:
+        // a histogram of AoI, and a constant.
         let copy = env.uavs * 24 + env.users * 48 + (env.slots + 1) * 4 + 1024;
         self.copies * copy + env.nodes() * 64 + 4096
     }
 }
 
-/// Checks a seed.
+/// Checks that a seed is in range.
 pub(super) fn check_seed(seed: u64) -> Result<(), Invalid> {
     in_range("seed", seed, 0..=EXACT)
 }
 
-/// The seed of episode `episode` of the copy whose episode 0 has `first`: at most [`EXACT`], and the top bit below it set,
-/// so that episodes after the first do not meet those that policies are evaluated on.
+/// The seed of episode `episode` of the copy whose episode 0 has seed `first`. Seeds of later episodes have bit 52 set and are
+/// at most [`EXACT`], so they are disjoint from the seeds of evaluation episodes.
 pub(super) fn episode_seed(first: u64, episode: u64) -> u64 {
     if episode == 0 {
         return first;

@@ -1,0 +1,40 @@
+//! Steps that all kinds of memory share: conversion of the observation, and the call of the engine.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use tracing::level_filters::LevelFilter;
+
+use crate::policy::Slot;
+use crate::service::{App, Error};
+use crate::serving::{LoadedPolicy, SceneOrGraph, Task, TaskOutput};
+
+/// Observations with at least this many nodes are converted on a blocking thread, not on those that serve connections.
+pub const INLINE_NODES: usize = 256;
+
+/// Converts an observation of `uavs` UAVs and `users` users to the input of `policy`.
+pub(super) async fn build(
+    content: SceneOrGraph,
+    (uavs, users): (usize, usize),
+    policy: &Arc<LoadedPolicy>,
+) -> Result<Slot, Error> {
+    if uavs + users < INLINE_NODES {
+        return Ok(content.into_slot((uavs, users), &*policy.policy)?);
+    }
+    let policy = policy.clone();
+    let converted = tokio::task::spawn_blocking(move || content.into_slot((uavs, users), &*policy.policy));
+    Ok(converted.await.map_err(Error::internal)??)
+}
+
+/// Runs the policy of `task`.
+pub(super) async fn compute(app: &App, task: Task, deadline: Option<Instant>) -> Result<TaskOutput, Error> {
+    record_in_span("policy", &task.policy().reference);
+    Ok(app.engine.run(task, deadline).await?)
+}
+
+/// Adds a field to the span of the request, if spans are enabled.
+pub(super) fn record_in_span(field: &'static str, value: &dyn std::fmt::Display) {
+    if LevelFilter::current() >= LevelFilter::DEBUG {
+        tracing::Span::current().record(field, tracing::field::display(value));
+    }
+}
