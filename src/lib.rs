@@ -1,26 +1,26 @@
-//! Qedgix: trains and serves policies that fly UAV fleets for fresh data.
+//! Qedgix trains and serves policies that steer UAV fleets to keep data fresh (Age of Information).
 //!
-//! Folders are layers; a file imports only from layers below it (`tests/architecture.rs` checks this).
+//! Directories are layers. A file imports only from layers below its own; `tests/architecture.rs` checks this.
 //!
 //! | layer | owns |
 //! | --- | --- |
 //! | [`cli`] | the command line |
-//! | [`server`], [`config`], [`telemetry`] | listeners, background work, shutdown; settings; logs and metrics |
-//! | [`api`] | gRPC, REST, wire formats, the table of errors |
+//! | [`server`], [`config`], [`telemetry`] | listeners, background tasks, shutdown; settings; logs, metrics, traces |
+//! | [`api`] | gRPC, REST, Open Inference Protocol: wire formats, access rules, error tables |
 //! | [`service`] | one function per use case |
-//! | [`serving`], [`jobs`] | answering now; running work later |
-//! | [`store`] | the only SQL |
-//! | [`experiment`] | many runs and what they say together |
+//! | [`serving`], [`jobs`] | sessions, batching and inference; scheduling and running training jobs |
+//! | [`store`] | the database; the only SQL |
+//! | [`experiment`] | plans of many runs, and their combined results |
 //! | [`learner`] | replay, rollout, update, training, evaluation |
 //! | [`checkpoint`] | parameters to and from safetensors |
 //! | [`train_config`] | what a training run is made of: algorithm, preset, resolved configuration |
 //! | [`policy`] | observations, agents, mixers, baselines |
 //! | [`plot`] | numbers to SVG |
-//! | [`nn`], [`env`] | mathematics; physics |
-//! | [`clock`], [`draining`] | wall and monotonic time; the flag of shutdown |
-//! | [`invalid`], [`error_code`], [`rng`], [`files`] | errors of input; codes of errors; random streams; atomic writes of files |
+//! | [`nn`], [`env`] | neural network layers; the simulated environment |
+//! | [`clock`], [`draining`] | wall and monotonic time; the shutdown flag |
+//! | [`invalid`], [`error_code`], [`rng`], [`files`] | errors of invalid input; error codes; seeded random streams; atomic writes of files |
 //!
-//! Read `env`, then `policy`, then `learner`; then `service` and what it calls.
+//! Reading order: `env`, `policy`, `learner`; then `service` and the layers that it calls.
 
 pub mod api;
 pub mod checkpoint;

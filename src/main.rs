@@ -1,6 +1,6 @@
-//! The `qedgix` binary; everything is in the library.
+//! The `qedgix` binary. All code is in the library.
 
-/// A request of a large fleet is a hundred thousand small allocations.
+/// Requests of large fleets make about 100 000 small allocations, which mimalloc serves faster than the system allocator.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 

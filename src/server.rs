@@ -263,10 +263,10 @@ pub async fn run(
     let serve_grpc = connections.clone().serve(listeners.grpc, Protocol::Grpc, grpc(services));
     let serve_rest = connections.serve(listeners.http, Protocol::Http, router);
 
-    let scheduling = tokio::spawn(app.scheduler.clone().run(format!("http://{workers}")));
-    let housekeeping = tokio::spawn(housekeeping(app.clone(), config.session_ttl.min(config.environment_ttl)));
-    let monitoring = tokio::spawn(health.clone().follow(app.clone()));
-    let following = tokio::spawn(keys::follow(app.clone()));
+    let scheduler = tokio::spawn(app.scheduler.clone().run(format!("http://{workers}")));
+    let housekeeper = tokio::spawn(housekeeping(app.clone(), config.session_ttl.min(config.environment_ttl)));
+    let health_reporter = tokio::spawn(health.clone().follow(app.clone()));
+    let key_follower = tokio::spawn(keys::follow(app.clone()));
     data.write_endpoints(endpoints)?;
     tracing::info!(grpc = %endpoints.grpc, http = %endpoints.http, policies = app.registry.len(), "serving");
 
@@ -285,10 +285,9 @@ pub async fn run(
         _ = serve => {}
         () = drain => {}
     }
-    scheduling.abort();
-    housekeeping.abort();
-    monitoring.abort();
-    following.abort();
+    for task in [scheduler, housekeeper, health_reporter, key_follower] {
+        task.abort();
+    }
     keys::save_last_used(&app).await;
     data.remove_endpoints();
     tracing::info!("stopped");

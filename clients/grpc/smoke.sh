@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Flies three slots of Act and one of an environment through a server's gRPC with grpcurl and fails on any surprise.
+# Runs three slots of Act and one slot of a hosted environment with grpcurl, and fails on any unexpected response.
 #
 #   clients/grpc/smoke.sh HOST:PORT
 #
-# GRPCURL: the program (default: grpcurl); the original in Go and the one of the crate grpcurl-rs both do.
-# POLICY:  the policy to fly (default: sweep).
+# GRPCURL: the grpcurl program (default: grpcurl); works with the original in Go and with the crate grpcurl-rs.
+# POLICY:  the policy to run (default: sweep).
 set -euo pipefail
 
 address=${1:?usage: smoke.sh HOST:PORT}
@@ -18,7 +18,7 @@ fail() {
     exit 1
 }
 
-# Calls a method of $service; answers are compared without the whitespace that the two programs set differently.
+# Calls a method of $service. Removes whitespace, because the two programs format JSON differently.
 call() {
     local method=$1 request=$2
     "$grpcurl" --plaintext -d "$request" "$address" "$service/$method" | tr -d ' \n\t'
@@ -29,7 +29,7 @@ expect() {
     [[ $answer =~ $pattern ]] || fail "$what: expected $pattern in: $answer"
 }
 
-# A slot of three UAVs at the centre and five users, one of them in sight.
+# The request of one slot: three UAVs at the centre and five users, one of them detected.
 slot() {
     local step=$1 uavs="" users="" i
     for i in 1 2 3; do
@@ -44,12 +44,12 @@ slot() {
 
 services=$("$grpcurl" --plaintext "$address" list)
 for name in "$service" qedgix.v1.EnvironmentService inference.GRPCInferenceService grpc.health.v1.Health; do
-    grep -qxF "$name" <<<"$services" || fail "the list of services lacks $name: $services"
+    grep -qxF "$name" <<<"$services" || fail "missing in the list of services: $name: $services"
 done
 
 description=$("$grpcurl" --plaintext "$address" describe "$service")
 for method in Act OpenSession CloseSession ListPolicies GetPolicy; do
-    grep -qE "rpc $method \(" <<<"$description" || fail "$service lacks $method: $description"
+    grep -qE "rpc $method \(" <<<"$description" || fail "missing in $service: $method: $description"
 done
 
 health=$("$grpcurl" --plaintext -d "{\"service\":\"$service\"}" "$address" grpc.health.v1.Health/Check)
@@ -60,7 +60,7 @@ expect GetPolicy "$answer" '"digest":"[0-9a-f]{64}"'
 answer=$(call OpenSession "{\"policy\":\"$policy\",\"session_id\":\"$session\",\"seed\":7}")
 expect OpenSession "$answer" "\"sessionId\":\"$session\""
 
-# What is left out of JSON because it is zero: heading 0 and step 0.
+# JSON omits fields that are zero: heading 0 and step 0.
 action='\{"uavId":"uav-N"(,"headingIndex":[1-8])?(,"headingDeg":(0|[0-9.]+))?\}'
 last=
 for step in 0 1 2; do
@@ -72,20 +72,20 @@ for step in 0 1 2; do
 done
 
 headings() { grep -o '"actions":\[[^]]*\]' <<<"$1"; }
-again=$(call Act "$(slot 2)")
-[ "$(headings "$again")" = "$(headings "$last")" ] || fail "step 2 repeated was answered differently: $again, before: $last"
+repeated=$(call Act "$(slot 2)")
+[ "$(headings "$repeated")" = "$(headings "$last")" ] || fail "repeating step 2 returned another response: $repeated, before: $last"
 
 if refused=$(call Act "$(slot 7)" 2>&1); then
-    fail "step 7 after step 2 was answered: $refused"
+    fail "step 7 after step 2 was not refused: $refused"
 fi
 expect "Act, step 7" "$refused" '(FailedPrecondition|FAILED_PRECONDITION)'
 
 answer=$(call CloseSession "{\"session_id\":\"$session\"}")
 expect CloseSession "$answer" '"steps":"3"'
 if refused=$(call CloseSession "{\"session_id\":\"$session\"}" 2>&1); then
-    fail "a closed session was closed again: $refused"
+    fail "closing a closed session was not refused: $refused"
 fi
-expect "CloseSession, again" "$refused" '(NotFound|NOT_FOUND)'
+expect "CloseSession, repeated" "$refused" '(NotFound|NOT_FOUND)'
 
 service=qedgix.v1.EnvironmentService
 environment="\"environment_id\":\"$session\""
@@ -93,15 +93,15 @@ answer=$(call CreateEnvironment "{$environment,\"environment\":{\"M\":2,\"N\":4,
 expect CreateEnvironment "$answer" '"slots":1[,}]'
 answer=$(call Reset "{$environment}")
 expect Reset "$answer" '"uavs":\[\{"id":"uav-0","x":0.5,"y":0.5\}'
-flight="{$environment,\"step\":0,\"actions\":[{\"headings\":[0,3]},{\"headings\":[5,1]}]}"
-answer=$(call Step "$flight")
+step_request="{$environment,\"step\":0,\"actions\":[{\"headings\":[0,3]},{\"headings\":[5,1]}]}"
+answer=$(call Step "$step_request")
 expect Step "$answer" '"meanAoi":[0-9.]+'
-[ "$(call Step "$flight")" = "$answer" ] || fail "a repeated Step was answered differently"
-if refused=$(call Step "${flight/:0,/:1,}" 2>&1); then
-    fail "a step after the last was answered: $refused"
+[ "$(call Step "$step_request")" = "$answer" ] || fail "repeating Step returned another response"
+if refused=$(call Step "${step_request/:0,/:1,}" 2>&1); then
+    fail "a step after the last one was not refused: $refused"
 fi
 expect "Step, after the last" "$refused" '(FailedPrecondition|FAILED_PRECONDITION)'
 answer=$(call DeleteEnvironment "{$environment}")
 expect DeleteEnvironment "$answer" "\"environmentId\":\"$session\""
 
-echo "smoke: ok: $policy flew three slots at $address"
+echo "smoke: ok: policy $policy ran three slots at $address"

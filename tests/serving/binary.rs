@@ -1,8 +1,9 @@
-//! The program itself, as operators run it: its own process, its logs, its signals.
+//! `qedgix serve` as a process, with its log and signals.
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -19,6 +20,7 @@ pub struct Binary {
     pub http: String,
     lines: Arc<Mutex<Vec<String>>>,
     reader: Option<std::thread::JoinHandle<()>>,
+    close: Arc<AtomicBool>,
 }
 
 const POLL: Duration = Duration::from_millis(5);
@@ -26,7 +28,7 @@ const POLL: Duration = Duration::from_millis(5);
 impl Binary {
     pub async fn start(dir: &Path, flags: &[&str]) -> Self {
         let endpoints = dir.join(qedgix::server::ENDPOINTS);
-        // What a server that was killed has left.
+        // A killed server leaves its file behind.
         let _ = std::fs::remove_file(&endpoints);
         let mut child = Command::new(env!("CARGO_BIN_EXE_qedgix"))
             .args(["serve", "--grpc-addr", "127.0.0.1:0", "--http-addr", "127.0.0.1:0", "--data-dir"])
@@ -39,12 +41,17 @@ impl Binary {
             .unwrap();
         let lines = Arc::new(Mutex::new(Vec::new()));
         let (stderr, kept) = (child.stderr.take().unwrap(), lines.clone());
+        let close = Arc::new(AtomicBool::new(false));
+        let closed = close.clone();
         let reader = std::thread::spawn(move || {
             for line in BufReader::new(stderr).lines().map_while(Result::ok) {
                 kept.lock().unwrap().push(line);
+                if closed.load(Ordering::Relaxed) {
+                    break;
+                }
             }
         });
-        let mut binary = Self { child, grpc: String::new(), http: String::new(), lines, reader: Some(reader) };
+        let mut binary = Self { child, grpc: String::new(), http: String::new(), lines, reader: Some(reader), close };
         let text = soon(async {
             loop {
                 if let Ok(text) = std::fs::read_to_string(&endpoints) {
@@ -72,7 +79,7 @@ impl Binary {
         reqwest::get(format!("{}/metrics", self.http)).await.unwrap().text().await.unwrap()
     }
 
-    /// The value of the one sample that begins so; 0 where there is none.
+    /// The value of the sample whose line has this prefix; 0 if there is none.
     pub async fn sample(&self, beginning: &str) -> f64 {
         let text = self.metrics().await;
         text.lines()
@@ -80,12 +87,12 @@ impl Binary {
             .map_or(0.0, |line| line.rsplit_once(' ').unwrap().1.parse().unwrap())
     }
 
-    /// What it has logged so far.
+    /// The log so far.
     pub fn lines(&self) -> Vec<String> {
         self.lines.lock().unwrap().clone()
     }
 
-    /// Waits for a line that holds this text.
+    /// Waits for a log line that contains `text`.
     pub async fn says(&self, text: &str) -> String {
         soon(async {
             loop {
@@ -98,12 +105,17 @@ impl Binary {
         .await
     }
 
+    /// Closes the log after its next line.
+    pub fn close_log(&self) {
+        self.close.store(true, Ordering::Relaxed);
+    }
+
     pub fn signal(&self, name: &str) {
         let sent = Command::new("kill").args([format!("-{name}"), self.child.id().to_string()]).status().unwrap();
         assert!(sent.success());
     }
 
-    /// Waits for its end: exit code and everything it has logged.
+    /// Waits for the exit and returns the exit code and the whole log.
     pub async fn ended(mut self) -> (Option<i32>, Vec<String>) {
         let status = soon(async {
             loop {
@@ -121,7 +133,7 @@ impl Binary {
 
 impl Drop for Binary {
     fn drop(&mut self) {
-        // It may have ended before.
+        // The process may have exited already.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }

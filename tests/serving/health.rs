@@ -1,4 +1,4 @@
-//! `grpc.health.v1`: what is served, what is unknown, what is broken, and the end.
+//! `grpc.health.v1`: known and unknown services, failures, and draining.
 
 use std::sync::Arc;
 
@@ -27,7 +27,7 @@ async fn next(states: &mut Streaming<HealthCheckResponse>) -> Option<ServingStat
 }
 
 #[tokio::test]
-async fn every_service_is_known_and_no_other() {
+async fn every_service_has_a_health_status_and_others_are_not_found() {
     let server = Server::start().await;
     let mut health = HealthClient::new(server.channel().await);
     assert!(SERVICES.len() >= 4);
@@ -41,7 +41,7 @@ async fn every_service_is_known_and_no_other() {
 }
 
 #[tokio::test]
-async fn watches_hear_of_the_end_and_do_not_keep_it() {
+async fn health_watches_report_draining_and_do_not_delay_it() {
     let mut server = Server::start().await;
     let gate = Arc::new(Gate::default());
     server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
@@ -61,7 +61,7 @@ async fn watches_hear_of_the_end_and_do_not_keep_it() {
         assert_eq!(next(states).await, None);
     }
     assert_eq!(next(&mut unknown).await, None);
-    // All streams are held open by their client, and a request was in flight.
+    // The clients still hold their streams open, and a request is in flight.
     gate.open();
     assert_eq!(soon(in_flight).await.unwrap().unwrap().into_inner().actions.len(), 2);
     soon(server.stopped()).await;
@@ -69,7 +69,7 @@ async fn watches_hear_of_the_end_and_do_not_keep_it() {
 }
 
 #[tokio::test]
-async fn jobs_are_not_served_while_their_queue_cannot_be_read() {
+async fn the_job_service_is_not_serving_while_its_queue_is_unreadable() {
     let server = Server::start().await;
     let mut health = HealthClient::new(server.channel().await);
     let mut states = health.watch(ask("qedgix.v1.JobService")).await.unwrap().into_inner();
@@ -79,7 +79,7 @@ async fn jobs_are_not_served_while_their_queue_cannot_be_read() {
     sqlx::query("ALTER TABLE jobs RENAME TO elsewhere").execute(&mut database).await.unwrap();
     server.app.scheduler.job_changed(0);
     assert_eq!(next(&mut states).await, Some(ServingStatus::NotServing));
-    // Who asks a policy is not concerned.
+    // Other services are not affected.
     assert_eq!(status(&mut health, "qedgix.v1.PolicyService").await, ServingStatus::Serving);
     assert_eq!(status(&mut health, "").await, ServingStatus::Serving);
     sqlx::query("ALTER TABLE elsewhere RENAME TO jobs").execute(&mut database).await.unwrap();

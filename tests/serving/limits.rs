@@ -1,4 +1,4 @@
-//! Malformed and oversized messages, deadlines, full queues and panics over gRPC: the table of errors, and no harm done.
+//! Malformed and oversized messages, deadlines, full queues and panics over gRPC, and their status codes.
 
 use std::sync::Arc;
 
@@ -9,7 +9,7 @@ use tonic::{Code, Request, Status};
 
 use super::harness::*;
 
-/// Sends and receives messages as they are.
+/// A codec that sends and receives raw bytes.
 #[derive(Default)]
 pub struct Raw;
 
@@ -50,7 +50,7 @@ async fn raw(server: &Server, path: &'static str, message: Bytes) -> (Code, Stri
 }
 
 #[tokio::test]
-async fn messages_that_do_not_decode_or_are_too_large() {
+async fn malformed_and_oversized_messages_are_refused() {
     let server = Server::start().await;
     let act = "/qedgix.v1.PolicyService/Act";
     for garbage in [&b"\xff\xff\xff\xff"[..], b"\x12\x7f", b"\x0a\x02\xff\xfe"] {
@@ -81,7 +81,7 @@ fn in_scene(request: &mut v1::ActRequest) -> &mut v1::Scene {
 }
 
 #[tokio::test]
-async fn scenes_that_cannot_be_used_name_their_field() {
+async fn errors_of_invalid_scenes_name_the_field() {
     let server = Server::start().await;
     let mut client = server.grpc().await;
     let cases: &[(&str, &str, Change)] = &[
@@ -116,12 +116,12 @@ async fn scenes_that_cannot_be_used_name_their_field() {
 }
 
 #[tokio::test]
-async fn graphs_that_cannot_be_used_name_their_field() {
+async fn errors_of_invalid_graphs_name_the_field() {
     let server = Server::start().await;
     let mut client = server.grpc().await;
     let at = |id: &str, x: f64| v1::SceneUav { id: id.into(), x, y: 0.5 };
     let user = |id: &str, x: f64| v1::SceneUser { id: id.into(), x, y: 0.5, aoi: 4.0 };
-    // Nodes 0 and 1 are UAVs, 2 and 3 users; all see each other, in the order of the list.
+    // Nodes 0 and 1 are UAVs, 2 and 3 are users. All detect each other, in this order.
     let scene = v1::Scene { uavs: vec![at("a", 0.5), at("b", 0.55)], users: vec![user("u", 0.6), user("w", 0.65)] };
     let request = || v1::ActRequest {
         policy: "sweep".into(),
@@ -171,7 +171,7 @@ async fn graphs_that_cannot_be_used_name_their_field() {
     }
 }
 
-/// Sends an Act with a `grpc-timeout` and no timer of its own; returns `grpc-status` and `qedgix-code`.
+/// Sends an Act with a `grpc-timeout` but without a client timer. Returns `grpc-status` and `qedgix-code`.
 async fn act_within(server: &Server, timeout: &'static str, request: v1::ActRequest) -> (String, String) {
     use prost::Message;
     let socket = tokio::net::TcpStream::connect(server.endpoints.grpc).await.unwrap();
@@ -193,29 +193,29 @@ async fn act_within(server: &Server, timeout: &'static str, request: v1::ActRequ
 }
 
 #[tokio::test]
-async fn a_deadline_is_kept_in_the_queue_and_changes_nothing() {
+async fn requests_past_their_deadline_do_not_advance_the_session() {
     let server = Server::with(|config| config.engine.threads = 1).await;
     let gate = Arc::new(Gate::default());
     server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
     let mut client = server.grpc().await;
     client.open_session(open("slow", "s")).await.unwrap();
     client.open_session(open("sweep", "t")).await.unwrap();
-    for (session, while_it) in [("s", "computes"), ("t", "waits for the engine"), ("t", "has time for nothing")] {
-        let timeout = if while_it == "has time for nothing" { "1n" } else { "30m" };
+    for (session, while_it) in [("s", "computes"), ("t", "waits for the engine"), ("t", "has no time left")] {
+        let timeout = if while_it == "has no time left" { "1n" } else { "30m" };
         let (status, code) = act_within(&server, timeout, in_session(session, Some(0), scene(2, 2, 0))).await;
         assert_eq!((status.as_str(), code.as_str()), ("4", "deadline_exceeded"), "while it {while_it}");
     }
     gate.open();
     for session in ["s", "t"] {
         let answer = soon(client.act(in_session(session, Some(0), scene(2, 2, 0)))).await.unwrap().into_inner();
-        assert_eq!(answer.step, 0, "the slot was not flown before");
+        assert_eq!(answer.step, 0, "the session has not advanced");
     }
     let (status, _) = act_within(&server, "99999999H", in_session("t", Some(1), scene(2, 2, 0))).await;
-    assert_eq!(status, "", "the status of an answer comes after it");
+    assert_eq!(status, "", "a successful response has its status in trailers");
 }
 
 #[tokio::test]
-async fn a_retry_that_overtakes_its_first_attempt_gets_the_same_answer() {
+async fn a_retry_during_the_first_attempt_returns_the_same_response() {
     let server = Server::start().await;
     let gate = Arc::new(Gate::default());
     server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
@@ -232,11 +232,11 @@ async fn a_retry_that_overtakes_its_first_attempt_gets_the_same_answer() {
     let (first, second) = (soon(first).await.unwrap(), soon(second).await.unwrap());
     assert_eq!(first, second);
     let next = client.act(in_session("s", None, scene(2, 2, 0))).await.unwrap().into_inner();
-    assert_eq!(next.step, 1, "the memory advanced once");
+    assert_eq!(next.step, 1, "the session advanced once");
 }
 
 #[tokio::test]
-async fn a_full_queue_is_said_and_empties() {
+async fn a_full_queue_refuses_requests_and_recovers() {
     let server = Server::with(|config| (config.engine.threads, config.engine.queue) = (1, 1)).await;
     let gate = Arc::new(Gate::default());
     server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
@@ -257,7 +257,7 @@ async fn a_full_queue_is_said_and_empties() {
 }
 
 #[tokio::test]
-async fn sessions_are_bounded() {
+async fn open_sessions_are_limited() {
     let server = Server::with(|config| config.max_sessions = 1).await;
     let mut client = server.grpc().await;
     client.open_session(open("sweep", "a")).await.unwrap();
@@ -269,7 +269,7 @@ async fn sessions_are_bounded() {
 }
 
 #[tokio::test]
-async fn a_policy_that_panics_is_an_internal_error_and_no_more() {
+async fn a_panicking_policy_returns_an_internal_error() {
     let server = Server::with(|config| config.engine.threads = 1).await;
     server.add("panics", 1, Arc::new(Deed::Panic));
     let mut client = server.grpc().await;

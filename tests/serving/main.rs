@@ -14,6 +14,7 @@ mod load;
 mod oip;
 mod openapi;
 mod operations;
+mod output;
 mod policies;
 mod promotion;
 mod published;

@@ -1,4 +1,4 @@
-//! What operators see: metrics, logs, traces, draining, and the options of connections.
+//! Operations: metrics, logs, traces, draining, and socket options.
 
 mod collector;
 mod exposition;
@@ -10,21 +10,21 @@ use qedgix::wire::v1;
 use super::binary::Binary;
 use super::harness::*;
 
-/// Accepted sockets of both listeners, as the system sees them.
+/// Checks the options of accepted sockets of both listeners.
 #[cfg(target_os = "linux")]
 #[tokio::test]
-async fn small_packets_are_sent_at_once_on_both_listeners() {
+async fn both_listeners_set_tcp_nodelay() {
     use rustix::process::{PidfdFlags, PidfdGetfdFlags, getpid, pidfd_getfd, pidfd_open};
     use std::net::{SocketAddr, TcpStream};
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
-    /// This process's other end of a connection to it.
+    /// The server's end of a connection to this process.
     fn accepted(client: SocketAddr) -> Option<TcpStream> {
         let myself = pidfd_open(getpid(), PidfdFlags::empty()).unwrap();
         let files = std::fs::read_dir("/proc/self/fd").unwrap();
         let numbers: Vec<i32> = files.filter_map(|entry| entry.unwrap().file_name().to_str()?.parse().ok()).collect();
         numbers.into_iter().find_map(|number| {
-            // A file that was closed meanwhile is none of ours, and one that is no socket has no peer.
+            // Skips files that were closed meanwhile and files that are not sockets.
             let stream = TcpStream::from(pidfd_getfd(&myself, number, PidfdGetfdFlags::empty()).ok()?);
             (stream.peer_addr().ok()? == client).then_some(stream)
         })
@@ -34,7 +34,7 @@ async fn small_packets_are_sent_at_once_on_both_listeners() {
     let myself = pidfd_open(getpid(), PidfdFlags::empty());
     let allowed = myself.is_ok_and(|myself| pidfd_getfd(&myself, 0, PidfdGetfdFlags::empty()).is_ok());
     if !allowed {
-        eprintln!("this system does not let a process look at its own files: nothing is tested");
+        eprintln!("skipped: this system does not let a process duplicate its own files");
         return;
     }
     for (address, hello) in [
@@ -43,19 +43,19 @@ async fn small_packets_are_sent_at_once_on_both_listeners() {
     ] {
         let mut client = tokio::net::TcpStream::connect(address).await.unwrap();
         client.write_all(hello).await.unwrap();
-        // It answers, so it has accepted.
+        // A response means that the connection was accepted.
         soon(client.read_u8()).await.unwrap();
         let socket = accepted(client.local_addr().unwrap()).expect("the socket is this process's");
         assert!(socket.nodelay().unwrap(), "{address}");
     }
-    // What the test looks at is not on by itself.
+    // The option is off by default, so the test can fail.
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let client = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
     let _held = listener.accept().unwrap();
     assert!(!accepted(client.local_addr().unwrap()).unwrap().nodelay().unwrap());
 }
 
-/// A slot in a session that `sweep` flies.
+/// One slot in a session of `sweep`.
 async fn fly(binary: &Binary, id: &str, step: u64) -> v1::ActResponse {
     let mut client = binary.policies().await;
     if step == 0 {

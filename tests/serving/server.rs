@@ -1,4 +1,4 @@
-//! A server as a whole: health, reflection, drain, its data directory and its settings.
+//! The whole server: health, reflection, draining, data directory, settings.
 
 use std::sync::Arc;
 
@@ -15,7 +15,7 @@ use tonic_reflection::pb::{v1, v1alpha};
 use super::harness::*;
 
 #[tokio::test]
-async fn draining_answers_what_is_in_flight_and_refuses_the_rest() {
+async fn draining_completes_requests_in_flight() {
     let mut server = Server::start().await;
     let gate = Arc::new(Gate::default());
     server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
@@ -55,7 +55,7 @@ async fn new_work_is_refused_while_draining() {
 }
 
 #[tokio::test]
-async fn health_tells_of_every_service() {
+async fn health_reports_every_service() {
     let server = Server::start().await;
     let mut health = HealthClient::new(server.channel().await);
     for service in ["", "qedgix.v1.PolicyService", "qedgix.v1.EnvironmentService", "inference.GRPCInferenceService"] {
@@ -67,7 +67,7 @@ async fn health_tells_of_every_service() {
 }
 
 #[tokio::test]
-async fn reflection_in_both_versions() {
+async fn reflection_works_in_both_versions() {
     let server = Server::start().await;
     let ask = || MessageRequest::ListServices(String::new());
     let request = v1::ServerReflectionRequest { host: String::new(), message_request: Some(ask()) };
@@ -88,17 +88,17 @@ async fn reflection_in_both_versions() {
 }
 
 #[tokio::test]
-async fn a_data_directory_belongs_to_one_server() {
+async fn a_data_directory_is_locked_by_one_server() {
     let server = Server::start().await;
     let second = DataDir::lock(server.dir.path()).unwrap_err();
     assert!(matches!(&second, server::Error::InUse(path) if path == server.dir.path()), "{second}");
     assert!(second.to_string().contains("--data-dir"), "{second}");
     let file = server.dir.path().join("lock");
-    assert!(matches!(DataDir::lock(&file), Err(server::Error::File { .. })), "a file is no directory");
+    assert!(matches!(DataDir::lock(&file), Err(server::Error::File { .. })), "a file is not a directory");
 }
 
 #[test]
-fn settings_are_checked() {
+fn settings_are_validated() {
     let refused = |change: fn(&mut Config)| {
         let mut config = Config::new("unused");
         change(&mut config);
@@ -123,12 +123,12 @@ fn settings_are_checked() {
     assert_eq!(far.validate_exposure(false).unwrap_err().field, "--grpc-addr");
     (far.grpc_addr, far.http_addr) = ("[::1]:50051".parse().unwrap(), "192.0.2.1:80".parse().unwrap());
     assert_eq!(far.validate_exposure(false).unwrap_err().field, "--http-addr");
-    assert!(far.validate_exposure(true).is_ok(), "callers need keys");
+    assert!(far.validate_exposure(true).is_ok(), "API keys are required");
     far.insecure = true;
     assert!(far.validate_exposure(false).is_ok());
 }
 
-/// Starts the binary; it is killed when dropped.
+/// A process of the binary; killed when dropped.
 struct Process(std::process::Child);
 
 impl Process {
@@ -144,7 +144,7 @@ impl Process {
         Self(child.unwrap())
     }
 
-    /// Waits for its end: exit code and standard error.
+    /// Waits for the exit and returns the exit code and standard error.
     fn ended(mut self) -> (Option<i32>, String) {
         let mut text = String::new();
         std::io::Read::read_to_string(self.0.stderr.as_mut().unwrap(), &mut text).unwrap();
@@ -160,15 +160,15 @@ impl Drop for Process {
 }
 
 #[test]
-fn the_binary_says_where_it_listens_and_ends_well_on_sigterm() {
+fn the_binary_prints_its_addresses_and_drains_on_sigterm() {
     use std::io::BufRead;
     let dir = tempfile::tempdir().unwrap();
     let mut first = Process::start(dir.path(), &[]);
-    let mut told = std::io::BufReader::new(first.0.stdout.take().unwrap()).lines().map(Result::unwrap);
-    assert!(told.next().unwrap().starts_with("qedgix "));
-    let grpc = told.next().unwrap();
+    let mut stdout = std::io::BufReader::new(first.0.stdout.take().unwrap()).lines().map(Result::unwrap);
+    assert!(stdout.next().unwrap().starts_with("qedgix "));
+    let grpc = stdout.next().unwrap();
     assert!(grpc.starts_with("gRPC  127.0.0.1:") && !grpc.ends_with(":0"), "{grpc}");
-    assert!(told.next().unwrap().starts_with("REST  http://127.0.0.1:"));
+    assert!(stdout.next().unwrap().starts_with("REST  http://127.0.0.1:"));
 
     let (code, text) = Process::start(dir.path(), &[]).ended();
     assert_eq!(code, Some(1));

@@ -1,4 +1,4 @@
-//! Traces: what a collector receives, and that one which does not answer is nobody's problem.
+//! Traces: the spans that a collector receives, and a collector that does not respond.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
@@ -16,7 +16,7 @@ use super::super::binary::Binary;
 use super::super::harness::*;
 use super::fly;
 
-/// A collector that keeps what it is sent.
+/// A collector that keeps all received spans.
 #[derive(Clone, Default)]
 struct Collector(Arc<Mutex<Vec<ExportTraceServiceRequest>>>);
 
@@ -44,7 +44,7 @@ impl Collector {
         resources.flat_map(|spans| &spans.scope_spans).flat_map(|spans| spans.spans.clone()).collect()
     }
 
-    /// Attributes of where the spans are from.
+    /// Attributes of the resource that sent the spans.
     fn resource(&self) -> BTreeMap<String, String> {
         let requests = self.0.lock().unwrap();
         attributes(&requests[0].resource_spans[0].resource.as_ref().unwrap().attributes)
@@ -64,7 +64,7 @@ fn hex(bytes: &[u8]) -> String {
 }
 
 #[tokio::test]
-async fn spans_follow_the_callers_trace_to_the_collector() {
+async fn spans_are_exported_with_the_trace_of_the_caller() {
     const TRACE: &str = "4bf92f3577b34da6a3ce929d0e0e4736";
     const PARENT: &str = "00f067aa0ba902b7";
     let (collector, address) = Collector::start().await;
@@ -81,12 +81,12 @@ async fn spans_follow_the_callers_trace_to_the_collector() {
     };
     client.act(traced(in_session("flight-1", Some(1), scene(2, 3, 1)), "01")).await.unwrap();
     client.act(traced(in_session("flight-1", Some(9), scene(2, 3, 1)), "01")).await.unwrap_err();
-    // The caller decided not to sample this one.
+    // The caller decided not to sample this request.
     client.act(traced(in_session("flight-1", Some(2), scene(2, 3, 1)), "00")).await.unwrap();
     let rest = reqwest::Client::new().get(format!("{}/v1/policies/sweep", binary.http));
     let rest = rest.header("traceparent", format!("00-{TRACE}-{PARENT}-01")).send().await.unwrap();
     assert_eq!(rest.status(), 200);
-    // What is left is sent at the end.
+    // The server sends the remaining spans at shutdown.
     binary.signal("TERM");
     let (code, lines) = binary.ended().await;
     assert_eq!(code, Some(0), "{lines:?}");
@@ -107,7 +107,7 @@ async fn spans_follow_the_callers_trace_to_the_collector() {
     }
     assert_eq!((refused["code"].as_str(), shown["code"].as_str()), ("FailedPrecondition", "200"));
     assert!(!spans.iter().any(|span| attributes(&span.attributes).get("request_id").is_some_and(|id| id == "traced-00")));
-    // A caller that tells no trace begins one.
+    // A request without a traceparent starts a trace.
     let opened = spans.iter().find(|span| span.name == "qedgix.v1.PolicyService/OpenSession").unwrap();
     assert!(hex(&opened.trace_id) != TRACE && opened.parent_span_id.is_empty());
     let resource = collector.resource();
@@ -115,8 +115,8 @@ async fn spans_follow_the_callers_trace_to_the_collector() {
 }
 
 #[tokio::test]
-async fn a_collector_that_is_away_or_silent_keeps_nobody_waiting() {
-    // One port that nobody listens on, one whose connections are never answered.
+async fn an_unreachable_or_silent_collector_delays_no_request() {
+    // A closed port, and a port that accepts connections and never responds.
     let closed = TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
     let silent = TcpListener::bind("127.0.0.1:0").await.unwrap();
     for address in [closed, silent.local_addr().unwrap()] {
@@ -133,7 +133,7 @@ async fn a_collector_that_is_away_or_silent_keeps_nobody_waiting() {
 }
 
 #[tokio::test]
-async fn an_address_that_is_none_is_refused() {
+async fn invalid_collector_addresses_are_refused() {
     for wrong in ["127.0.0.1:4317", "https://127.0.0.1:4317", "http://", "/tmp/socket", ""] {
         let dir = tempfile::tempdir().unwrap();
         let output = std::process::Command::new(env!("CARGO_BIN_EXE_qedgix"))

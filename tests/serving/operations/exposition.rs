@@ -1,4 +1,4 @@
-//! `/metrics`: names and types as Prometheus wants them, and counts that are right, to the one.
+//! `/metrics`: valid Prometheus names and types, and exact counts.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -42,7 +42,7 @@ fn sample(line: &str) -> (String, BTreeMap<String, String>, f64) {
     (name.to_owned(), known, value.parse().unwrap_or_else(|_| panic!("{line}")))
 }
 
-/// Reads a whole exposition. Fails where a line is none, or belongs to no family that was announced.
+/// Parses an exposition. Panics when a line is invalid or belongs to no declared family.
 fn parse(text: &str) -> BTreeMap<String, Family> {
     let mut families: BTreeMap<String, Family> = BTreeMap::new();
     for line in text.lines().filter(|line| !line.is_empty()) {
@@ -69,7 +69,7 @@ fn parse(text: &str) -> BTreeMap<String, Family> {
     families
 }
 
-/// The rules that `promtool check metrics` knows, and those of the format.
+/// Checks the rules of the format and of `promtool check metrics`.
 fn check(families: &BTreeMap<String, Family>) {
     for (name, family) in families {
         assert!(is_name(name), "{name}");
@@ -116,14 +116,14 @@ fn check_histogram(name: &str, family: &Family) {
 }
 
 #[tokio::test]
-async fn the_exposition_keeps_the_rules_and_has_every_family() {
+async fn the_exposition_is_valid_and_contains_every_family() {
     let dir = tempfile::tempdir().unwrap();
     let binary = Binary::start(dir.path(), &[]).await;
     fly(&binary, "s", 0).await;
     let job = reqwest::Client::new().post(format!("{}/v1/jobs", binary.http)).body("{\"threads\": 1, \"priority\": -1}");
     assert_eq!(job.send().await.unwrap().status(), 201);
     let families = parse(&binary.metrics().await);
-    // The second one counts the first.
+    // The second exposition counts the request of the first.
     let families = [families, parse(&binary.metrics().await)];
     families.iter().for_each(check);
     let has: BTreeSet<&str> = families[1].keys().map(String::as_str).collect();
@@ -167,7 +167,7 @@ async fn the_exposition_keeps_the_rules_and_has_every_family() {
     assert!(memory[0].2 > 1e6);
 }
 
-/// How often a method was begun and ended with each code, and its messages.
+/// Counts of one method: started, handled per code, timed, and messages.
 #[derive(Debug, PartialEq)]
 struct Calls {
     started: f64,
@@ -207,7 +207,7 @@ fn counted(started: f64, handled: &[(&str, f64)], received: f64, sent: f64) -> C
     Calls { started, handled: handled.iter().map(|&(code, n)| (code.to_owned(), n)).collect(), timed, received, sent }
 }
 
-/// A call over a connection of its own, whose frames the test sends itself.
+/// A call on a connection of its own, whose frames the test sends.
 async fn raw_stream(binary: &Binary, path: &str) -> (h2::SendStream<bytes::Bytes>, h2::client::ResponseFuture) {
     let socket = tokio::net::TcpStream::connect(binary.grpc.trim_start_matches("http://")).await.unwrap();
     let (client, connection) = h2::client::handshake(socket).await.unwrap();
@@ -229,7 +229,7 @@ fn framed(message: &impl prost::Message) -> bytes::Bytes {
 const POLICIES: &str = "qedgix.v1.PolicyService";
 
 #[tokio::test]
-async fn calls_are_counted_when_they_end_with_the_status_that_they_end_with() {
+async fn grpc_calls_are_counted_with_their_final_status() {
     let dir = tempfile::tempdir().unwrap();
     let binary = Binary::start(dir.path(), &[]).await;
     let mut client = binary.policies().await;
@@ -241,7 +241,7 @@ async fn calls_are_counted_when_they_end_with_the_status_that_they_end_with() {
     assert_eq!(refused(client.act(in_session("nobody", None, scene(2, 3, 0))).await).0, Code::NotFound);
     let act = |text: &str| calls(text, POLICIES, "Act", "unary");
     let handled = [("OK", 3.0), ("FailedPrecondition", 1.0), ("NotFound", 1.0)];
-    // An answer is counted behind its last byte, which its caller may have read already.
+    // A call is counted after its last byte, which the client may have read before.
     let ended = async |seen: &dyn Fn(&str) -> Calls, expected: Calls| {
         soon(async {
             loop {
@@ -263,7 +263,7 @@ async fn calls_are_counted_when_they_end_with_the_status_that_they_end_with() {
     assert_eq!(binary.sample("qedgix_inference_failure_total{policy=\"sweep\"}").await, 0.0);
     assert_eq!(binary.sample("qedgix_act_compute_seconds_count").await, 3.0);
 
-    // A stream in both directions: begun at once, ended with its last message.
+    // A bidirectional stream: started at once, handled after its last message.
     let stream = |text: &str| calls(text, POLICIES, "ActStream", "bidi_stream");
     let (send, requests) = tokio::sync::mpsc::unbounded_channel();
     let requests = tokio_stream::wrappers::UnboundedReceiverStream::new(requests);
@@ -277,7 +277,7 @@ async fn calls_are_counted_when_they_end_with_the_status_that_they_end_with() {
     assert!(answers.message().await.unwrap().is_none());
     ended(&stream, counted(1.0, &[("OK", 1.0)], 3.0, 3.0)).await;
 
-    // One whose caller leaves.
+    // A stream whose client disconnects.
     let (mut questions, answer) = raw_stream(&binary, "/qedgix.v1.PolicyService/ActStream").await;
     questions.send_data(framed(&in_session("s", None, scene(2, 3, 6))), false).unwrap();
     let mut answers = soon(answer).await.unwrap().into_body();
@@ -285,7 +285,7 @@ async fn calls_are_counted_when_they_end_with_the_status_that_they_end_with() {
     questions.send_reset(h2::Reason::CANCEL);
     ended(&stream, counted(2.0, &[("OK", 1.0), ("Canceled", 1.0)], 4.0, 4.0)).await;
 
-    // One that ends with a status of its own, in its trailers.
+    // A stream that fails with a status in its trailers.
     let mut garbled = tonic::client::Grpc::new(binary.channel().await);
     garbled.ready().await.unwrap();
     let pieces = futures::stream::iter([bytes::Bytes::from_static(b"\xff\xff\xff\xff")]);
@@ -297,7 +297,7 @@ async fn calls_are_counted_when_they_end_with_the_status_that_they_end_with() {
     let handled = [("OK", 1.0), ("Canceled", 1.0), ("InvalidArgument", 1.0)];
     ended(&stream, counted(3.0, &handled, 5.0, 4.0)).await;
 
-    // Streams of the server, and what does not exist.
+    // Server streams, and unknown methods.
     let mut health = HealthClient::new(binary.channel().await);
     let mut states = health.watch(HealthCheckRequest::default()).await.unwrap().into_inner();
     states.message().await.unwrap().unwrap();
@@ -340,17 +340,20 @@ async fn rest_is_counted_by_route() {
     assert_eq!(count("GET", "unknown", 404).await, 2.0);
     assert_eq!(count("other", "/v1/policies", 405).await, 2.0);
     let text = binary.metrics().await;
-    assert!(!text.contains("BREW") && !text.contains("/no/such") && !text.contains("nobody"), "words of callers are no labels");
+    assert!(
+        !text.contains("BREW") && !text.contains("/no/such") && !text.contains("nobody"),
+        "input of callers does not become a label"
+    );
 }
 
 #[test]
 #[should_panic(expected = "of no family")]
-fn the_reader_of_expositions_sees_what_was_not_announced() {
+fn samples_without_a_family_fail_the_parser() {
     parse("# HELP a_total Of a test.\n# TYPE a_total counter\na_total 1\nb_total 1\n");
 }
 
 #[test]
 #[should_panic(expected = "counters end in _total")]
-fn the_rules_are_checked() {
+fn counters_without_total_fail_the_check() {
     check(&parse("# HELP fleets Of a test, counted.\n# TYPE fleets counter\nfleets 1\n"));
 }

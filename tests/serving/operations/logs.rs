@@ -1,4 +1,4 @@
-//! Logs: every line is what was asked for, and a request is found by its id.
+//! Logs: formats, levels, and request ids.
 
 use qedgix::wire::v1::ListJobsRequest;
 use reqwest::{Client, StatusCode};
@@ -16,12 +16,12 @@ fn named<T>(message: T, id: &str) -> tonic::Request<T> {
     request
 }
 
-/// The lines that tell of the request with this id.
-fn of<'a>(lines: &'a [Value], id: &str) -> Vec<&'a Value> {
+/// The log lines of the request with this id.
+fn lines_of<'a>(lines: &'a [Value], id: &str) -> Vec<&'a Value> {
     lines.iter().filter(|line| line["fields"]["request_id"] == id).collect()
 }
 
-/// Ends the program and reads its log.
+/// Stops the server and returns its log.
 async fn log(binary: Binary) -> Vec<Value> {
     binary.signal("TERM");
     let (code, lines) = binary.ended().await;
@@ -30,7 +30,7 @@ async fn log(binary: Binary) -> Vec<Value> {
 }
 
 #[tokio::test]
-async fn an_access_log_tells_of_every_request_as_json() {
+async fn the_access_log_has_a_json_line_per_request() {
     let dir = tempfile::tempdir().unwrap();
     let binary = Binary::start(dir.path(), &["--log-format", "json", "--access-log"]).await;
     fly(&binary, "s", 0).await;
@@ -52,7 +52,7 @@ async fn an_access_log_tells_of_every_request_as_json() {
         ("rest-1", "GET /v1/policies/{policy}", "200"),
         (&given, "GET /livez", "200"),
     ] {
-        let [line] = of(&lines, id)[..] else { panic!("one line tells of {id}: {lines:?}") };
+        let [line] = lines_of(&lines, id)[..] else { panic!("expected one line for {id}: {lines:?}") };
         assert_eq!((&line["level"], &line["target"]), (&json!("INFO"), &json!("qedgix::access")));
         let fields = &line["fields"];
         assert_eq!((&fields["method"], &fields["code"]), (&json!(method), &json!(code)), "{line}");
@@ -62,7 +62,7 @@ async fn an_access_log_tells_of_every_request_as_json() {
 }
 
 #[tokio::test]
-async fn without_it_slots_leave_no_trace_and_faults_and_refusals_do() {
+async fn without_an_access_log_only_failed_and_refused_requests_are_logged() {
     let dir = tempfile::tempdir().unwrap();
     let binary = Binary::start(dir.path(), &["--log-format", "json", "--max-message-size", "4096"]).await;
     fly(&binary, "s", 0).await;
@@ -72,7 +72,7 @@ async fn without_it_slots_leave_no_trace_and_faults_and_refusals_do() {
     let large = client.act(named(in_session("s", Some(2), scene(2, 300, 1)), "large")).await.unwrap_err();
     assert_eq!(large.code(), tonic::Code::ResourceExhausted, "{large}");
 
-    // The database loses a table while the server runs.
+    // Breaks the database while the server runs.
     let file = dir.path().join(qedgix::store::FILE);
     let mut database = SqliteConnection::connect_with(&SqliteConnectOptions::new().filename(file)).await.unwrap();
     sqlx::query("ALTER TABLE jobs RENAME TO elsewhere").execute(&mut database).await.unwrap();
@@ -87,13 +87,13 @@ async fn without_it_slots_leave_no_trace_and_faults_and_refusals_do() {
     sqlx::query("ALTER TABLE elsewhere RENAME TO jobs").execute(&mut database).await.unwrap();
 
     let lines = log(binary).await;
-    assert_eq!((of(&lines, "slot"), of(&lines, "mistake")), (vec![], vec![]));
+    assert_eq!((lines_of(&lines, "slot"), lines_of(&lines, "mistake")), (vec![], vec![]));
     for (id, level, method, code, detail) in [
         ("large", "WARN", "qedgix.v1.PolicyService/Act", "ResourceExhausted", "4096"),
         ("broken-rest", "ERROR", "GET /v1/jobs", "500", "no such table"),
         ("broken-grpc", "ERROR", "qedgix.v1.JobService/ListJobs", "Internal", "no such table"),
     ] {
-        let [line] = of(&lines, id)[..] else { panic!("one line tells of {id}: {lines:?}") };
+        let [line] = lines_of(&lines, id)[..] else { panic!("expected one line for {id}: {lines:?}") };
         let fields = &line["fields"];
         assert_eq!((&line["level"], &fields["method"], &fields["code"]), (&json!(level), &json!(method), &json!(code)), "{line}");
         assert!(format!("{}{}", fields["error"], fields["detail"]).contains(detail), "{line}");
@@ -101,7 +101,7 @@ async fn without_it_slots_leave_no_trace_and_faults_and_refusals_do() {
 }
 
 #[tokio::test]
-async fn text_is_one_line_per_event_whatever_callers_send() {
+async fn text_logs_have_one_line_per_event_for_any_input() {
     let dir = tempfile::tempdir().unwrap();
     let binary = Binary::start(dir.path(), &["--access-log"]).await;
     let job = json!({"name": "a-name", "labels": {"note": "two\nlines \u{1b}[31mred"}, "preset": "two\nlines"});
@@ -110,10 +110,10 @@ async fn text_is_one_line_per_event_whatever_callers_send() {
     binary.signal("TERM");
     let (_, lines) = binary.ended().await;
     assert!(lines.iter().all(|line| line.starts_with("20") && !line.contains('\u{1b}')), "{lines:?}");
-    let told: Vec<&String> = lines.iter().filter(|line| line.contains("request_id=odd")).collect();
-    assert_eq!(told.len(), 1, "{lines:?}");
+    let found: Vec<&String> = lines.iter().filter(|line| line.contains("request_id=odd")).collect();
+    assert_eq!(found.len(), 1, "{lines:?}");
     assert!(
-        told[0].contains("method=POST /v1/jobs") && told[0].contains("code=\"422\"") && !told[0].contains("otel."),
-        "{told:?}"
+        found[0].contains("method=POST /v1/jobs") && found[0].contains("code=\"422\"") && !found[0].contains("otel."),
+        "{found:?}"
     );
 }

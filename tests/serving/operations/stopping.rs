@@ -1,4 +1,4 @@
-//! Draining, as a supervisor does it: a signal, an orderly end, and a way out for the impatient.
+//! Draining on signals: orderly shutdown, the drain timeout, and the second signal.
 
 use qedgix::wire::v1;
 use qedgix::wire::v1::job_service_client::JobServiceClient;
@@ -13,7 +13,7 @@ use tonic_reflection::pb::v1::server_reflection_client::ServerReflectionClient;
 use super::super::binary::Binary;
 use super::super::harness::*;
 
-/// An `Act` that waits in the engine for company.
+/// An `Act` that waits in the engine for a larger batch.
 async fn in_flight(binary: &Binary) -> tokio::task::JoinHandle<Result<tonic::Response<v1::ActResponse>, tonic::Status>> {
     let mut client = binary.policies().await;
     loop {
@@ -24,18 +24,18 @@ async fn in_flight(binary: &Binary) -> tokio::task::JoinHandle<Result<tonic::Res
                 return act;
             }
         }
-        // It was answered before anybody looked.
+        // It was answered before the metric was read.
         act.await.unwrap().unwrap();
         client = binary.policies().await;
     }
 }
 
 #[tokio::test]
-async fn streams_end_and_what_is_in_flight_is_answered() {
+async fn sigterm_ends_streams_and_completes_requests_in_flight() {
     let dir = tempfile::tempdir().unwrap();
     let binary = Binary::start(dir.path(), &["--max-batch-delay", "3s", "--cpu-budget", "1"]).await;
     let mut jobs = JobServiceClient::new(binary.channel().await);
-    // A job that neither runs nor ends.
+    // A paused job neither runs nor ends.
     let spec = serde_json::json!({
         "algorithm": "vdn",
         "threads": 1,
@@ -60,39 +60,40 @@ async fn streams_end_and_what_is_in_flight_is_answered() {
     assert_eq!(states.message().await.unwrap().unwrap().status(), ServingStatus::Serving);
     let (asking, requests) = mpsc::unbounded_channel();
     let mut answers = binary.policies().await.act_stream(UnboundedReceiverStream::new(requests)).await.unwrap().into_inner();
-    // The crate's own service knows nothing of draining.
+    // The reflection service of the crate does not know about draining.
     let mut reflection = ServerReflectionClient::new(binary.channel().await);
-    let (_wondering, wonders) = mpsc::unbounded_channel();
-    let mut described = reflection.server_reflection_info(UnboundedReceiverStream::new(wonders)).await.unwrap().into_inner();
-    // Nothing was ever asked over this one.
+    let (_open, requests_of_reflection) = mpsc::unbounded_channel();
+    let mut described =
+        reflection.server_reflection_info(UnboundedReceiverStream::new(requests_of_reflection)).await.unwrap().into_inner();
+    // A connection without any request.
     let idle = tokio::net::TcpStream::connect(binary.http.trim_start_matches("http://")).await.unwrap();
     let act = in_flight(&binary).await;
 
     binary.signal("TERM");
     assert_eq!(soon(states.message()).await.unwrap().unwrap().status(), ServingStatus::NotServing);
     assert!(soon(states.message()).await.unwrap().is_none());
-    assert!(soon(answers.message()).await.unwrap().is_none(), "the stream ends, though its caller would go on");
+    assert!(soon(answers.message()).await.unwrap().is_none(), "the server ends the stream");
     assert!(soon(described.message()).await.unwrap().is_none());
-    let told = soon(async {
+    let watch_status = soon(async {
         loop {
             if let Err(status) = watch.message().await {
                 return status;
             }
         }
     });
-    assert_eq!(told.await.code(), Code::Unavailable);
+    assert_eq!(watch_status.await.code(), Code::Unavailable);
     soon(async { while events.chunk().await.unwrap().is_some() {} }).await;
     let answer = soon(act).await.unwrap().unwrap().into_inner();
     assert_eq!(answer.actions.len(), 2);
     let (code, lines) = binary.ended().await;
     assert_eq!(code, Some(0), "{lines:?}");
-    assert!(!lines.iter().any(|line| line.contains("gave up")), "{lines:?}");
+    assert!(!lines.iter().any(|line| line.contains("drain timeout")), "{lines:?}");
     assert!(!dir.path().join(qedgix::server::ENDPOINTS).exists());
     drop((asking, idle));
 }
 
 #[tokio::test]
-async fn a_second_signal_ends_at_once() {
+async fn a_second_signal_ends_the_process_at_once() {
     for (signal, code) in [("TERM", 143), ("INT", 130)] {
         let dir = tempfile::tempdir().unwrap();
         let binary = Binary::start(dir.path(), &["--max-batch-delay", "10s"]).await;
@@ -103,7 +104,7 @@ async fn a_second_signal_ends_at_once() {
         let (ended, lines) = binary.ended().await;
         assert_eq!(ended, Some(code), "{lines:?}");
         assert!(soon(act).await.unwrap().is_err());
-        // Nothing is left in the way of the next one.
+        // Another server can start on the same directory.
         let binary = Binary::start(dir.path(), &[]).await;
         let ready = reqwest::get(format!("{}/readyz", binary.http)).await.unwrap();
         assert_eq!(ready.status(), 200);
@@ -111,7 +112,7 @@ async fn a_second_signal_ends_at_once() {
 }
 
 #[tokio::test]
-async fn what_takes_too_long_is_given_up() {
+async fn requests_are_closed_after_the_drain_timeout() {
     let dir = tempfile::tempdir().unwrap();
     let binary = Binary::start(dir.path(), &["--max-batch-delay", "10s", "--drain-timeout", "50ms"]).await;
     let act = in_flight(&binary).await;

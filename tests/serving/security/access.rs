@@ -1,4 +1,4 @@
-//! The table of access covers everything that is served, and both transports go by it.
+//! The access table covers every method and route, and both transports enforce it.
 
 use std::collections::BTreeSet;
 
@@ -16,7 +16,7 @@ use super::super::harness::*;
 use super::super::limits::Raw;
 use super::{key, make, signed};
 
-/// `SERVICE/METHOD` of everything in the descriptor sets that reflection serves.
+/// `SERVICE/METHOD` of all methods in the descriptor sets of reflection.
 fn grpc_methods() -> Vec<String> {
     let sets = [qedgix::wire::DESCRIPTORS, tonic_health::pb::FILE_DESCRIPTOR_SET];
     let reflection = [tonic_reflection::pb::v1::FILE_DESCRIPTOR_SET, tonic_reflection::pb::v1alpha::FILE_DESCRIPTOR_SET];
@@ -32,7 +32,7 @@ fn grpc_methods() -> Vec<String> {
     methods
 }
 
-/// Verb and route of everything: what the document has, and what is registered below `/v2`, which is not in it.
+/// Verb and route of all routes: those of the OpenAPI document, and those below `/v2`, which are not in it.
 async fn rest_routes(server: &Server) -> Vec<(Method, String)> {
     const VERBS: [&str; 5] = ["GET", "POST", "PUT", "PATCH", "DELETE"];
     let document: Value = reqwest::get(server.url("/openapi.json")).await.unwrap().json().await.unwrap();
@@ -67,7 +67,7 @@ async fn rest_routes(server: &Server) -> Vec<(Method, String)> {
 }
 
 #[tokio::test]
-async fn everything_that_is_served_is_in_the_table() {
+async fn every_route_and_method_is_in_the_access_table() {
     let server = Server::start().await;
     let grpc = grpc_methods().into_iter().filter(|method| access::grpc_rule(&format!("/{method}")).is_none());
     let rest = rest_routes(&server).await.into_iter().filter(|(verb, route)| access::rest_rule(verb, route).is_none());
@@ -82,7 +82,7 @@ fn scopes(requirement: Requirement) -> Option<(Scope, Vec<Scope>)> {
     Some((scope, others.collect()))
 }
 
-/// A server of which jobs may be asked for, although none runs.
+/// A server whose jobs never run.
 async fn without_workers() -> Server {
     Server::with(|config| config.worker = Some("/bin/false".into())).await
 }
@@ -91,16 +91,20 @@ async fn grpc(channel: &Channel, method: &str, key: Option<&str>) -> (Code, Stri
     let mut client = tonic::client::Grpc::new(channel.clone());
     client.ready().await.unwrap();
     let request = key.map_or_else(|| tonic::Request::new(Bytes::new()), |key| signed(key, Bytes::new()));
-    // Every kind of method answers a stream of one message with its head.
+    // Every kind of method responds to a stream of one message.
     let answer = soon(client.server_streaming(request, format!("/{method}").parse().unwrap(), Raw)).await;
     answer.map_or_else(|status| (status.code(), status.message().to_owned()), |_| (Code::Ok, String::new()))
 }
 
 #[tokio::test]
-async fn grpc_goes_by_the_table() {
+async fn grpc_enforces_the_access_table() {
     let server = without_workers().await;
     let channel = server.channel().await;
-    assert_ne!(grpc(&channel, "qedgix.v1.PolicyService/ListPolicies", None).await.0, Code::Unauthenticated, "no key, no gate");
+    assert_ne!(
+        grpc(&channel, "qedgix.v1.PolicyService/ListPolicies", None).await.0,
+        Code::Unauthenticated,
+        "no key is required while none exists"
+    );
     let of = [key(&server, "read").await, key(&server, "act").await, key(&server, "jobs").await, key(&server, "admin").await];
     for method in grpc_methods() {
         let worker = method.starts_with("qedgix.v1.WorkerService/");
@@ -127,7 +131,7 @@ async fn grpc_goes_by_the_table() {
         assert_eq!(grpc(&channel, nowhere, Some(&of[0])).await.0, Code::PermissionDenied);
         assert_eq!(grpc(&channel, nowhere, Some(&of[3])).await.0, Code::Unimplemented);
     }
-    // Only what exists becomes a label.
+    // Unknown methods do not become labels.
     let metrics = reqwest::Client::new().get(server.url("/metrics")).bearer_auth(&of[0]).send().await.unwrap();
     let metrics = metrics.text().await.unwrap();
     let refused = "grpc_service=\"qedgix.v1.PolicyService\",grpc_method=\"Act\",grpc_code=\"Unauthenticated\"";
@@ -144,9 +148,9 @@ async fn rest(server: &Server, verb: &Method, path: &str, key: Option<&str>) -> 
 }
 
 #[tokio::test]
-async fn rest_goes_by_the_table() {
+async fn rest_enforces_the_access_table() {
     let server = without_workers().await;
-    assert_eq!(rest(&server, &Method::GET, "/v1/policies", None).await.0, 200, "no key, no gate");
+    assert_eq!(rest(&server, &Method::GET, "/v1/policies", None).await.0, 200, "no key is required while none exists");
     let of = [key(&server, "read").await, key(&server, "act").await, key(&server, "jobs").await, key(&server, "admin").await];
     let mut open = BTreeSet::new();
     for (verb, route) in rest_routes(&server).await {
@@ -171,7 +175,7 @@ async fn rest_goes_by_the_table() {
         }
     }
     assert!(open.contains("/livez") && open.contains("/readyz"), "{open:?}");
-    // A made-up path is only told to those who belong here; a verb that nothing answers, to admins.
+    // An unknown path is 404 for any valid key; an unknown verb is 405 for admins. Both are 401 without a key.
     for (verb, path, statuses) in [("GET", "/v1/nothing", [401, 404, 404]), ("PURGE", "/v1/act", [401, 403, 405])] {
         let verb: Method = verb.parse().unwrap();
         for (key, status) in [None, Some(&of[0]), Some(&of[3])].into_iter().zip(statuses) {
@@ -185,7 +189,7 @@ async fn rest_goes_by_the_table() {
 }
 
 #[tokio::test]
-async fn a_key_may_have_several_scopes_and_is_shown_in_either_header() {
+async fn keys_can_have_several_scopes_and_are_read_from_both_headers() {
     let server = Server::start().await;
     let created = make(&server, "read,jobs", |_| {}).await;
     let client = reqwest::Client::new();

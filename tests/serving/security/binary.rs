@@ -1,5 +1,4 @@
-//! The program itself: `qedgix keys` beside a running server, commands that show keys and certificates, SIGHUP, and logs
-//! without secrets.
+//! The binary: `qedgix keys` next to a running server, commands with keys and certificates, SIGHUP, and logs without secrets.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -16,7 +15,7 @@ use super::{signed, tls};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_qedgix");
 
-/// A server on free ports that logs everything; killed when dropped.
+/// A server on free ports with log level trace; killed when dropped.
 struct Process {
     child: Child,
     endpoints: Value,
@@ -46,7 +45,7 @@ impl Process {
         process
     }
 
-    /// Waits until the log says this.
+    /// Waits until a log line contains `words`.
     fn says(&mut self, words: &str) {
         loop {
             let line = self.lines.recv_timeout(Duration::from_secs(60)).unwrap_or_else(|_| panic!("{words}: {:#?}", self.log));
@@ -66,7 +65,7 @@ impl Process {
         assert!(Command::new("kill").args([&format!("-{name}"), &self.child.id().to_string()]).status().unwrap().success());
     }
 
-    /// Ends it and returns all that it said.
+    /// Stops the server and returns its log.
     fn end(mut self) -> String {
         self.signal("TERM");
         assert!(self.child.wait().unwrap().success());
@@ -92,14 +91,14 @@ fn run(words: &[&str], key: Option<&str>) -> Output {
     command.output().unwrap()
 }
 
-/// What a command that goes well prints.
+/// Standard output of a command that succeeds.
 fn printed(words: &[&str], key: Option<&str>) -> String {
     let output = run(words, key);
     assert!(output.status.success(), "{words:?}: {}", String::from_utf8_lossy(&output.stderr));
     String::from_utf8(output.stdout).unwrap().trim_end().to_owned()
 }
 
-/// Both outputs of a command that fails.
+/// Standard output and standard error of a command that fails.
 fn failed(words: &[&str], key: Option<&str>) -> String {
     let output = run(words, key);
     assert!(!output.status.success(), "{words:?}");
@@ -111,7 +110,7 @@ fn text(path: &Path) -> &str {
 }
 
 #[test]
-fn keys_are_made_listed_rotated_and_revoked() {
+fn keys_are_created_listed_rotated_and_revoked() {
     let dir = tempfile::tempdir().unwrap();
     let data = dir.path().join("new");
     fn in_order<'a>(data: &'a Path, words: &[&'a str]) -> Vec<&'a str> {
@@ -144,22 +143,22 @@ fn keys_are_made_listed_rotated_and_revoked() {
         (&["create", "--name", "", "--scopes", "read"], "name"),
         (&["revoke", "0000000000"], "no API key"),
     ] {
-        let told = failed(&in_order(&data, wrong), None);
-        assert!(told.contains(named), "{told}");
+        let output = failed(&in_order(&data, wrong), None);
+        assert!(output.contains(named), "{output}");
     }
     let all = format!("{table}{}", list());
     assert!(!all.contains(&key[15..]) && !all.contains(&rotated["key"].as_str().unwrap()[15..]), "{all}");
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn no_secret_is_logged_shown_or_repeated() {
+async fn secrets_appear_in_no_log_response_or_error() {
     let dir = tempfile::tempdir().unwrap();
     let create = |scopes| printed(&["keys", "create", "--name", "k", "--scopes", scopes, "--data-dir", text(dir.path())], None);
     let (admin, limited) = (create("admin"), create("jobs"));
     let wrong = format!("{}x", &admin[..admin.len() - 1]);
     let process = Process::start(dir, &[]);
     let (http, grpc) = (process.address("http").to_owned(), process.address("grpc").to_owned());
-    let mut told = String::new();
+    let mut output = String::new();
 
     let client = reqwest::Client::new();
     for (key, status) in [(&admin, 200), (&limited, 403), (&wrong, 401)] {
@@ -167,42 +166,42 @@ async fn no_secret_is_logged_shown_or_repeated() {
         for request in [get().bearer_auth(key), get().header("x-api-key", key)] {
             let answer = request.send().await.unwrap();
             assert_eq!(answer.status(), status);
-            told += &[format!("{:?}", answer.headers()), answer.text().await.unwrap()].concat();
+            output += &[format!("{:?}", answer.headers()), answer.text().await.unwrap()].concat();
         }
         let mut client = PolicyServiceClient::connect(format!("http://{grpc}")).await.unwrap();
         let answer = client.list_policies(signed(key, v1::ListPoliciesRequest::default())).await;
         assert_eq!(answer.is_ok(), status == 200);
-        told.extend([format!("{answer:?}")]);
+        output.extend([format!("{answer:?}")]);
     }
 
     let evaluate = ["evaluate", "--policy", "sweep", "--episodes", "1", "--slots", "3", "--server", &grpc];
-    told += &printed(&evaluate, Some(&admin));
-    told += &failed(&evaluate, Some(&wrong));
-    assert!(told.contains("is unknown"), "{told}");
-    told += &failed(&evaluate, Some(&limited));
-    assert!(told.contains("the scope act"), "{told}");
+    output += &printed(&evaluate, Some(&admin));
+    output += &failed(&evaluate, Some(&wrong));
+    assert!(output.contains("is unknown"), "{output}");
+    output += &failed(&evaluate, Some(&limited));
+    assert!(output.contains("the scope act"), "{output}");
     let train = ["train", "--server", &http, "--steps", "100"];
-    told += &failed(&train, Some(&wrong));
-    told += &failed(&train, Some(&format!("{admin}\u{1}")));
-    assert!(told.contains("--api-key: not an API key"), "{told}");
+    output += &failed(&train, Some(&wrong));
+    output += &failed(&train, Some(&format!("{admin}\u{1}")));
+    assert!(output.contains("--api-key: not an API key"), "{output}");
     for help in [["train", "--help"], ["evaluate", "--help"], ["keys", "--help"]] {
-        told += &printed(&help, Some(&admin));
+        output += &printed(&help, Some(&admin));
     }
-    told += &printed(&["bench", "act", "--help"], Some(&admin));
-    assert!(told.contains("QEDGIX_API_KEY"), "{told}");
+    output += &printed(&["bench", "act", "--help"], Some(&admin));
+    assert!(output.contains("QEDGIX_API_KEY"), "{output}");
 
     let log = process.end();
     let id = &admin[4..14];
-    assert!(log.contains("TRACE") && log.contains(id), "the log says everything, and who asked");
+    assert!(log.contains("TRACE") && log.contains(id), "the log has level trace and contains the id of the key");
     for key in [&admin, &limited, &wrong] {
         let secret = &key[15..];
-        assert!(!told.contains(secret), "{told}");
+        assert!(!output.contains(secret), "{output}");
         assert!(!log.contains(secret), "{}", log.lines().find(|line| line.contains(secret)).unwrap());
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_job_is_trained_by_a_server_that_asks_for_keys_and_certificates() {
+async fn a_job_runs_on_a_server_with_keys_and_client_certificates() {
     let dir = tempfile::tempdir().unwrap();
     let (ours, clients) = (tls::Authority::new("ours"), tls::Authority::new("clients"));
     let files = tls::write(dir.path(), &ours.issue(), Some(&clients));
@@ -278,17 +277,17 @@ async fn a_job_is_trained_by_a_server_that_asks_for_keys_and_certificates() {
     ]);
     let flown = tokio::task::spawn_blocking(move || run(fly, pilot));
     assert!(soon(flown).await.unwrap().contains("over-tls:1"));
-    // Without a certificate, or with a key that opens something else, nothing is.
-    let told = tokio::task::spawn_blocking(move || {
+    // Without a client certificate the server cannot be reached.
+    let output = tokio::task::spawn_blocking(move || {
         let bare: Vec<&str> =
             train.iter().map(String::as_str).filter(|word| !word.contains("client-") && !word.contains("own.")).collect();
         failed(&bare, Some(&trainer))
     });
-    assert!(soon(told).await.unwrap().contains("cannot reach https://localhost"));
+    assert!(soon(output).await.unwrap().contains("cannot reach https://localhost"));
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn sighup_reads_the_certificates_again() {
+async fn sighup_reloads_certificates() {
     let dir = tempfile::tempdir().unwrap();
     let [first, second] = ["first", "second"].map(tls::Authority::new);
     let [early, late] = ["early", "late"].map(tls::Authority::new);
@@ -310,7 +309,7 @@ async fn sighup_reads_the_certificates_again() {
     let new = tls::caller(&second, Some(&of_late));
     assert_eq!(tls::get(&new, false, &url).await.unwrap().0, 200);
     tls::policies(tls::channel(&new, process.address("grpc")).await.unwrap()).await.unwrap();
-    // Who was connected goes on; who comes with what was good before does not get in.
+    // Open connections continue; new connections with the old certificates are refused.
     tls::policies(open.clone()).await.unwrap();
     assert!(tls::get(&tls::caller(&first, Some(&of_late)), false, &url).await.is_err());
     assert!(tls::get(&tls::caller(&second, Some(&of_early)), false, &url).await.is_err());

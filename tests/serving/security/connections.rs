@@ -1,4 +1,4 @@
-//! Callers that connect too often, say nothing, or stop in the middle: each costs a connection for a while, and no more.
+//! Limits on connections: too many, silent, or interrupted ones.
 
 use std::time::Duration;
 
@@ -9,10 +9,10 @@ use tokio::net::TcpStream;
 use super::super::harness::*;
 use super::tls;
 
-/// Waits until the server closes this connection; what it said before.
+/// Waits until the server closes this connection and returns what it sent.
 async fn closed(mut stream: TcpStream) -> Vec<u8> {
     let mut said = Vec::new();
-    // A reset is an end as well.
+    // A reset counts as closed.
     let _ = soon(stream.read_to_end(&mut said)).await;
     said
 }
@@ -28,7 +28,7 @@ async fn live(server: &Server) -> bool {
 }
 
 #[tokio::test]
-async fn connections_are_bounded_over_both_addresses() {
+async fn the_connection_limit_covers_both_addresses() {
     let server = Server::with(|config| config.max_connections = 3).await;
     let mut stream = after(server.endpoints.http, b"GET /livez HTTP/1.1\r\nhost: x\r\n\r\n").await;
     let mut answer = [0; 12];
@@ -38,7 +38,7 @@ async fn connections_are_bounded_over_both_addresses() {
     for fleet in &mut fleets {
         fleet.act(held_slot()).await.unwrap();
     }
-    // Closed at once, on either address; those who are in go on.
+    // Further connections are closed at once on both addresses; open ones continue.
     for address in [server.endpoints.http, server.endpoints.grpc] {
         assert_eq!(closed(TcpStream::connect(address).await.unwrap()).await, b"");
     }
@@ -46,7 +46,7 @@ async fn connections_are_bounded_over_both_addresses() {
     for fleet in &mut fleets {
         fleet.act(held_slot()).await.unwrap();
     }
-    // Who leaves makes room.
+    // A closed connection frees its place.
     drop(stream);
     soon(async {
         while !live(&server).await {
@@ -62,7 +62,7 @@ fn held_slot() -> qedgix::wire::v1::ActRequest {
 }
 
 #[tokio::test]
-async fn who_says_nothing_is_not_waited_for() {
+async fn silent_connections_and_bodies_time_out() {
     let server = Server::with(|config| config.read_timeout = Duration::from_millis(200)).await;
     let preface = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
     let (grpc, http) = (server.endpoints.grpc, server.endpoints.http);
@@ -71,14 +71,14 @@ async fn who_says_nothing_is_not_waited_for() {
         let said = closed(after(address, begin).await).await;
         assert!(!said.starts_with(b"HTTP/1.1 2"), "{said:?}");
     }
-    // Between two requests it may say nothing for as long.
+    // The timeout also applies between two requests of an HTTP/1 connection.
     let said = closed(after(http, b"GET /livez HTTP/1.1\r\nhost: x\r\n\r\n").await).await;
     assert!(said.starts_with(b"HTTP/1.1 200 OK"), "{said:?}");
-    // A body that stops is an error of its caller.
+    // An incomplete body is an error of the caller.
     let head = b"POST /v1/act HTTP/1.1\r\nhost: x\r\nconnection: close\r\ncontent-length: 100\r\n\r\n{\"polic";
     let said = String::from_utf8(closed(after(http, head).await).await).unwrap();
     assert!(said.starts_with("HTTP/1.1 400 "), "{said}");
-    // Who has introduced itself may be silent for longer on gRPC: its connection answers pings.
+    // After the preface, a gRPC connection may be silent for longer, because it answers pings.
     let mut client = server.grpc().await;
     client.act(held_slot()).await.unwrap();
     tokio::time::sleep(Duration::from_millis(500)).await;
@@ -87,7 +87,7 @@ async fn who_says_nothing_is_not_waited_for() {
 }
 
 #[tokio::test]
-async fn handshakes_have_their_time_and_hold_up_nobody() {
+async fn slow_handshakes_time_out_and_delay_no_other_connection() {
     let (dir, authority) = (tempfile::tempdir().unwrap(), tls::Authority::new("ours"));
     let files = tls::write(dir.path(), &authority.issue(), None);
     let server = Server::with(|config| (config.tls, config.read_timeout) = (Some(files), Duration::from_secs(5))).await;
@@ -106,7 +106,7 @@ async fn handshakes_have_their_time_and_hold_up_nobody() {
 }
 
 #[tokio::test]
-async fn a_server_that_stops_waits_for_no_handshake() {
+async fn shutdown_does_not_wait_for_handshakes() {
     let (dir, authority) = (tempfile::tempdir().unwrap(), tls::Authority::new("ours"));
     let files = tls::write(dir.path(), &authority.issue(), None);
     let mut server = Server::with(|config| (config.tls, config.read_timeout) = (Some(files), Duration::from_secs(3600))).await;
@@ -119,7 +119,7 @@ async fn a_server_that_stops_waits_for_no_handshake() {
 }
 
 #[tokio::test]
-async fn streams_of_a_connection_are_bounded() {
+async fn streams_per_connection_are_limited() {
     for streams in [1024, 7] {
         let server = Server::with(|config| config.max_streams = streams).await;
         let socket = TcpStream::connect(server.endpoints.grpc).await.unwrap();
@@ -127,7 +127,7 @@ async fn streams_of_a_connection_are_bounded() {
         tokio::spawn(connection);
         let get = axum::http::Request::get("http://x/").body(()).unwrap();
         let mut client = client.ready().await.unwrap();
-        // The server's settings have come when it has answered.
+        // The server sends its settings before the response.
         let _ = soon(client.send_request(get, true).unwrap().0).await;
         assert_eq!(client.current_max_send_streams(), streams as usize);
     }

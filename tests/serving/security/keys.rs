@@ -1,4 +1,4 @@
-//! Keys begin and end, the server notices, and what it asked for once it asks for ever.
+//! API keys: creation, expiry, revocation, rotation, and what the server stores of them.
 
 use std::time::Duration;
 
@@ -10,7 +10,7 @@ use tonic::Code;
 use super::super::harness::*;
 use super::{key, make, refresh, signed};
 
-/// What `GET /v1/policies` answers: status and detail.
+/// Status and detail of `GET /v1/policies`.
 async fn ask(server: &Server, key: &str) -> (u16, String) {
     let answer = reqwest::Client::new().get(server.url("/v1/policies")).bearer_auth(key).send().await.unwrap();
     let (status, body) = (answer.status().as_u16(), answer.json::<serde_json::Value>().await.unwrap());
@@ -18,7 +18,7 @@ async fn ask(server: &Server, key: &str) -> (u16, String) {
 }
 
 #[tokio::test]
-async fn keys_end_and_the_server_never_falls_open() {
+async fn expired_and_revoked_keys_are_refused_and_keys_stay_required() {
     let server = Server::start().await;
     let forever = make(&server, "admin", |_| {}).await;
     let short = make(&server, "read", |new| new.lifetime = Some(Duration::from_secs(3600))).await;
@@ -30,12 +30,12 @@ async fn keys_end_and_the_server_never_falls_open() {
     keys::revoke(&server.app.store, &forever.info.id, server.app.clock.now()).await.unwrap();
     refresh(&server).await;
     assert_eq!(ask(&server, &forever.key).await, (401, "the API key is revoked".into()));
-    // Nobody has a good key now, and nobody gets in.
+    // No valid key is left, and requests still require one.
     assert!(ask(&server, "").await.1.starts_with("an API key is required"));
     assert_eq!(reqwest::get(server.url("/v1/policies")).await.unwrap().status(), 401);
     let mut client = server.grpc().await;
     assert_eq!(refused(client.list_policies(v1::ListPoliciesRequest::default()).await).0, Code::Unauthenticated);
-    // Not even when somebody empties the table under a running server; what was in it is over.
+    // Deleting all rows under a running server revokes their keys and does not turn keys off.
     let last = key(&server, "read").await;
     assert_eq!(ask(&server, &last).await.0, 200);
     let database = format!("sqlite://{}", server.dir.path().join("qedgix.sqlite").display());
@@ -47,7 +47,7 @@ async fn keys_end_and_the_server_never_falls_open() {
 }
 
 #[tokio::test]
-async fn what_is_almost_a_key_is_none() {
+async fn malformed_keys_are_refused() {
     let server = Server::start().await;
     let (good, other) = (key(&server, "read").await, key(&server, "read").await);
     let (head, secret) = good.rsplit_once('_').unwrap();
@@ -59,7 +59,7 @@ async fn what_is_almost_a_key_is_none() {
         format!("{good}x"),
         format!("{}{last}", &good[..good.len() - 1]),
         good.to_uppercase(),
-        // The id of one with the secret of another.
+        // The id of one key with the secret of another.
         format!("{head}_{}", other.rsplit_once('_').unwrap().1),
         format!("qdx_{}_{secret}", "0".repeat(10)),
         "x".repeat(10_000),
@@ -70,10 +70,10 @@ async fn what_is_almost_a_key_is_none() {
 }
 
 #[tokio::test]
-async fn a_running_server_notices_by_itself() {
+async fn a_running_server_notices_new_and_revoked_keys() {
     let server = Server::start().await;
-    assert_eq!(ask(&server, "").await.0, 200, "without keys everybody on this machine may ask");
-    // Another process would do the same: a database of its own on the same file.
+    assert_eq!(ask(&server, "").await.0, 200, "no key is required while none exists");
+    // A second connection to the database, as another process has it.
     let store = keys::open_store(server.dir.path(), false).await.unwrap();
     let new = keys::NewKey { name: "k".into(), scopes: "read".parse().unwrap(), lifetime: None, rate: None, burst: None };
     let created = keys::create(&store, new, server.app.clock.now()).await.unwrap();
@@ -88,26 +88,26 @@ async fn a_running_server_notices_by_itself() {
 }
 
 #[tokio::test]
-async fn a_stream_ends_with_its_key() {
+async fn a_stream_ends_when_its_key_is_revoked() {
     let server = Server::start().await;
     let created = make(&server, "act", |_| {}).await;
     let mut client = server.grpc().await;
-    let (ask, asked) = tokio::sync::mpsc::channel(1);
-    let stream = tokio_stream::wrappers::ReceiverStream::new(asked);
+    let (sender, requests) = tokio::sync::mpsc::channel(1);
+    let stream = tokio_stream::wrappers::ReceiverStream::new(requests);
     let mut answers = client.act_stream(signed(&created.key, stream)).await.unwrap().into_inner();
     let slot = || held("sweep", bytes::Bytes::new(), scene(2, 2, 0));
-    ask.send(slot()).await.unwrap();
+    sender.send(slot()).await.unwrap();
     let first = soon(answers.message()).await.unwrap().unwrap();
     assert!(matches!(first.result, Some(v1::act_result::Result::Response(_))), "{first:?}");
     keys::revoke(&server.app.store, &created.info.id, server.app.clock.now()).await.unwrap();
     refresh(&server).await;
-    ask.send(slot()).await.unwrap();
+    sender.send(slot()).await.unwrap();
     let status = soon(answers.message()).await.unwrap_err();
     assert_eq!((status.code(), status.message()), (Code::Unauthenticated, "the API key is revoked"));
 }
 
 #[tokio::test]
-async fn rotation_keeps_what_a_key_is_and_ends_the_old_one() {
+async fn rotation_copies_a_key_and_lets_the_old_one_expire() {
     let server = Server::start().await;
     let change = |new: &mut keys::NewKey| (new.lifetime, new.rate) = (Some(Duration::from_secs(1000)), Some(50.0));
     let old = make(&server, "read", change).await;
@@ -121,7 +121,7 @@ async fn rotation_keeps_what_a_key_is_and_ends_the_old_one() {
     assert_eq!([ask(&server, &old.key).await.0, ask(&server, &new.key).await.0], [200, 200]);
     server.pass(60);
     assert_eq!([ask(&server, &old.key).await.0, ask(&server, &new.key).await.0], [401, 200]);
-    // It does not live longer for being rotated again, and one that is over is not rotated.
+    // A longer grace does not extend the old key, and an expired key cannot be rotated.
     let again = keys::rotate(store, &new.info.id, Duration::from_secs(1_000_000), server.app.clock.now()).await.unwrap();
     let list = keys::list(store, server.app.clock.now()).await.unwrap();
     let ends: Vec<_> = list.iter().map(|key| (key.id.as_str(), key.state, key.expires_at)).collect();
@@ -155,7 +155,7 @@ async fn a_rotation_that_fails_leaves_no_new_key() {
 }
 
 #[tokio::test]
-async fn names_and_numbers_of_keys_are_checked() {
+async fn properties_of_new_keys_are_validated() {
     let server = Server::start().await;
     let refused = async |change: fn(&mut keys::NewKey)| {
         let mut new = keys::NewKey { name: "k".into(), scopes: "read".parse().unwrap(), lifetime: None, rate: None, burst: None };
@@ -172,17 +172,17 @@ async fn names_and_numbers_of_keys_are_checked() {
     assert_eq!(refused(|new| new.rate = Some(f64::NAN)).await, "rate");
     assert_eq!(refused(|new| new.burst = Some(0.0)).await, "burst");
     assert_eq!(refused(|new| new.lifetime = Some(Duration::from_secs(u64::MAX / 4))).await, "expires");
-    assert_eq!(reqwest::get(server.url("/v1/policies")).await.unwrap().status(), 200, "none was made");
+    assert_eq!(reqwest::get(server.url("/v1/policies")).await.unwrap().status(), 200, "no key was created");
 }
 
 #[tokio::test]
-async fn the_last_use_is_kept_and_a_restart_changes_nothing() {
+async fn the_time_of_last_use_survives_a_restart() {
     let mut server = Server::start().await;
     let created = make(&server, "read", |_| {}).await;
     server.pass(5000);
     assert_eq!(ask(&server, &created.key).await.0, 200);
     let used = async |server: &Server| keys::list(&server.app.store, server.app.clock.now()).await.unwrap()[0].last_used_at;
-    assert_eq!(used(&server).await, None, "no request writes");
+    assert_eq!(used(&server).await, None, "requests do not write to the database");
     server.app.keys.save_last_used(&server.app.store).await.unwrap();
     assert_eq!(used(&server).await, Some(server.app.clock.now()));
     server.pass(5);
@@ -190,13 +190,13 @@ async fn the_last_use_is_kept_and_a_restart_changes_nothing() {
     let last = server.app.clock.now();
     server.begin_stop();
     let server = server.restarted().await;
-    assert_eq!(used(&server).await, Some(last), "it is kept at the end");
+    assert_eq!(used(&server).await, Some(last), "saved at shutdown");
     assert_eq!(reqwest::get(server.url("/v1/policies")).await.unwrap().status(), 401);
     assert_eq!(ask(&server, &created.key).await.0, 200);
 }
 
 #[tokio::test]
-async fn the_database_holds_no_secret() {
+async fn the_database_contains_no_secret() {
     let server = Server::start().await;
     let created = make(&server, "read", |new| new.name = "findable".into()).await;
     assert_eq!(ask(&server, &created.key).await.0, 200);
@@ -206,15 +206,15 @@ async fn the_database_holds_no_secret() {
         bytes.extend(std::fs::read(file.unwrap().path()).unwrap());
     }
     let found = |text: &[u8]| bytes.windows(text.len()).any(|window| window == text);
-    assert!(found(b"findable") && found(created.info.id.as_bytes()), "this is where keys are");
-    assert!(found(&<sha2::Sha256 as sha2::Digest>::digest(secret)), "and their digests");
+    assert!(found(b"findable") && found(created.info.id.as_bytes()), "the database contains the key");
+    assert!(found(&<sha2::Sha256 as sha2::Digest>::digest(secret)), "the database contains the digest");
     for part in secret.as_bytes().chunks_exact(12) {
         assert!(!found(part));
     }
 }
 
 #[tokio::test]
-async fn who_moved_an_alias_is_kept() {
+async fn the_history_of_an_alias_names_the_key() {
     let server = Server::start().await;
     let created = make(&server, "admin", |_| {}).await;
     let send = |request: reqwest::RequestBuilder| request.bearer_auth(&created.key).send();
@@ -226,18 +226,18 @@ async fn who_moved_an_alias_is_kept() {
 }
 
 #[tokio::test]
-async fn following_a_job_ends_with_its_key() {
+async fn job_event_streams_end_when_their_key_is_revoked() {
     use std::os::unix::fs::PermissionsExt;
-    // A worker that does nothing: its job runs until it is cancelled.
+    // A worker that does nothing, so the job runs until it is cancelled.
     let dir = tempfile::tempdir().unwrap();
     let idle = dir.path().join("idle");
     std::fs::write(&idle, "#!/bin/sh\nexec sleep 1000\n").unwrap();
     std::fs::set_permissions(&idle, std::fs::Permissions::from_mode(0o755)).unwrap();
     let server = Server::with(|config| config.worker = Some(idle)).await;
-    let (boss, reader) = (key(&server, "jobs").await, make(&server, "read", |_| {}).await);
+    let (owner, reader) = (key(&server, "jobs").await, make(&server, "read", |_| {}).await);
     let client = reqwest::Client::new();
     let post = async |path: &str, body: &'static str| {
-        let request = client.post(server.url(path)).bearer_auth(&boss).header("content-type", "application/json").body(body);
+        let request = client.post(server.url(path)).bearer_auth(&owner).header("content-type", "application/json").body(body);
         request.send().await.unwrap().json::<serde_json::Value>().await.unwrap()
     };
     let id = post("/v1/jobs", "{\"algorithm\": \"vdn\"}").await["id"].as_str().unwrap().to_owned();
@@ -259,9 +259,9 @@ async fn following_a_job_ends_with_its_key() {
         }
     });
     assert_eq!(status.await.code(), Code::Unauthenticated);
-    let mut told = String::new();
+    let mut received = String::new();
     while let Some(part) = soon(page.chunk()).await.unwrap() {
-        told += std::str::from_utf8(&part).unwrap();
+        received += std::str::from_utf8(&part).unwrap();
     }
-    assert!(!told.contains("cancelled"), "{told}");
+    assert!(!received.contains("cancelled"), "{received}");
 }

@@ -1,4 +1,4 @@
-//! Who gets in: keys and scopes, rates, TLS, limits on connections; and that no secret is told to anybody.
+//! Security: API keys and scopes, rates, TLS, limits on connections, and secrecy of keys.
 
 mod access;
 mod binary;
@@ -12,7 +12,7 @@ use tonic::Request;
 
 use super::harness::Server;
 
-/// A key of a server in this process, which knows it when this returns.
+/// Creates a key that the server already knows when this returns.
 async fn make(server: &Server, scopes: &str, change: impl FnOnce(&mut NewKey)) -> CreatedKey {
     let mut new = NewKey { name: "of a test".into(), scopes: scopes.parse().unwrap(), lifetime: None, rate: None, burst: None };
     change(&mut new);
@@ -25,12 +25,12 @@ async fn key(server: &Server, scopes: &str) -> String {
     make(server, scopes, |_| {}).await.key
 }
 
-/// What the server does every second.
+/// Reloads the keys, which the server does every second.
 async fn refresh(server: &Server) {
     server.app.keys.refresh(&server.app.store).await.unwrap();
 }
 
-/// A gRPC request that shows a key.
+/// A gRPC request with an API key.
 fn signed<T>(key: &str, message: T) -> Request<T> {
     let mut request = Request::new(message);
     request.metadata_mut().insert("authorization", format!("Bearer {key}").parse().unwrap());

@@ -1,10 +1,10 @@
-//! How often a key may ask: per key, on both transports, slot by slot in batches and streams.
+//! Rate limits per API key, on both transports and for the slots of batches and streams.
 
 use bytes::Bytes;
 use qedgix::wire::v1;
 use tonic::Code;
 use tonic_types::StatusExt;
-use v1::act_result::Result as Told;
+use v1::act_result::Result as ActResult;
 
 use super::super::harness::*;
 use super::{key, make, signed};
@@ -20,7 +20,7 @@ async fn rest(server: &Server, key: &str) -> (u16, Option<String>) {
 }
 
 #[tokio::test]
-async fn a_key_that_asks_too_often_waits_and_others_do_not() {
+async fn a_key_over_its_rate_is_refused_and_other_keys_are_not() {
     let server = Server::start().await;
     let slow = make(&server, "read,act", |new| (new.rate, new.burst) = (Some(0.5), Some(3.0))).await.key;
     let free = key(&server, "read,act").await;
@@ -57,7 +57,7 @@ async fn requests_without_the_scope_count_against_the_rate() {
 }
 
 #[tokio::test]
-async fn the_server_has_a_rate_for_keys_without_one() {
+async fn keys_without_a_rate_use_the_rate_of_the_server() {
     let server = Server::with(|config| (config.key_rate, config.key_burst) = (Some(1.0), Some(2.0))).await;
     let (usual, own) = (key(&server, "read").await, make(&server, "read", |new| new.rate = Some(100.0)).await.key);
     let all = async |key: &str| {
@@ -72,28 +72,28 @@ async fn the_server_has_a_rate_for_keys_without_one() {
 }
 
 #[tokio::test]
-async fn batches_and_streams_count_their_slots() {
+async fn slots_of_batches_and_streams_are_counted() {
     let server = Server::start().await;
     let mut client = server.grpc().await;
     let limited = async || make(&server, "act", |new| (new.rate, new.burst) = (Some(1.0), Some(3.0))).await.key;
-    // A batch is answered whole, and what it cost is waited for.
+    // A batch is answered as a whole, and later requests wait for its slots.
     let batch = limited().await;
     let answer = client.act_batch(signed(&batch, v1::ActBatchRequest { requests: vec![slot(); 6] })).await.unwrap();
-    assert!(answer.into_inner().results.iter().all(|result| matches!(result.result, Some(Told::Response(_)))));
+    assert!(answer.into_inner().results.iter().all(|result| matches!(result.result, Some(ActResult::Response(_)))));
     assert_eq!(client.act(signed(&batch, slot())).await.unwrap_err().metadata().get("retry-after").unwrap(), "4");
     server.pass(4);
     client.act(signed(&batch, slot())).await.unwrap();
 
-    // A stream counts when it begins, then each slot; one that comes too soon is refused on its own.
+    // Opening a stream counts as one request, and each slot as another. Slots over the rate are refused individually.
     let stream = limited().await;
     let slots = tokio_stream::iter(vec![slot(); 4]);
     let mut answers = client.act_stream(signed(&stream, slots)).await.unwrap().into_inner();
-    let mut told = Vec::new();
+    let mut codes = Vec::new();
     while let Some(answer) = soon(answers.message()).await.unwrap() {
-        told.push(match answer.result.unwrap() {
-            Told::Response(_) => Code::Ok,
-            Told::Error(error) => Code::from(error.status),
+        codes.push(match answer.result.unwrap() {
+            ActResult::Response(_) => Code::Ok,
+            ActResult::Error(error) => Code::from(error.status),
         });
     }
-    assert_eq!(told, [Code::Ok, Code::Ok, Code::ResourceExhausted, Code::ResourceExhausted]);
+    assert_eq!(codes, [Code::Ok, Code::Ok, Code::ResourceExhausted, Code::ResourceExhausted]);
 }

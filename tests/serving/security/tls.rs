@@ -1,4 +1,4 @@
-//! TLS on both addresses: who is trusted, what is spoken inside, what else may come along.
+//! TLS on both addresses: server and client certificates, protocols, and errors of files.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -23,7 +23,7 @@ use tonic::transport::{Channel, Endpoint};
 use super::super::harness::*;
 use super::{key, signed};
 
-/// Issues certificates.
+/// A certificate authority.
 pub struct Authority(CertifiedIssuer<'static, KeyPair>);
 
 /// A certificate and its key, in PEM.
@@ -44,7 +44,7 @@ impl Authority {
         self.0.pem()
     }
 
-    /// For this machine, and for callers.
+    /// Issues a certificate for this machine or for a client.
     pub fn issue(&self) -> Identity {
         let key = KeyPair::generate().unwrap();
         let params = CertificateParams::new(vec!["127.0.0.1".into(), "localhost".into()]).unwrap();
@@ -52,7 +52,7 @@ impl Authority {
     }
 }
 
-/// Files for a server, as flags name them.
+/// Writes the TLS files of a server.
 pub fn write(dir: &Path, identity: &Identity, client_ca: Option<&Authority>) -> TlsFiles {
     let file = |name: &str, text: &str| -> PathBuf {
         std::fs::write(dir.join(name), text).unwrap();
@@ -65,7 +65,7 @@ pub fn write(dir: &Path, identity: &Identity, client_ca: Option<&Authority>) -> 
     }
 }
 
-/// A caller that trusts an authority and may show a certificate.
+/// TLS configuration of a client that trusts `trusted`, with an optional client certificate.
 pub fn caller(trusted: &Authority, identity: Option<&Identity>) -> ClientConfig {
     let mut roots = RootCertStore::empty();
     roots.add(CertificateDer::from_pem_slice(trusted.pem().as_bytes()).unwrap()).unwrap();
@@ -77,7 +77,7 @@ pub fn caller(trusted: &Authority, identity: Option<&Identity>) -> ClientConfig 
     builder.with_client_auth_cert(certs, PrivateKeyDer::from_pem_slice(identity.key.as_bytes()).unwrap()).unwrap()
 }
 
-/// `GET` over TLS: status and the version of HTTP that was agreed on.
+/// `GET` over TLS: the status and the negotiated HTTP version.
 pub async fn get(caller: &ClientConfig, http2: bool, url: &str) -> Result<(u16, Version), String> {
     let builder = HttpsConnectorBuilder::new().with_tls_config(caller.clone()).https_only();
     let connector = if http2 { builder.enable_all_versions().build() } else { builder.enable_http1().build() };
@@ -94,7 +94,7 @@ pub async fn channel(caller: &ClientConfig, address: impl std::fmt::Display) -> 
     connected.map_err(|e| format!("{e:?}"))
 }
 
-/// Asks for policies; a handshake that the server breaks off is noticed here at the latest.
+/// Lists policies. A handshake that the server aborts fails here at the latest.
 pub async fn policies(channel: Channel) -> Result<usize, String> {
     let mut client = PolicyServiceClient::new(channel);
     let answer = soon(client.list_policies(v1::ListPoliciesRequest::default())).await;
@@ -107,7 +107,7 @@ async fn over_tls(dir: &Path, authority: &Authority, clients: Option<&Authority>
 }
 
 #[tokio::test]
-async fn both_addresses_speak_tls() {
+async fn both_addresses_use_tls() {
     let (dir, authority) = (tempfile::tempdir().unwrap(), Authority::new("ours"));
     let server = over_tls(dir.path(), &authority, None).await;
     let url = format!("https://localhost:{}/v1/policies", server.endpoints.http.port());
@@ -115,7 +115,7 @@ async fn both_addresses_speak_tls() {
     assert_eq!(get(&trusting, false, &url).await, Ok((200, Version::HTTP_11)));
     assert_eq!(get(&trusting, true, &url).await, Ok((200, Version::HTTP_2)));
     assert!(policies(channel(&trusting, server.endpoints.grpc).await.unwrap()).await.unwrap() > 5);
-    // Old TLS, new TLS.
+    // TLS 1.2 and TLS 1.3.
     for version in [&rustls::version::TLS12, &rustls::version::TLS13] {
         let mut roots = RootCertStore::empty();
         roots.add(CertificateDer::from_pem_slice(authority.pem().as_bytes()).unwrap()).unwrap();
@@ -123,11 +123,11 @@ async fn both_addresses_speak_tls() {
         let config = builder.with_protocol_versions(&[version]).unwrap().with_root_certificates(roots).with_no_client_auth();
         assert_eq!(get(&config, false, &url).await, Ok((200, Version::HTTP_11)));
     }
-    // A caller that trusts somebody else is told by its own side.
+    // A client that trusts another authority refuses the server.
     let stranger = caller(&Authority::new("theirs"), None);
     assert!(get(&stranger, false, &url).await.unwrap_err().contains("UnknownIssuer"));
     assert!(channel(&stranger, server.endpoints.grpc).await.unwrap_err().contains("UnknownIssuer"));
-    // Keys work inside as they do outside.
+    // API keys work the same with TLS.
     let admin = key(&server, "admin").await;
     assert_eq!(get(&trusting, true, &url).await.unwrap().0, 401);
     let mut client = PolicyServiceClient::new(channel(&trusting, server.endpoints.grpc).await.unwrap());
@@ -135,7 +135,7 @@ async fn both_addresses_speak_tls() {
 }
 
 #[tokio::test]
-async fn callers_show_certificates_where_they_are_asked_to() {
+async fn client_certificates_are_required_and_verified() {
     let (dir, ours, clients) = (tempfile::tempdir().unwrap(), Authority::new("ours"), Authority::new("clients"));
     let server = over_tls(dir.path(), &ours, Some(&clients)).await;
     let url = format!("https://localhost:{}/livez", server.endpoints.http.port());
@@ -144,7 +144,7 @@ async fn callers_show_certificates_where_they_are_asked_to() {
     assert_eq!(get(&with(Some(&known)), false, &url).await.map(|answer| answer.0), Ok(200));
     let connected = channel(&with(Some(&known)), server.endpoints.grpc).await.unwrap();
     assert!(policies(connected).await.is_ok());
-    // Neither without one nor with one of somebody else; what is broken off is not the server.
+    // Missing and foreign certificates are refused, and the server continues.
     for identity in [None, Some(&unknown)] {
         assert!(get(&with(identity), false, &url).await.is_err());
         let refused = match channel(&with(identity), server.endpoints.grpc).await {
@@ -156,18 +156,18 @@ async fn callers_show_certificates_where_they_are_asked_to() {
     assert_eq!(get(&with(Some(&known)), true, &url).await.map(|answer| answer.0), Ok(200));
 }
 
-/// Sends bytes to an address, and whatever comes back until the server closes.
+/// Sends bytes and returns what the server sends until it closes the connection.
 async fn send(address: std::net::SocketAddr, bytes: &[u8]) -> Vec<u8> {
     let mut stream = TcpStream::connect(address).await.unwrap();
     stream.write_all(bytes).await.unwrap();
     let mut answer = Vec::new();
-    // A reset is an end as well.
+    // A reset counts as closed.
     let _ = soon(stream.read_to_end(&mut answer)).await;
     answer
 }
 
 #[tokio::test]
-async fn what_is_no_tls_is_turned_away() {
+async fn connections_without_tls_are_closed() {
     let (dir, authority) = (tempfile::tempdir().unwrap(), Authority::new("ours"));
     let server = over_tls(dir.path(), &authority, None).await;
     for address in [server.endpoints.grpc, server.endpoints.http] {
@@ -176,7 +176,7 @@ async fn what_is_no_tls_is_turned_away() {
             assert!(!answer.starts_with(b"HTTP/1.1 2"), "{answer:?}");
         }
     }
-    // And TLS sent to a server without it.
+    // TLS sent to a server without TLS.
     let plain = Server::start().await;
     let trusting = caller(&authority, None);
     assert!(get(&trusting, false, &format!("https://{}/livez", plain.endpoints.http)).await.is_err());
@@ -187,7 +187,7 @@ async fn what_is_no_tls_is_turned_away() {
 }
 
 #[tokio::test]
-async fn files_that_cannot_be_used_are_named_with_their_flag() {
+async fn errors_of_tls_files_name_flag_and_path() {
     let dir = tempfile::tempdir().unwrap();
     let (authority, other) = (Authority::new("ours"), Authority::new("others"));
     let good = write(dir.path(), &authority.issue(), Some(&other));
