@@ -61,7 +61,7 @@ async fn every_route_is_described_and_no_other() {
     let index = Rest::new(&server).get("/").await.1;
     let listed: BTreeSet<&str> = index["endpoints"].as_array().unwrap().iter().map(|e| e.as_str().unwrap()).collect();
     assert_eq!(listed.len(), served.values().map(BTreeSet::len).sum::<usize>());
-    assert!(listed.contains("PUT /v1/policies/{policy}/aliases/{alias}"));
+    assert!(listed.contains("PUT /v1/policies/{name}/aliases/{alias}"));
 }
 
 #[tokio::test]

@@ -55,7 +55,7 @@ struct Id {
     params((
         "idempotency-key" = Option<String>, Header,
         description = "The same key with the same job is the same job, however often it is sent: 1 to 255 printable characters.",
-        min_length = 1, max_length = 255, pattern = "^[ -~]*$", nullable = false
+        min_length = 1, max_length = 255, pattern = "^[!-~]([ -~]*[!-~])?$", nullable = false
     )),
     request_body = JobRequest,
     responses(

@@ -95,7 +95,7 @@ fn finished(document: &OpenApi, cpu_budget: usize) -> Value {
     schemas["ActRequest"]["oneOf"] = json!([one_of("graph", "scene"), one_of("scene", "graph")]);
     schemas["ActRequest"]["anyOf"] =
         json!(["session_id", "recurrent_state"].map(|none| json!({"properties": {none: {"type": "null"}}})));
-    document["paths"]["/v1/policies/{policy}/versions"]["post"]["parameters"][0]["schema"]["not"] = taken;
+    document["paths"]["/v1/policies/{name}/versions"]["post"]["parameters"][0]["schema"]["not"] = taken;
     for link in &LINKS {
         link.add(&mut document);
     }
@@ -111,7 +111,7 @@ struct Link {
     operations: &'static [&'static str],
 }
 
-const LINKS: [Link; 5] = [
+const LINKS: [Link; 6] = [
     Link {
         of: ("/v1/sessions", "post", "201"),
         parameter: ("id", "$response.body#/session_id"),
@@ -142,9 +142,14 @@ const LINKS: [Link; 5] = [
         operations: &["getCheckpoint"],
     },
     Link {
-        of: ("/v1/policies/{policy}/versions", "post", "201"),
+        of: ("/v1/policies/{name}/versions", "post", "201"),
         parameter: ("policy", "$response.body#/ref/name"),
-        operations: &["getPolicy", "exportPolicy", "setAlias", "listAliases", "listAliasMoves", "unloadPolicy", "loadPolicy"],
+        operations: &["getPolicy", "exportPolicy", "unloadPolicy", "loadPolicy"],
+    },
+    Link {
+        of: ("/v1/policies/{name}/versions", "post", "201"),
+        parameter: ("name", "$response.body#/ref/name"),
+        operations: &["setAlias", "listAliases", "listAliasMoves"],
     },
 ];
 
@@ -153,8 +158,11 @@ impl Link {
         let (path, verb, status) = self.of;
         let (parameter, source) = self.parameter;
         let link = |id: &&str| ((*id).to_owned(), json!({"operationId": id, "parameters": {parameter: source}}));
-        let links: Map<String, Value> = self.operations.iter().map(link).collect();
-        document["paths"][path][verb]["responses"][status]["links"] = links.into();
+        let links = &mut document["paths"][path][verb]["responses"][status]["links"];
+        if links.is_null() {
+            *links = json!({});
+        }
+        links.as_object_mut().expect("an object, made above").extend(self.operations.iter().map(link));
     }
 }
 

@@ -89,9 +89,9 @@ struct Versions {
 #[into_params(parameter_in = Path)]
 #[expect(dead_code, reason = "read as text; this is its documentation")]
 struct Name {
-    /// NAME of the policy.
+    /// NAME of the policy, without a version or alias.
     #[param(value_type = schemas::Name, inline, example = "qedgix")]
-    policy: String,
+    name: String,
 }
 
 /// An alias in a path.
@@ -99,9 +99,9 @@ struct Name {
 #[into_params(parameter_in = Path)]
 #[expect(dead_code, reason = "read as text; this is its documentation")]
 struct AliasOf {
-    /// NAME of the policy.
+    /// NAME of the policy, without a version or alias.
     #[param(value_type = schemas::Name, inline, example = "qedgix")]
-    policy: String,
+    name: String,
     /// The alias.
     #[param(value_type = schemas::Name, inline, example = "live")]
     alias: String,
@@ -175,7 +175,7 @@ fn by(caller: Option<Extension<Caller>>) -> Option<String> {
 /// Equal bytes under the same name are the version that they already are.
 #[utoipa::path(
     post,
-    path = "/v1/policies/{policy}/versions",
+    path = "/v1/policies/{name}/versions",
     operation_id = "uploadPolicy",
     tag = "policies",
     params(Name, UploadQuery),
@@ -288,14 +288,14 @@ struct Aliases {
 /// Aliases of a policy
 #[utoipa::path(
     get,
-    path = "/v1/policies/{policy}/aliases",
+    path = "/v1/policies/{name}/aliases",
     operation_id = "listAliases",
     tag = "policies",
     params(Name),
     responses((status = 200, description = "All of them.", body = Aliases), BadRequest, NotFound)
 )]
-async fn aliases(State(app): Shared, Path(policy): Path<String>) -> Result<Json<Aliases>, Error> {
-    let all = policies::aliases(&app, &policy)?.into_iter();
+async fn aliases(State(app): Shared, Path(name): Path<String>) -> Result<Json<Aliases>, Error> {
+    let all = policies::aliases(&app, &name)?.into_iter();
     Ok(Json(Aliases { aliases: all.map(|(alias, version)| Alias { alias, version }).collect() }))
 }
 
@@ -325,7 +325,7 @@ struct Moved {
 /// Let an alias mean a version, for all requests at once
 #[utoipa::path(
     put,
-    path = "/v1/policies/{policy}/aliases/{alias}",
+    path = "/v1/policies/{name}/aliases/{alias}",
     operation_id = "setAlias",
     tag = "policies",
     params(AliasOf),
@@ -360,7 +360,7 @@ struct Expected {
 /// Delete an alias
 #[utoipa::path(
     delete,
-    path = "/v1/policies/{policy}/aliases/{alias}",
+    path = "/v1/policies/{name}/aliases/{alias}",
     operation_id = "deleteAlias",
     tag = "policies",
     params(AliasOf, Expected),
@@ -428,7 +428,7 @@ struct History {
 /// Where the aliases of a policy have been, newest first
 #[utoipa::path(
     get,
-    path = "/v1/policies/{policy}/history",
+    path = "/v1/policies/{name}/history",
     operation_id = "listAliasMoves",
     tag = "policies",
     params(Name, HistoryQuery),
@@ -436,11 +436,11 @@ struct History {
 )]
 async fn history(
     State(app): Shared,
-    Path(policy): Path<String>,
+    Path(name): Path<String>,
     Query(query): Query<HistoryQuery>,
 ) -> Result<Json<History>, Error> {
     let HistoryQuery { alias, page_size, page_token } = query;
     let page = PageRequest { size: page_size, token: page_token };
-    let page = policies::history(&app, &policy, alias.as_deref(), &page).await?.map(Into::into);
+    let page = policies::history(&app, &name, alias.as_deref(), &page).await?.map(Into::into);
     Ok(Json(History { history: page.items, next_page_token: page.next_token }))
 }
