@@ -59,8 +59,7 @@ async fn rest_routes(server: &Server) -> Vec<(Method, String)> {
         }
         assert!(routes.len() > before, "no verb that this test knows in .route({route:?}, {handlers}");
     }
-    for known in [("POST", "/v1/act"), ("DELETE", "/v1/policies/{name}/aliases/{alias}"), ("POST", "/v2/models/{model}/infer")]
-    {
+    for known in [("POST", "/v1/act"), ("DELETE", "/v1/policies/{name}/aliases/{alias}"), ("POST", "/v2/models/{model}/infer")] {
         assert!(routes.contains(&(known.0, known.1.to_owned())), "{routes:?}");
     }
     routes.into_iter().map(|(verb, route)| (verb.parse().unwrap(), route)).collect()
