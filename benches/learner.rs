@@ -1,4 +1,4 @@
-//! Time of an update and of a rollout step by algorithm, size of the fleet, batch and threads, and of their matrix products:
+//! Time of an update and of a rollout step, by algorithm, fleet size, batch and threads, and of the matrix products:
 //! `cargo bench --bench learner`.
 #![allow(missing_docs)] // criterion's macros
 
@@ -13,7 +13,7 @@ use qedgix::nn::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
 use qedgix::policy::{Actor, Aggregation, Identity, ObservationKind, StepInput, TOKEN};
 use sample::episodes;
 
-/// What `reference/torch_qedgix.py speed` runs: flat, one-hot, mean, qmix.
+/// The configuration of docs/performance.md: flat, one-hot, mean, qmix.
 fn config(algorithm: Algorithm) -> TrainConfig {
     let mut config = TrainConfig::preset(algorithm, Preset::Paper);
     config.training.aggregation = Aggregation::Mean;
@@ -21,7 +21,7 @@ fn config(algorithm: Algorithm) -> TrainConfig {
     config
 }
 
-/// Networks that fly a fleet of any size.
+/// Networks that fit a fleet of any size.
 fn sized(uavs: usize, users: usize, range: f64) -> TrainConfig {
     let mut config = config(Algorithm::Qedgix);
     config.training.observation = ObservationKind::Set;
@@ -55,13 +55,13 @@ fn update(c: &mut Criterion) {
     for batch in [8, 32, 128] {
         measure("update, by batch", batch.to_string(), &config(Algorithm::Qedgix), batch, 2);
     }
-    // As many UAVs per area and users per area or more: what a node sees grows with V, so do the edges.
+    // Larger fleets in the same area: the number of edges per node grows with V.
     for (uavs, users, range) in [(2, 4, 0.28), (3, 5, 0.28), (4, 8, 0.28), (8, 32, 0.1), (16, 64, 0.1), (32, 128, 0.1)] {
         measure("update of 8, by size", format!("{uavs} UAVs, {users} users"), &sized(uavs, users, range), 8, 2);
     }
 }
 
-/// The kernel alone, at the shapes of a chunk of 8 episodes and at a slot's.
+/// The matrix product alone, at the shapes of a chunk of 8 episodes and of one slot.
 fn products(c: &mut Criterion) {
     let mut group = c.benchmark_group("product, one thread");
     group.sample_size(20).measurement_time(Duration::from_secs(1));

@@ -1,5 +1,7 @@
-//! Folders are layers; a file imports only from layers below it (ARCHITECTURE.md). This test keeps the picture true.
+//! Checks the structure that ARCHITECTURE.md describes: a file imports only from layers below its own, and within a layer no
+//! modules import each other in a circle.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -93,7 +95,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ),
 ];
 
-/// What the pure layers never touch.
+/// Names that pure layers must not contain.
 const IMPURE: &[&str] =
     &["tokio", "tonic", "axum", "sqlx", "std::fs", "std::net", "std::process", "std::time", "SystemTime", "rand::rng("];
 const PURE: &[&str] = &["invalid", "error_code", "rng", "nn", "env", "policy", "learner", "checkpoint", "plot", "experiment"];
@@ -151,6 +153,214 @@ fn imports(code: &str) -> Vec<String> {
         }
     }
     found
+}
+
+/// A module as the names on its path: `["policy", "mixer"]`.
+type Module = Vec<String>;
+
+/// The module that a file defines.
+fn module_of(path: &Path) -> Module {
+    let inside = path.strip_prefix(concat!(env!("CARGO_MANIFEST_DIR"), "/src")).expect("below src").with_extension("");
+    let names = inside.components().map(|part| part.as_os_str().to_string_lossy().into_owned());
+    names.filter(|name| name != "mod" && name != "lib").collect()
+}
+
+/// The identifiers, `::` and other symbols of `code`.
+fn tokens(code: &str) -> Vec<&str> {
+    let word = |c: char| c.is_alphanumeric() || c == '_';
+    let mut found = Vec::new();
+    let mut rest = code.trim_start();
+    while let Some(first) = rest.chars().next() {
+        let length = match rest.find(|c| !word(c)) {
+            Some(0) if rest.starts_with("::") => 2,
+            Some(0) => first.len_utf8(),
+            end => end.unwrap_or(rest.len()),
+        };
+        found.push(&rest[..length]);
+        rest = rest[length..].trim_start();
+    }
+    found
+}
+
+/// Paths of a use tree that starts at `at`, each after `prefix`, with the name that each path introduces. Returns the index
+/// behind the tree.
+fn use_tree(tokens: &[&str], mut at: usize, prefix: &[&str], found: &mut Vec<(Vec<String>, String)>) -> usize {
+    let mut path = prefix.to_vec();
+    loop {
+        match tokens.get(at).copied() {
+            Some("::") => at += 1,
+            Some("{") => {
+                at += 1;
+                while !matches!(tokens.get(at), Some(&("}" | ";")) | None) {
+                    at = use_tree(tokens, at, &path, found);
+                    at += usize::from(tokens.get(at) == Some(&","));
+                }
+                return at + 1;
+            }
+            Some("as") => {
+                found.push((path.iter().map(ToString::to_string).collect(), tokens[at + 1].to_owned()));
+                return at + 2;
+            }
+            Some("," | "}" | ";") | None => {
+                if path.len() > 1 && path.last() == Some(&"self") {
+                    path.pop();
+                }
+                let name = path.last().map(ToString::to_string).unwrap_or_default();
+                found.push((path.iter().map(ToString::to_string).collect(), name));
+                return at;
+            }
+            Some(name) => {
+                path.push(name);
+                at += 1;
+            }
+        }
+    }
+}
+
+/// The paths in a file's code: in `use` declarations, with the names that they introduce, and elsewhere.
+fn paths(code: &str) -> Vec<(Vec<String>, Option<String>)> {
+    let tokens = tokens(code);
+    let mut found = Vec::new();
+    let mut at = 0;
+    while at < tokens.len() {
+        if tokens[at] == "use" {
+            let mut tree = Vec::new();
+            at = use_tree(&tokens, at + 1, &[], &mut tree);
+            found.extend(tree.into_iter().map(|(path, name)| (path, Some(name))));
+        } else if tokens.get(at + 1) == Some(&"::") {
+            let mut path = vec![tokens[at].to_owned()];
+            at += 1;
+            while tokens.get(at) == Some(&"::") && tokens.get(at + 1).is_some_and(|t| t.starts_with(char::is_alphabetic)) {
+                path.push(tokens[at + 1].to_owned());
+                at += 2;
+            }
+            at += usize::from(tokens.get(at) == Some(&"::"));
+            found.push((path, None));
+        } else {
+            at += 1;
+        }
+    }
+    found
+}
+
+/// The modules of a source tree, the paths in each, and the names that each introduces by `use`.
+struct Modules {
+    paths: BTreeMap<Module, BTreeSet<Vec<String>>>,
+    names: BTreeMap<(Module, String), Vec<String>>,
+}
+
+impl Modules {
+    fn read(files: impl Iterator<Item = (Module, String)>) -> Self {
+        let files: Vec<(Module, String)> = files.collect();
+        let mut modules =
+            Self { paths: files.iter().map(|(m, _)| (m.clone(), BTreeSet::new())).collect(), names: BTreeMap::new() };
+        for (module, code) in &files {
+            for (path, name) in paths(code) {
+                let Some(path) = modules.absolute(module, &path) else { continue };
+                if let Some(name) = name {
+                    modules.names.insert((module.clone(), name), path.clone());
+                }
+                modules.paths.get_mut(module).expect("inserted above").insert(path);
+            }
+        }
+        modules
+    }
+
+    /// `path` from the root of the crate; `None` for other crates and local names.
+    fn absolute(&self, module: &Module, path: &[String]) -> Option<Vec<String>> {
+        let supers = path.iter().take_while(|name| *name == "super").count();
+        let (base, rest) = match path[0].as_str() {
+            "crate" => (&[][..], &path[1..]),
+            "self" => (&module[..], &path[1..]),
+            "super" => (&module[..module.len().checked_sub(supers)?], &path[supers..]),
+            child if self.paths.contains_key(&[&module[..], &[child.to_owned()]].concat()) => (&module[..], path),
+            _ => return None,
+        };
+        Some([base, rest].concat())
+    }
+
+    /// The module that defines the item at an absolute path, behind all re-exports.
+    fn definer(&self, path: &[String], depth: usize) -> Module {
+        let mut length = 0;
+        while length < path.len() && self.paths.contains_key(&path[..=length]) {
+            length += 1;
+        }
+        match path.get(length).and_then(|name| self.names.get(&(path[..length].to_vec(), name.clone()))) {
+            Some(target) if depth < 8 => self.definer(&[target, &path[length + 1..]].concat(), depth + 1),
+            _ => path[..length].to_vec(),
+        }
+    }
+
+    /// For each folder, which of its children import which others, with one example each.
+    fn siblings(&self) -> BTreeMap<Module, BTreeMap<String, BTreeMap<String, String>>> {
+        let mut folders = BTreeMap::<_, BTreeMap<_, BTreeMap<_, _>>>::new();
+        for (from, paths) in &self.paths {
+            for path in paths {
+                let to = self.definer(path, 0);
+                let common = from.iter().zip(&to).take_while(|(a, b)| a == b).count();
+                // 0: different layers, which another test checks.
+                if common > 0 && common < from.len() && common < to.len() {
+                    let example = format!("{} uses {}", from.join("::"), path.join("::"));
+                    let children = folders.entry(from[..common].to_vec()).or_default();
+                    children.entry(from[common].clone()).or_default().entry(to[common].clone()).or_insert(example);
+                }
+            }
+        }
+        folders
+    }
+
+    /// Every import that is part of a circle.
+    fn circles(&self) -> Vec<String> {
+        let mut found = Vec::new();
+        for children in self.siblings().values() {
+            for (from, imports) in children {
+                for (to, example) in imports {
+                    let mut reached = BTreeSet::from([to]);
+                    let mut queue = vec![to];
+                    while let Some(next) = queue.pop() {
+                        queue.extend(children.get(next).into_iter().flat_map(BTreeMap::keys).filter(|&n| reached.insert(n)));
+                    }
+                    if reached.contains(from) {
+                        found.push(example.clone());
+                    }
+                }
+            }
+        }
+        found
+    }
+}
+
+/// The rule: of the files and folders in one folder, none imports itself by way of others. A folder counts as one with all
+/// that is in it. An import counts where its item is defined, not where it is re-exported. A folder's own `mod.rs` holds what
+/// its children share, so imports between a module and its descendants are free.
+#[test]
+fn no_modules_of_a_layer_import_each_other_in_a_circle() {
+    let src = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/src"));
+    let files = sources(src).into_iter().filter(|path| !path.ends_with("src/main.rs"));
+    let modules = Modules::read(files.map(|path| (module_of(&path), code(&path))));
+    let imports: usize = modules.siblings().values().flat_map(BTreeMap::values).map(BTreeMap::len).sum();
+    assert!(imports > 100, "only {imports} imports between siblings were found");
+    let circles = modules.circles();
+    assert!(circles.is_empty(), "{}", circles.join("\n"));
+}
+
+#[test]
+fn circles_are_found_through_re_exports_groups_and_paths_in_code() {
+    let circles = |files: &[(&str, &str)]| {
+        let modules = files.iter().map(|(name, code)| (name.split("::").map(str::to_owned).collect(), (*code).to_owned()));
+        Modules::read(modules.collect::<Vec<_>>().into_iter()).circles()
+    };
+    let parent = ("a", "mod x; mod y; mod z; pub use x::{X, Inner as I}; use self::z::Z; struct Shared;");
+    assert_eq!(
+        circles(&[parent, ("a::x", "use super::{y::Y, Shared};"), ("a::y", "fn f() { crate::a::I::new() }"), ("a::z", "")]),
+        ["a::x uses a::y::Y", "a::y uses a::I::new"]
+    );
+    // By way of a third module, and of a module inside a folder.
+    let z = [("a::z", "mod deep;"), ("a::z::deep", "use super::super::x;")];
+    assert_eq!(circles(&[parent, ("a::x", "use super::y;"), ("a::y", "use super::z::{self, deep};"), z[0], z[1]]).len(), 3);
+    // Between a module and its descendants, everything is free; so is a straight line.
+    let line = [("a::x", "use super::{I, Shared, y};"), ("a::y", "use crate::a::Z;"), ("a::z", "use crate::b::x;")];
+    assert_eq!(circles(&[parent, line[0], line[1], line[2]]), [""; 0]);
 }
 
 #[test]

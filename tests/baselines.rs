@@ -1,4 +1,4 @@
-//! Baselines (spec 6): they are as good as they claim, they repeat themselves, and batching changes nothing.
+//! Baselines (docs/model.md, "Baselines"): quality, determinism, and independence of batching.
 
 use std::sync::Arc;
 
@@ -20,13 +20,13 @@ fn mean(episodes: &[EpisodeMetrics]) -> f64 {
 }
 
 #[test]
-fn each_beats_random_and_knowing_more_is_better() {
+fn better_informed_baselines_have_lower_aoi() {
     for (uavs, users) in [(2, 4), (3, 5), (4, 8)] {
         let env = EnvConfig { uavs, users, ..EnvConfig::default() };
         let all: Vec<_> = LIST.iter().map(|b| (b.name, flown(b.name, &env, 64))).collect();
         for (i, (worse, before)) in all.iter().enumerate() {
             for (better, after) in &all[i + 1..] {
-                // Two ways to use the same knowledge: which is better depends on the size.
+                // These two have the same information. Which is better depends on the size.
                 if (*worse, *better) != ("max-aoi", "nearest") {
                     let d = difference(after, before).unwrap().mean_aoi;
                     assert!(d.high < 0.0, "({uavs}, {users}): {better} against {worse}: {d:?}");
@@ -37,9 +37,9 @@ fn each_beats_random_and_knowing_more_is_better() {
 }
 
 #[test]
-fn mean_aoi_at_the_paper_s_sizes() {
+fn mean_aoi_for_the_sizes_of_the_paper() {
     let env = EnvConfig::default();
-    // Spec 6: random about 29, greedy-global at most 5.2; sweep searches well enough to find nearly everybody.
+    // The limits of docs/model.md, "Baselines".
     let random = mean(&flown("random", &env, 256));
     assert!((28.0..31.0).contains(&random), "random: {random}");
     let greedy = mean(&flown("greedy-global", &env, 256));
@@ -51,7 +51,6 @@ fn mean_aoi_at_the_paper_s_sizes() {
         let aoi = mean(&flown(greedy, &env, 256));
         assert!(aoi < 15.0, "{greedy}: {aoi}");
     }
-    // Spec 6: tour about 1.6 and 3.8; at (4, 8), where it was measured on other layouts, 1.2.
     for (uavs, users, limit) in [(3, 5, 1.6), (2, 4, 3.8), (4, 8, 1.3)] {
         let tour = mean(&flown("tour", &EnvConfig { uavs, users, ..EnvConfig::default() }, 256));
         assert!(tour < limit, "tour with ({uavs}, {users}): {tour}");
@@ -59,7 +58,7 @@ fn mean_aoi_at_the_paper_s_sizes() {
 }
 
 #[test]
-fn a_tour_is_planned_once_and_again_when_users_have_walked() {
+fn tour_plans_once_and_again_after_users_have_moved() {
     let policy = policy("tour");
     let users: Vec<Point> = (0..5).map(|j| [0.1 + 0.2 * j as f64, 0.3]).collect();
     let scene = |users: &[Point]| Slot::from_scene(&[[0.5, 0.5]; 3], users, &[0.0; 5], policy.detection_range());
@@ -73,11 +72,11 @@ fn a_tour_is_planned_once_and_again_when_users_have_walked() {
     let plan = memory.clone();
     let near: Vec<Point> = users.iter().map(|u| [u[0], u[1] + 0.05]).collect();
     fly(&scene(&near), 1, &mut memory);
-    assert_eq!(memory, plan, "nobody left the place that the plan was made for");
+    assert_eq!(memory, plan, "no user has moved too far from the plan");
     let far: Vec<Point> = users.iter().map(|u| [u[0], 1.0 - u[1]]).collect();
     let headings = fly(&scene(&far), 2, &mut memory);
     assert_ne!(memory, plan);
-    // A memory that makes no sense, as a caller might send one, is a reason to plan again too.
+    // A malformed memory, which a client could send, also leads to a new plan.
     for junk in [f32::NAN, f32::INFINITY, -1.0, 1e9, 2.0] {
         let mut memory = vec![junk; memory.len()];
         assert_eq!(fly(&scene(&far), 2, &mut memory), headings, "{junk}");
@@ -85,13 +84,11 @@ fn a_tour_is_planned_once_and_again_when_users_have_walked() {
 }
 
 #[test]
-fn tours_of_large_fleets_are_planned_too() {
+fn tours_of_large_fleets_are_planned() {
     for (uavs, users) in [(64, 1024), (1, 3000), (200, 3), (5, 5), (9, 40)] {
         let env = EnvConfig { uavs, users, slots: 12, ..EnvConfig::default() };
-        let begin = std::time::Instant::now();
-        flown("tour", &env, 1);
-        // Generous: tests share their processor.
-        assert!(begin.elapsed().as_secs() < 5, "({uavs}, {users}): {:?}", begin.elapsed());
+        let aoi = mean(&flown("tour", &env, 1));
+        assert!(aoi > 0.0 && aoi <= 12.0, "({uavs}, {users}): {aoi}");
     }
     let env = EnvConfig { uavs: 64, users: 1024, ..EnvConfig::default() };
     let better = difference(&flown("tour", &env, 4), &flown("sweep", &env, 4)).unwrap().mean_aoi;
@@ -99,7 +96,7 @@ fn tours_of_large_fleets_are_planned_too() {
 }
 
 #[test]
-fn the_same_seeds_fly_the_same_episodes_on_any_number_of_threads() {
+fn episodes_depend_on_seeds_only() {
     let env = EnvConfig { user_speed: 0.01, ..EnvConfig::default() };
     let seeds = layout_list("valid-v1").unwrap().seeds(20);
     for b in LIST {
@@ -108,11 +105,11 @@ fn the_same_seeds_fly_the_same_episodes_on_any_number_of_threads() {
         let backwards: Vec<u64> = seeds.iter().rev().copied().collect();
         let mut reversed = evaluate(&*policy(b.name), &env, &backwards, 1).unwrap();
         reversed.reverse();
-        assert_eq!(one, reversed, "{}: the order of fleets", b.name);
+        assert_eq!(one, reversed, "{}: order of fleets", b.name);
     }
 }
 
-/// A fleet in some slot, with its memory.
+/// A fleet in one slot, with its memory.
 struct Fleet {
     slot: Slot,
     memory: Vec<f32>,
@@ -136,7 +133,7 @@ impl Fleet {
 }
 
 #[test]
-fn fleets_of_different_sizes_share_a_batch_without_noticing() {
+fn fleets_of_different_sizes_in_one_batch_do_not_affect_each_other() {
     for b in LIST {
         let policy = policy(b.name);
         let fleets = || [(1, 1, 5), (3, 5, 6), (6, 2, 7)].map(|(m, n, seed)| Fleet::new(&*policy, m, n, seed));
@@ -157,7 +154,7 @@ fn fleets_of_different_sizes_share_a_batch_without_noticing() {
 }
 
 #[test]
-fn detections_are_enough_where_the_scene_is_not_needed() {
+fn detections_suffice_for_baselines_that_do_not_need_the_scene() {
     for b in LIST.iter().filter(|b| b.needs < RequiredInput::FullScene) {
         let policy = policy(b.name);
         let mut scene = Fleet::new(&*policy, 3, 5, 11);
@@ -174,7 +171,7 @@ fn detections_are_enough_where_the_scene_is_not_needed() {
 }
 
 #[test]
-fn seeds_matter_to_those_that_draw_and_memories_are_finite() {
+fn only_random_baselines_depend_on_seeds_and_memories_are_finite() {
     for b in LIST {
         let policy = policy(b.name);
         let fly = |seed: u64| {
@@ -195,7 +192,7 @@ fn seeds_matter_to_those_that_draw_and_memories_are_finite() {
 }
 
 #[test]
-fn values_are_absent_and_fleets_are_checked() {
+fn q_values_are_nan_and_fleets_are_checked() {
     let policy = policy("sweep");
     let mut fleet = Fleet::new(&*policy, 2, 2, 0);
     let mut q = vec![0.0; 16];

@@ -1,4 +1,4 @@
-//! The environment against spec 1: order of a step, every option, recorded dynamics, invariants.
+//! The environment (docs/model.md, "Environment"): order of a step, every option, recorded dynamics, invariants.
 
 #![allow(clippy::float_cmp, reason = "the expected numbers are exact in binary")]
 
@@ -24,7 +24,7 @@ fn episode(config: &EnvConfig) -> Episode {
 }
 
 #[test]
-fn reset_puts_uavs_in_the_middle_and_ages_nothing() {
+fn reset_puts_uavs_at_the_centre_and_aoi_to_0() {
     let env = BatchEnv::new(&EnvConfig::default(), 4).unwrap();
     assert!(env.uav_xy().iter().all(|&x| x == 0.5));
     assert!(env.aoi().iter().all(|&a| a == 0.0));
@@ -33,7 +33,7 @@ fn reset_puts_uavs_in_the_middle_and_ages_nothing() {
 }
 
 #[test]
-fn a_layout_depends_on_seed_and_users_only() {
+fn layout_depends_on_seed_and_number_of_users_only() {
     let mut a = BatchEnv::new(&EnvConfig::default(), 1).unwrap();
     let other = EnvConfig { uavs: 7, slots: 9, speed: 0.1, hover: true, start: Start::Random, ..EnvConfig::default() };
     let mut b = BatchEnv::new(&other, 2).unwrap();
@@ -43,7 +43,7 @@ fn a_layout_depends_on_seed_and_users_only() {
 }
 
 #[test]
-fn every_heading_turns_45_degrees_counter_clockwise() {
+fn headings_are_45_degrees_apart_counter_clockwise() {
     for h in 0..8_u8 {
         let mut e = episode(&pair([0.5, 0.5], [0.0, 0.0]));
         e.step(&[h]).unwrap();
@@ -55,19 +55,19 @@ fn every_heading_turns_45_degrees_counter_clockwise() {
 }
 
 #[test]
-fn data_is_collected_where_the_move_ends() {
-    // Out of range before the move, in range after it: AoI 0, and the reward already knows.
+fn data_is_collected_at_the_end_of_the_move() {
+    // Out of range before the move, in range after it: AoI 0, and the reward is computed from it.
     let mut e = episode(&pair([0.25, 0.5], [0.5, 0.5]));
     assert_eq!(e.step(&[0]), Ok(0.0));
     assert_eq!(e.aoi(), [0.0]);
-    // Flies away: ages again, one per slot.
+    // The UAV flies away, and AoI rises by 1 per slot.
     e.step(&[4]).unwrap();
     e.step(&[4]).unwrap();
     assert_eq!(e.aoi(), [2.0]);
 }
 
 #[test]
-fn the_edge_of_the_range_belongs_to_it() {
+fn a_user_exactly_at_the_transmission_range_is_collected() {
     // After flying up, dx = 0.125 exactly and dy = 0; all numbers are powers of two, so distance^2 == t^2.
     let mut e = episode(&pair([0.5, 0.375], [0.625, 0.5]));
     e.step(&[2]).unwrap();
@@ -78,7 +78,7 @@ fn the_edge_of_the_range_belongs_to_it() {
 }
 
 #[test]
-fn the_border_is_applied_before_data_is_collected() {
+fn boundary_rule_is_applied_before_data_is_collected() {
     // Unclamped the UAV would end at x = 1.06, out of range of the user; clamped it ends at 1.
     let mut clamped = pair([0.9375, 0.5], [0.9, 0.5]);
     clamped.transmission_range = 0.11;
@@ -92,7 +92,7 @@ fn the_border_is_applied_before_data_is_collected() {
 }
 
 #[test]
-fn each_coordinate_is_clamped_on_its_own() {
+fn coordinates_are_clamped_independently() {
     let mut e = episode(&pair([1.0, 0.5], [0.0, 0.0]));
     e.step(&[1]).unwrap();
     let [x, y] = e.uavs()[0];
@@ -100,7 +100,7 @@ fn each_coordinate_is_clamped_on_its_own() {
 }
 
 #[test]
-fn hovering_stays_and_exists_only_where_allowed() {
+fn hovering_needs_the_option_and_stays_in_place() {
     let still = pair([0.5, 0.5], [0.5, 0.5]);
     let mut e = episode(&EnvConfig { hover: true, ..still.clone() });
     e.step(&[8]).unwrap();
@@ -130,7 +130,7 @@ fn reward_is_scaled_mean_aoi() {
 }
 
 #[test]
-fn starts_are_given_or_drawn_from_the_seed() {
+fn start_positions_are_given_or_drawn_from_the_seed() {
     let given = EnvConfig { start: Start::Given(vec![[0.25, 0.75], [1.0, 0.0], [0.5, 0.5]]), ..EnvConfig::default() };
     assert_eq!(episode(&given).uavs(), [[0.25, 0.75], [1.0, 0.0], [0.5, 0.5]]);
     let random = EnvConfig { start: Start::Random, ..EnvConfig::default() };
@@ -141,7 +141,7 @@ fn starts_are_given_or_drawn_from_the_seed() {
 }
 
 #[test]
-fn moving_users_walk_their_speed_and_stay_in_the_square() {
+fn moving_users_keep_their_speed_and_stay_in_the_square() {
     let config = EnvConfig { user_speed: 0.02, slots: 500, ..EnvConfig::default() };
     let mut e = Episode::new(&config, 7).unwrap();
     let mut reflected = false;
@@ -156,15 +156,15 @@ fn moving_users_walk_their_speed_and_stay_in_the_square() {
             reflected |= walked < 0.019;
         }
     }
-    assert!(reflected, "somebody met the border in 500 slots");
+    assert!(reflected, "a user was reflected in 500 slots");
     let mut still = Episode::new(&EnvConfig::default(), 7).unwrap();
     let users = still.users();
     still.step(&[0, 1, 2]).unwrap();
-    assert_eq!(still.users(), users, "users stay unless told to walk");
+    assert_eq!(still.users(), users, "users do not move by default");
 }
 
 #[test]
-fn the_time_limit_refuses_further_steps_until_a_reset() {
+fn steps_after_the_time_limit_are_rejected_until_a_reset() {
     let mut e = episode(&EnvConfig { slots: 2, ..EnvConfig::default() });
     e.step(&[0, 0, 0]).unwrap();
     e.step(&[0, 0, 0]).unwrap();
@@ -176,7 +176,7 @@ fn the_time_limit_refuses_further_steps_until_a_reset() {
 }
 
 #[test]
-fn metrics_of_a_counted_episode() {
+fn metrics_of_a_small_episode() {
     // User 0 is always in range, user 1 never: ages 1, 2, 3, 4.
     let config = EnvConfig {
         uavs: 1,
@@ -195,11 +195,11 @@ fn metrics_of_a_counted_episode() {
     assert_eq!(m.peak_aoi, 4.0);
     assert_eq!(m.p95_aoi, 4.0, "nearest rank of 8 values");
     assert_eq!(m.coverage, 0.5);
-    assert_eq!(m.fairness, 0.5, "one of two users has it all");
+    assert_eq!(m.fairness, 0.5, "only one of two users is served");
 }
 
 #[test]
-fn configurations_out_of_range_are_refused() {
+fn configurations_out_of_range_are_rejected() {
     let bad = EnvConfig { speed: f64::NAN, ..EnvConfig::default() };
     assert_eq!(BatchEnv::new(&bad, 1).unwrap_err().field, "speed");
     let bad = EnvConfig { detection_range: 0.1, ..EnvConfig::default() };
@@ -207,7 +207,7 @@ fn configurations_out_of_range_are_refused() {
     assert!(BatchEnv::new(&EnvConfig::default(), 0).is_err());
 }
 
-/// The recorded actions of every golden file lead through the recorded positions, ages and rewards.
+/// The actions recorded in every golden file reproduce the recorded positions, AoI and rewards.
 #[test]
 fn recorded_dynamics() {
     let directory = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden");

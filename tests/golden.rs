@@ -1,8 +1,8 @@
-//! Recorded learner updates of an independent implementation (spec 8), replayed: visibility, observations, Q-values,
-//! targets, loss, every gradient, every parameter after the step.
+//! Compares whole learner updates with the golden files (docs/model.md, "Golden files"): detections, observations, Q-values,
+//! targets, loss, every gradient, and every parameter after the step.
 //!
-//! `QEDGIX_GOLDEN_DIR=DIR cargo test --release --test golden` checks every `*.safetensors` in DIR; without the variable, the
-//! repository's own. Prints each file with its worst tensor. A tensor that is missing, unexpected or of another shape fails.
+//! Checks every `*.safetensors` in `tests/golden`, or in the directory `QEDGIX_GOLDEN_DIR` if that variable is set. Prints each
+//! file with the tensor that comes closest to its tolerance. A file fails if a tensor is missing, unexpected or of another shape.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
@@ -19,12 +19,12 @@ use qedgix::policy::{
 };
 use safetensors::{Dtype, SafeTensors};
 
-/// Allowed error of outputs and gradients, relative to the tensor's largest magnitude.
-const EXACT: f64 = 2e-5;
-/// Of parameters after the step: Adam's first step turns tiny gradients into whole steps.
-const AFTER: f64 = 2e-3;
+/// Tolerance of outputs and gradients, relative to the tensor's largest magnitude.
+const TOLERANCE: f64 = 2e-5;
+/// Tolerance of parameters after the step: Adam's first step turns tiny gradients into whole steps.
+const TOLERANCE_AFTER: f64 = 2e-3;
 
-type Outcome<T> = Result<T, String>;
+type Checked<T> = Result<T, String>;
 
 fn main() -> ExitCode {
     let own = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden");
@@ -51,7 +51,7 @@ fn main() -> ExitCode {
     if failed == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
-fn golden_files(dir: &Path) -> Outcome<Vec<PathBuf>> {
+fn golden_files(dir: &Path) -> Checked<Vec<PathBuf>> {
     let entries = std::fs::read_dir(dir).map_err(|e| e.to_string())?;
     let paths: Result<Vec<_>, _> = entries.map(|e| e.map(|e| e.path())).collect();
     let mut files = paths.map_err(|e| e.to_string())?;
@@ -64,7 +64,7 @@ fn golden_files(dir: &Path) -> Outcome<Vec<PathBuf>> {
 struct Config {
     agent: AgentConfig,
     dims: Dims,
-    mixing: MixerKind,
+    mixer: MixerKind,
     td_lambda: TdLambda,
     batch: usize,
     learning_rate: f64,
@@ -72,9 +72,9 @@ struct Config {
 }
 
 impl Config {
-    fn parse(meta: &HashMap<String, String>) -> Outcome<Self> {
+    fn parse(meta: &HashMap<String, String>) -> Checked<Self> {
         let text = |key: &str| meta.get(key).map(String::as_str).ok_or_else(|| format!("metadata lacks {key}"));
-        fn number<T: FromStr>(key: &str, text: &str) -> Outcome<T> {
+        fn number<T: FromStr>(key: &str, text: &str) -> Checked<T> {
             text.parse().map_err(|_| format!("metadata {key} = {text} is not a number of its kind"))
         }
         let count = |key: &str| number::<usize>(key, text(key)?);
@@ -117,7 +117,7 @@ impl Config {
             normalise: false,
         };
         if count("token")? != TOKEN {
-            return Err(format!("metadata token = {}; the specification has {TOKEN}", text("token")?));
+            return Err(format!("metadata token = {}; expected {TOKEN}", text("token")?));
         }
         Ok(Self {
             agent,
@@ -128,7 +128,7 @@ impl Config {
                 detection_range: real("d")?,
                 slots: count("K")?,
             },
-            mixing: match text("mixer")? {
+            mixer: match text("mixer")? {
                 "qmix" => MixerKind::Qmix,
                 "invariant" => MixerKind::Invariant,
                 "vdn" => MixerKind::Vdn,
@@ -142,30 +142,30 @@ impl Config {
     }
 }
 
-/// A file's tensors, each taken once and its shape checked.
+/// A file's tensors. Their shapes are checked when they are read, and unread tensors are reported.
 struct Tensors<'a> {
     all: SafeTensors<'a>,
-    taken: BTreeSet<String>,
+    read: BTreeSet<String>,
 }
 
 impl Tensors<'_> {
-    fn bytes(&mut self, name: &str, shape: &[usize], dtype: Dtype) -> Outcome<&[u8]> {
+    fn bytes(&mut self, name: &str, shape: &[usize], dtype: Dtype) -> Checked<&[u8]> {
         let view = self.all.tensor(name).map_err(|_| format!("{name} is missing"))?;
         if view.shape() != shape || view.dtype() != dtype {
             let found = (view.shape(), view.dtype());
             return Err(format!("{name} is {found:?} instead of {:?}", (shape, dtype)));
         }
-        self.taken.insert(name.to_owned());
+        self.read.insert(name.to_owned());
         Ok(view.data())
     }
 
-    fn f32(&mut self, name: &str, shape: &[usize]) -> Outcome<Vec<f32>> {
+    fn f32(&mut self, name: &str, shape: &[usize]) -> Checked<Vec<f32>> {
         let bytes = self.bytes(name, shape, Dtype::F32)?;
         let values: Vec<f32> = bytes.as_chunks().0.iter().map(|&b| f32::from_le_bytes(b)).collect();
         if values.iter().all(|x| x.is_finite()) { Ok(values) } else { Err(format!("{name} is not finite")) }
     }
 
-    fn actions(&mut self, name: &str, shape: &[usize], count: usize) -> Outcome<Vec<u8>> {
+    fn actions(&mut self, name: &str, shape: &[usize], count: usize) -> Checked<Vec<u8>> {
         let bytes = self.bytes(name, shape, Dtype::I64)?;
         let values = bytes.as_chunks().0.iter().map(|&b| i64::from_le_bytes(b));
         values
@@ -174,7 +174,7 @@ impl Tensors<'_> {
     }
 }
 
-/// Compares tensors and remembers which came closest to its tolerance.
+/// Results of comparisons, with the tensor that came closest to its tolerance.
 #[derive(Default)]
 struct Report {
     /// Share of the tolerance used, tensor, relative error.
@@ -187,7 +187,7 @@ impl Report {
         assert_eq!(ours.len(), golden.len(), "{name}");
         let scale = golden.iter().fold(0.0, |max: f64, x| max.max(f64::from(x.abs())));
         let difference = |(a, b): (&f32, &f32)| (f64::from(*a) - f64::from(*b)).abs();
-        // Not f64::max, which ignores NaN.
+        // f64::max would ignore NaN.
         let largest = ours.iter().zip(golden).map(difference).fold(0.0, |m: f64, d| if d <= m { m } else { d });
         let error = if largest == 0.0 { 0.0 } else { largest / scale };
         if !(error <= tolerance) {
@@ -199,12 +199,12 @@ impl Report {
     }
 }
 
-fn check(file: &Path) -> Outcome<String> {
+fn check(file: &Path) -> Checked<String> {
     let bytes = std::fs::read(file).map_err(|e| e.to_string())?;
     let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|e| e.to_string())?;
     let config = Config::parse(header.metadata().as_ref().ok_or("no metadata")?)?;
     let all = SafeTensors::deserialize(&bytes).map_err(|e| e.to_string())?;
-    let mut tensors = Tensors { all, taken: BTreeSet::new() };
+    let mut tensors = Tensors { all, read: BTreeSet::new() };
     let mut report = Report::default();
     let Dims { uavs: m, users: n, slots: k, actions, .. } = config.dims;
     let b = config.batch;
@@ -224,10 +224,10 @@ fn check(file: &Path) -> Outcome<String> {
     };
     check_features(&config, &episodes, &mut tensors, &mut report)?;
 
-    let Config { agent, dims, mixing, td_lambda, .. } = config;
-    let mut loss = Loss::<f32>::new(agent, dims, mixing, td_lambda, 1);
+    let Config { agent, dims, mixer, td_lambda, .. } = config;
+    let mut loss = Loss::<f32>::new(agent, dims, mixer, td_lambda, 1);
     let layout = loss.layout().clone();
-    let mut flat = |prefix: &str| -> Outcome<Vec<f32>> {
+    let mut flat = |prefix: &str| -> Checked<Vec<f32>> {
         let mut values = Vec::with_capacity(layout.len());
         for p in layout.parameters() {
             values.extend(tensors.f32(&format!("{prefix}{}", p.name), &p.shape)?);
@@ -245,21 +245,21 @@ fn check(file: &Path) -> Outcome<String> {
         ("out.loss", &[metrics.loss as f32], &[1]),
         ("out.grad_norm", &[metrics.grad_norm as f32], &[1]),
     ] {
-        report.compare(name, ours, &tensors.f32(name, shape)?, EXACT);
+        report.compare(name, ours, &tensors.f32(name, shape)?, TOLERANCE);
     }
     Adam::new(online.len()).step(&mut online, loss.gradient(), config.learning_rate, (metrics.grad_norm, config.clip));
     for p in layout.parameters() {
         let range = p.range.clone();
-        report.compare(&format!("grad.{}", p.name), &loss.gradient()[range.clone()], &grads[range.clone()], EXACT);
-        report.compare(&format!("after.{}", p.name), &online[range.clone()], &after[range], AFTER);
+        report.compare(&format!("grad.{}", p.name), &loss.gradient()[range.clone()], &grads[range.clone()], TOLERANCE);
+        report.compare(&format!("after.{}", p.name), &online[range.clone()], &after[range], TOLERANCE_AFTER);
     }
 
-    let unexpected: Vec<_> = tensors.all.names().into_iter().filter(|name| !tensors.taken.contains(*name)).collect();
+    let unexpected: Vec<_> = tensors.all.names().into_iter().filter(|name| !tensors.read.contains(*name)).collect();
     if !unexpected.is_empty() {
         return Err(format!("unexpected tensors: {}", unexpected.join(", ")));
     }
     let (_, name, error) = &report.worst;
-    let worst = format!("{} tensors, worst {name} with relative error {error:.1e}", tensors.taken.len());
+    let worst = format!("{} tensors, worst {name} with relative error {error:.1e}", tensors.read.len());
     if report.failures.is_empty() {
         return Ok(worst);
     }
@@ -267,11 +267,11 @@ fn check(file: &Path) -> Outcome<String> {
     Err(format!("{worst}; beyond tolerance: {}", failures.join(", ")))
 }
 
-/// Visibility of all pairs, bit for bit; the flat observation of every node and the flat state, where recorded.
-fn check_features(config: &Config, episodes: &Episodes, tensors: &mut Tensors<'_>, report: &mut Report) -> Outcome<()> {
+/// Compares the detections of all pairs, exactly, and the flat observation of every node and the flat state if recorded.
+fn check_features(config: &Config, episodes: &Episodes, tensors: &mut Tensors<'_>, report: &mut Report) -> Checked<()> {
     let Dims { uavs: m, users: n, slots: k, detection_range: range, .. } = config.dims;
     let (b, nodes, width) = (episodes.len, m + n, 2 * m + 3 * n);
-    // One layer, so that the geometry has the users' view too.
+    // With one layer, the geometry has the detections of users too.
     let wanted = GeometryConfig { range, slots: k, layers: 1, self_loops: config.agent.self_loops, hops: 1 };
     let (mut geometry, mut search) = (Geometry::default(), HopSearch::default());
     geometry.clear();
@@ -298,8 +298,8 @@ fn check_features(config: &Config, episodes: &Episodes, tensors: &mut Tensors<'_
         return Err(format!("out.visible differs in {} pairs", golden.iter().zip(&visible).filter(|(a, b)| a != b).count()));
     }
     if config.agent.observation == ObservationKind::Flat {
-        report.compare("out.obs", &observations, &tensors.f32("out.obs", &[b, k + 1, nodes, width])?, EXACT);
-        report.compare("out.state", &state, &tensors.f32("out.state", &[b, k + 1, width])?, EXACT);
+        report.compare("out.obs", &observations, &tensors.f32("out.obs", &[b, k + 1, nodes, width])?, TOLERANCE);
+        report.compare("out.state", &state, &tensors.f32("out.state", &[b, k + 1, width])?, TOLERANCE);
     }
     Ok(())
 }

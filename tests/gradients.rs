@@ -1,4 +1,4 @@
-//! Hand-derived gradients against central differences, in f64: of every layer, and of the whole loss.
+//! Compares hand-derived gradients with central differences, in f64: of every layer, and of the whole loss.
 
 mod sample;
 
@@ -12,7 +12,7 @@ use qedgix::rng;
 use rand::RngExt;
 use sample::{AGENT, episodes};
 
-/// Allowed difference, relative to the largest gradient of the tensor.
+/// Tolerance, relative to the largest gradient of the tensor.
 const TOLERANCE: f64 = 1e-6;
 const STEP: f64 = 1e-6;
 
@@ -21,7 +21,7 @@ fn uniform(len: usize, name: &str) -> Vec<f64> {
     (0..len).map(|_| 2.0 * stream.random::<f64>() - 1.0).collect()
 }
 
-/// Checks `gradient` of `f` at `at`, in the ranges named: a few entries of each, and one random direction through it.
+/// Checks `gradient` of `f` at `at`: in each named range, three entries and one random direction.
 fn check(
     what: &str,
     ranges: &[(String, std::ops::Range<usize>)],
@@ -46,13 +46,13 @@ fn check(
             let error = (numeric - exact).abs();
             assert!(
                 error <= TOLERANCE * largest + 1e-9,
-                "{what}, {name}: {exact:e} by hand, {numeric:e} by differences, largest {largest:e}"
+                "{what}, {name}: derived {exact:e}, by differences {numeric:e}, largest {largest:e}"
             );
         }
     }
 }
 
-/// A layer as a function: parameters and inputs in, outputs; and backward: the gradients of both, given that of the outputs.
+/// A layer as a function of parameters and inputs, with the gradients of both.
 trait Layer {
     fn forward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>) -> Batch<f64>;
     fn backward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>, dy: Batch<f64>, grads: &mut [f64]) -> Batch<f64>;
@@ -152,7 +152,7 @@ fn mlp_of_two_parts() {
 
 struct Cell(Gru, Batch<f64>, Batch<f64>);
 
-/// Slots of the GRU test.
+/// Number of slots in the test of the GRU.
 const SLOTS: usize = 5;
 
 impl Layer for Cell {
@@ -207,7 +207,8 @@ impl Layer for Convolution {
     }
 }
 
-/// Two of the first kind, four of the second; node 1 sees itself, node 3 nobody, node 5 is only seen.
+/// Two nodes of the first kind and four of the second. Node 1 is its own neighbour, node 3 has no neighbour, node 5 is only a
+/// neighbour.
 fn graph() -> Graph {
     let lists: [&[u32]; 5] = [&[1, 2, 4], &[1, 0, 3], &[0, 5], &[], &[2, 0]];
     let offsets = std::iter::once(0).chain(lists.iter().scan(0, |end, l| {
@@ -244,10 +245,10 @@ fn whole_loss() {
         ("qmix", AgentConfig { gnn: Gnn::None, ..AGENT }, MixerKind::Qmix),
         ("iql", AgentConfig { gnn: Gnn::None, identity: Identity::Token, ..set }, MixerKind::None),
     ];
-    for (name, agent, mixing) in cases {
+    for (name, agent, mixer) in cases {
         let dims = Dims { uavs: 3, users: 4, actions: 9, detection_range: 0.28, slots: 3 };
         let td_lambda = TdLambda { gamma: 0.95, lambda: 0.6 };
-        let mut loss = Loss::<f64>::new(agent, dims, mixing, td_lambda, 1);
+        let mut loss = Loss::<f64>::new(agent, dims, mixer, td_lambda, 1);
         let layout = loss.layout().clone();
         let online: Vec<f64> = layout.initialise(&mut rng::stream(1, "online", 0));
         let target: Vec<f64> = layout.initialise(&mut rng::stream(1, "target", 0));

@@ -1,4 +1,5 @@
-//! Properties of agents, mixers and updates that hold for all parameters (spec 2.4, 3, 4, 5).
+//! Properties of agents, mixers and updates that hold for all parameters (docs/model.md, "Observations", "Agents", "Mixers",
+//! "Learner").
 
 mod sample;
 
@@ -27,7 +28,7 @@ fn learned(config: AgentConfig) -> LearnedPolicy {
     LearnedPolicy::new(config, DIMS, parameters(Agent::new(config, DIMS).layout(), 1)).expect("as many as the layout says")
 }
 
-/// A slot with everybody near the middle, so that most see each other.
+/// A slot with all nodes near the centre, so that most nodes detect each other.
 fn slot(uavs: usize, users: usize, seed: u64) -> Slot {
     let mut stream = rng::stream(seed, "slot", 0);
     let mut points = |n: usize| -> Vec<Point> { (0..n).map(|_| [0, 1].map(|_| 0.3 + 0.4 * stream.random::<f64>())).collect() };
@@ -36,7 +37,7 @@ fn slot(uavs: usize, users: usize, seed: u64) -> Slot {
     Slot::from_scene(&uavs, &users, &aoi, DIMS.detection_range)
 }
 
-/// A fleet between slots: slot, memory, and what it answered.
+/// A fleet with its slot, memory and last results.
 struct Fleet {
     slot: Slot,
     memory: Vec<f32>,
@@ -64,7 +65,7 @@ impl Fleet {
 }
 
 #[test]
-fn a_batched_answer_is_the_single_answer_bit_for_bit() {
+fn batching_does_not_change_a_bit_of_the_result() {
     let variants = [
         SET,
         AgentConfig { identity: Identity::Token, self_loops: true, layers: 3, ..SET },
@@ -92,15 +93,15 @@ fn a_batched_answer_is_the_single_answer_bit_for_bit() {
 }
 
 #[test]
-fn more_hops_see_exactly_what_links_lead_to() {
-    // A chain of users from one UAV, each only seen by the one before, and a second UAV at its end.
+fn more_hops_observe_exactly_the_nodes_within_that_many_links() {
+    // A chain: UAV 0, four users, UAV 1. Each node detects only the next and the previous one.
     let users: Vec<Point> = (1..=4).map(|i| [0.2 * f64::from(i), 0.0]).collect();
     let slot = Slot::from_scene(&[[0.0, 0.0], [1.0, 0.0]], &users, &[8.0, 16.0, 24.0, 32.0], 0.25);
     for (hops, reach) in [(1, [2].as_slice()), (2, &[2, 3]), (3, &[2, 3, 4]), (4, &[2, 3, 4, 5]), (5, &[1, 2, 3, 4, 5])] {
         let config = GeometryConfig { range: 0.25, slots: 80, layers: 0, self_loops: false, hops };
         let (mut geometry, mut search) = (Geometry::default(), HopSearch::default());
         geometry.clear();
-        // Fleets before and after change nothing.
+        // Several equal fleets: each gets its own nodes.
         (0..3).for_each(|_| geometry.push_slot(&config, &slot));
         geometry.finish(&config);
         for fleet in 0..3 {
@@ -111,7 +112,7 @@ fn more_hops_see_exactly_what_links_lead_to() {
                 let x = if d.target == 1 { 1.0 } else { 0.2 * (d.target - 1) as f32 };
                 assert!((d.rel[0] - x).abs() < 1e-6 && d.rel[1] == 0.0, "{d:?}");
             }
-            assert_eq!(geometry.node(fleet, 1, &mut search).detections.len(), reach.len(), "the chain from its other end");
+            assert_eq!(geometry.node(fleet, 1, &mut search).detections.len(), reach.len(), "from the other end");
         }
     }
 }
@@ -135,7 +136,7 @@ fn more_hops_hold_no_more_detections() {
 }
 
 #[test]
-fn actor_policy_and_update_see_the_same_values() {
+fn actor_policy_and_update_compute_the_same_values() {
     let plain = AgentConfig { gnn: Gnn::None, ..AGENT };
     let configs =
         [AGENT, SET, AgentConfig { identity: Identity::Token, ..plain }, AgentConfig { hops: 3, normalise: true, ..plain }];
@@ -179,7 +180,7 @@ fn actor_policy_and_update_see_the_same_values() {
 
                 let actions = &ep.actions[(e * slots + t) * m..][..m];
                 actor.record_actions(actions);
-                // Replay what the episode did instead of the greedy heading.
+                // Continue with the action of the episode instead of the greedy heading.
                 let stride = memory.len() / m;
                 memory.chunks_exact_mut(stride).zip(actions).for_each(|(uav, &a)| uav[HIDDEN] = f32::from(a));
             }
@@ -188,7 +189,7 @@ fn actor_policy_and_update_see_the_same_values() {
 }
 
 #[test]
-fn without_an_identity_uavs_move_as_one_for_ever_and_with_one_they_part() {
+fn uavs_separate_only_with_an_identity() {
     let fly = |config: AgentConfig, seed: u64| {
         let policy = LearnedPolicy::new(config, DIMS, parameters(Agent::new(config, DIMS).layout(), seed)).expect("the layout's");
         assert_eq!(policy.needs(), if config.self_position { RequiredInput::OwnPositions } else { RequiredInput::Detections });
@@ -197,7 +198,7 @@ fn without_an_identity_uavs_move_as_one_for_ever_and_with_one_they_part() {
         let mut uavs: Vec<Point> = vec![[0.5, 0.5]; 3];
         let mut memory = vec![0.0; policy.memory_len(3, 5)];
         policy.start(3, 5, seed, &mut memory);
-        let mut parted = false;
+        let mut separated = false;
         for step in 0..80 {
             let slot = Slot::from_scene(&uavs, &users, &[step as f32; 5], DIMS.detection_range);
             let mut headings = [0; 3];
@@ -206,21 +207,21 @@ fn without_an_identity_uavs_move_as_one_for_ever_and_with_one_they_part() {
                 let (sin, cos) = (f64::from(h) * std::f64::consts::FRAC_PI_4).sin_cos();
                 *p = [(p[0] + 0.04 * cos).clamp(0.0, 1.0), (p[1] + 0.04 * sin).clamp(0.0, 1.0)];
             }
-            parted |= uavs.iter().any(|p| *p != uavs[0]);
+            separated |= uavs.iter().any(|p| *p != uavs[0]);
         }
-        parted
+        separated
     };
     for gnn in [Gnn::None, Gnn::EdgeConv] {
-        let parts = |identity| (0..6).filter(|&seed| fly(AgentConfig { gnn, identity, ..SET }, seed)).count();
-        assert_eq!(parts(Identity::None), 0, "{gnn:?}");
+        let separating = |identity| (0..6).filter(|&seed| fly(AgentConfig { gnn, identity, ..SET }, seed)).count();
+        assert_eq!(separating(Identity::None), 0, "{gnn:?}");
         for identity in [Identity::Onehot, Identity::Phase, Identity::Token] {
-            // A drawn network may prefer one heading whatever it is told; some of six do not.
-            assert!(parts(identity) > 0, "{gnn:?}, {identity:?}");
+            // Some random networks prefer the same heading for every input, but not all six.
+            assert!(separating(identity) > 0, "{gnn:?}, {identity:?}");
         }
     }
 }
 
-/// q of one slot of a set agent without identity, its UAVs and users in the order given.
+/// Q-values of one slot, for UAVs and users in the order given.
 fn values(policy: &LearnedPolicy, uavs: &[Point], users: &[(Point, f32)]) -> Vec<f32> {
     let (points, aoi): (Vec<Point>, Vec<f32>) = users.iter().copied().unzip();
     let slot = Slot::from_scene(uavs, &points, &aoi, DIMS.detection_range);
@@ -236,7 +237,7 @@ fn close(a: f32, b: f32) -> bool {
 }
 
 #[test]
-fn set_agents_are_equivariant_under_permutations_of_uavs_and_invariant_under_those_of_users() {
+fn set_agents_are_equivariant_in_uavs_and_invariant_in_users() {
     for gnn in [Gnn::None, Gnn::EdgeConv, Gnn::AggGnn, Gnn::Rgcn] {
         let policy = learned(AgentConfig { gnn, identity: Identity::None, ..SET });
         let mut stream = rng::stream(2, "permutation", 0);
@@ -252,21 +253,21 @@ fn set_agents_are_equivariant_under_permutations_of_uavs_and_invariant_under_tho
                 assert!(close(q[from * 8 + a], permuted[to * 8 + a]), "{gnn:?}");
             }
         }
-        assert!(q[..8].iter().zip(&q[8..16]).any(|(a, b)| !close(*a, *b)), "different UAVs value differently");
+        assert!(q[..8].iter().zip(&q[8..16]).any(|(a, b)| !close(*a, *b)), "UAVs at different positions have different Q-values");
     }
 }
 
-/// A mixer with drawn parameters, and Q_tot as a function of state and values.
-struct Mixed {
+/// A mixer with random parameters: Q_tot as a function of state and values.
+struct RandomMixer {
     mixer: Mixer,
     flat: Vec<f32>,
     transposed: Vec<f32>,
 }
 
-impl Mixed {
-    fn new(mixing: MixerKind, dims: &Dims, seed: u64) -> Self {
+impl RandomMixer {
+    fn new(kind: MixerKind, dims: &Dims, seed: u64) -> Self {
         let mut layout = ParameterLayout::default();
-        let mixer = Mixer::new(mixing, dims, &mut layout);
+        let mixer = Mixer::new(kind, dims, &mut layout);
         let flat = parameters(&layout, seed);
         let mut transposed = vec![0.0; flat.len()];
         mixer.prepare(&flat, &mut transposed);
@@ -296,23 +297,23 @@ impl Mixed {
     }
 }
 
-fn drawn(len: usize, seed: u64) -> Vec<f32> {
+fn uniform(len: usize, seed: u64) -> Vec<f32> {
     let mut stream = rng::stream(seed, "drawn", 0);
     (0..len).map(|_| 2.0 * stream.random::<f32>() - 1.0).collect()
 }
 
 #[test]
-fn q_tot_does_not_fall_when_a_value_rises() {
-    for mixing in [MixerKind::Qmix, MixerKind::Invariant, MixerKind::Vdn] {
+fn q_tot_is_monotone_in_every_value() {
+    for kind in [MixerKind::Qmix, MixerKind::Invariant, MixerKind::Vdn] {
         for seed in 0..50 {
-            let mixed = Mixed::new(mixing, &DIMS, seed);
-            let (state, q) = (drawn(2 * 3 + 3 * 5, seed), drawn(3, seed + 1000));
-            let slope = mixed.slope(&state, &q);
-            assert!(slope.iter().all(|&d| d >= 0.0) && slope.iter().any(|&d| d > 0.0), "{mixing:?}: {slope:?}");
+            let mixer = RandomMixer::new(kind, &DIMS, seed);
+            let (state, q) = (uniform(2 * 3 + 3 * 5, seed), uniform(3, seed + 1000));
+            let slope = mixer.slope(&state, &q);
+            assert!(slope.iter().all(|&d| d >= 0.0) && slope.iter().any(|&d| d > 0.0), "{kind:?}: {slope:?}");
             for i in 0..3 {
                 let mut more = q.clone();
                 more[i] += 0.5;
-                assert!(mixed.total(&state, &more) >= mixed.total(&state, &q), "{mixing:?}");
+                assert!(mixer.total(&state, &more) >= mixer.total(&state, &q), "{kind:?}");
             }
         }
     }
@@ -320,15 +321,15 @@ fn q_tot_does_not_fall_when_a_value_rises() {
 
 #[test]
 fn the_invariant_mixer_ignores_the_order_of_uavs_and_of_users() {
-    let mixed = Mixed::new(MixerKind::Invariant, &DIMS, 4);
-    let (state, q) = (drawn(21, 4), drawn(3, 5));
+    let mixer = RandomMixer::new(MixerKind::Invariant, &DIMS, 4);
+    let (state, q) = (uniform(21, 4), uniform(3, 5));
     let order = [2, 0, 1];
     let uavs = order.iter().flat_map(|&i| &state[2 * i..2 * i + 2]);
     let users = [4, 2, 0, 1, 3].into_iter().flat_map(|j| &state[6 + 3 * j..9 + 3 * j]);
     let shuffled: Vec<f32> = uavs.chain(users).copied().collect();
-    let total = mixed.total(&state, &q);
-    assert!(close(total, mixed.total(&shuffled, &order.map(|i| q[i]))));
-    assert!(!close(total, mixed.total(&shuffled, &q)), "but not of one without the other");
+    let total = mixer.total(&state, &q);
+    assert!(close(total, mixer.total(&shuffled, &order.map(|i| q[i]))));
+    assert!(!close(total, mixer.total(&shuffled, &q)), "a permutation of positions alone changes Q_tot");
 }
 
 #[test]
@@ -341,7 +342,7 @@ fn an_invariant_mixer_fits_any_fleet() {
     assert_eq!(layout(3, 5), layout(12, 40));
 }
 
-/// x'_i = agg_j f(x_i || x_j - x_i), edge by edge, as the formula reads, in f64.
+/// x'_i = agg_j f(x_i || x_j - x_i), edge by edge, in f64.
 fn naive_edge_conv(layout: &ParameterLayout, flat: &[f64], graph: &Graph, x: &Batch<f64>, mean: bool, nodes: usize) -> Vec<f64> {
     let get = |name: &str| {
         let p = layout.parameters().iter().find(|p| p.name == format!("layer.f.{name}")).expect(name);
@@ -375,7 +376,7 @@ fn naive_edge_conv(layout: &ParameterLayout, flat: &[f64], graph: &Graph, x: &Ba
 }
 
 #[test]
-fn the_factored_edge_conv_is_the_naive_one() {
+fn factored_edge_conv_equals_the_formula() {
     let mut stream = rng::stream(6, "graph", 0);
     let lists: Vec<Vec<u32>> =
         (0..9).map(|i| if i == 4 { vec![] } else { (0..12).filter(|_| stream.random_bool(0.4)).collect() }).collect();
@@ -384,14 +385,14 @@ fn the_factored_edge_conv_is_the_naive_one() {
     for mean in [true, false] {
         let mut layout = ParameterLayout::default();
         let layer = GraphLayer::edge_conv(&mut layout, "layer", mean);
-        // Scales and shifts that differ, so that the order of operations matters.
+        // Different scales and shifts, so that the order of operations matters.
         let mut flat: Vec<f64> = layout.initialise(&mut rng::stream(7, "init", 0));
-        flat.iter_mut().zip(drawn(layout.len(), 8)).for_each(|(p, d)| *p += 0.1 * f64::from(d));
+        flat.iter_mut().zip(uniform(layout.len(), 8)).for_each(|(p, d)| *p += 0.1 * f64::from(d));
         let mut transposed = vec![0.0; flat.len()];
         layer.prepare(&flat, &mut transposed);
         let (mut x, mut y) = (Batch::default(), Batch::default());
         x.reset(HIDDEN, 12);
-        x.as_mut_slice().iter_mut().zip(drawn(12 * HIDDEN, 9)).for_each(|(x, d)| *x = d.into());
+        x.as_mut_slice().iter_mut().zip(uniform(12 * HIDDEN, 9)).for_each(|(x, d)| *x = d.into());
         y.reset(HIDDEN, 9);
         layer.forward(
             Weights { flat: &flat, transposed: &transposed },
@@ -402,14 +403,14 @@ fn the_factored_edge_conv_is_the_naive_one() {
         );
         let naive = naive_edge_conv(&layout, &flat, &graph, &x, mean, 9);
         for (a, b) in y.as_slice().iter().zip(&naive) {
-            assert!((a - b).abs() < 1e-12, "{a} instead of {b}");
+            assert!((a - b).abs() < 1e-12, "{a}, expected {b}");
         }
         assert!(y.row(4).iter().all(|&x| x == 0.0), "an isolated node gets 0");
     }
 }
 
 #[test]
-fn one_thread_and_two_make_the_same_bits() {
+fn updates_have_the_same_bits_for_any_number_of_threads() {
     for (algorithm, preset) in
         [(Algorithm::Qedgix, Preset::Practical), (Algorithm::Qmix, Preset::Paper), (Algorithm::Iql, Preset::Paper)]
     {
@@ -432,7 +433,7 @@ fn one_thread_and_two_make_the_same_bits() {
 }
 
 #[test]
-fn a_restored_learner_goes_on_as_if_never_stopped() {
+fn restored_learner_continues_with_the_same_bits() {
     let mut config = TrainConfig::preset(Algorithm::Qmix, Preset::Practical);
     config.environment.slots = 8;
     let batch = |seed| episodes(&config.dims(), 6, seed);
@@ -452,7 +453,7 @@ fn a_restored_learner_goes_on_as_if_never_stopped() {
 }
 
 #[test]
-fn agents_say_which_fleets_fit() {
+fn agents_reject_fleets_that_do_not_fit() {
     let fits = |config, uavs, users| learned(config).check_fleet(uavs, users).map_err(|e| e.field);
     assert_eq!(fits(AGENT, 3, 5), Ok(()));
     assert_eq!(fits(AGENT, 4, 5), Err("uavs".into()));

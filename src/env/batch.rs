@@ -1,26 +1,26 @@
-//! The dynamics (spec 1): many copies of one environment stepped together, structure of arrays, no allocation per step.
+//! The dynamics (docs/model.md, "Environment"): many copies of one environment step together, without allocation per step.
 //!
-//! Positions are held as f32: each move is computed in f64 from the f32 position and rounded once, so what replay stores is
-//! exactly what was seen and collected. Range tests are in f64: distance^2 <= t^2. Policies and learning live elsewhere.
+//! Positions are f32. Each move is computed in f64 from the f32 position and rounded once, so that replay stores exactly the
+//! positions that detections and collection used. Range tests are computed in f64: distance^2 <= t^2.
 
 use rand::RngExt;
 
-use super::metrics::{EpisodeMetrics, Tally};
-use super::walk::Walk;
+use super::metrics::{EpisodeMetrics, MetricsCounter};
+use super::walk::RandomWalk;
 use super::{Boundary, DIRECTIONS, EnvConfig, Layout, Point, Start};
 use crate::invalid::Invalid;
 use crate::rng;
 
-/// Why a step was refused. The environment is as it was before.
+/// Why a step was rejected. The environment does not change.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum StepError {
-    /// The time limit K is reached; reset begins a new episode.
-    #[error("the episode is over after {slots} slots; reset begins a new one")]
+    /// The episode has reached the time limit K.
+    #[error("the episode ended after {slots} slots; reset starts a new one")]
     Finished {
         /// K.
         slots: usize,
     },
-    /// The actions do not fit.
+    /// The actions are invalid.
     #[error(transparent)]
     Invalid(#[from] Invalid),
 }
@@ -31,25 +31,25 @@ pub struct BatchEnv {
     config: EnvConfig,
     copies: usize,
     slot: usize,
-    /// Displacement of each action.
+    /// Displacement by each action.
     moves: Vec<Point>,
     /// Per-user weights, scaled to mean 1.
     weights: Vec<f64>,
-    /// (M) UAVs that neither move nor collect.
+    /// (M) whether the UAV neither moves nor collects.
     grounded: Vec<bool>,
     uav_xy: Vec<f32>,
     user_xy: Vec<f32>,
     aoi: Vec<f32>,
     reward: Vec<f32>,
-    walks: Vec<Walk>,
-    tally: Tally,
+    walks: Vec<RandomWalk>,
+    counter: MetricsCounter,
 }
 
 impl BatchEnv {
-    /// `copies` environments, at slot 0 of the episodes with seeds 0, 1, ... until [`BatchEnv::reset`] says otherwise.
+    /// `copies` environments at slot 0 of the episodes with seeds 0, 1, and so on. [`BatchEnv::reset`] chooses other seeds.
     ///
     /// # Errors
-    /// The first field of `config` that is out of range, or `copies` when it is 0.
+    /// [`Invalid`] for the first field of `config` that is out of range, or for `copies` if it is 0.
     pub fn new(config: &EnvConfig, copies: usize) -> Result<Self, Invalid> {
         config.validate()?;
         if copies == 0 {
@@ -67,7 +67,7 @@ impl BatchEnv {
             aoi: vec![0.0; copies * n],
             reward: vec![0.0; copies],
             walks: Vec::new(),
-            tally: Tally::new(copies, n, config.slots),
+            counter: MetricsCounter::new(copies, n, config.slots),
             config: config.clone(),
         };
         let seeds: Vec<u64> = (0..copies as u64).collect();
@@ -75,10 +75,10 @@ impl BatchEnv {
         Ok(env)
     }
 
-    /// Begins a new episode in every copy. The layout of an episode is a function of its seed and N only.
+    /// Starts a new episode in every copy. The layout of an episode depends on its seed and N only.
     ///
     /// # Panics
-    /// When there is not one seed per copy.
+    /// If the number of seeds is not the number of copies.
     pub fn reset(&mut self, seeds: &[u64]) {
         assert_eq!(seeds.len(), self.copies, "one seed per copy");
         let (m, n) = (self.config.uavs, self.config.users);
@@ -86,7 +86,7 @@ impl BatchEnv {
         self.grounded.fill(false);
         self.aoi.fill(0.0);
         self.reward.fill(0.0);
-        self.tally.clear();
+        self.counter.clear();
         self.walks.clear();
         for (b, &seed) in seeds.iter().enumerate() {
             let users = &mut self.user_xy[b * n * 2..(b + 1) * n * 2];
@@ -101,17 +101,17 @@ impl BatchEnv {
                 Start::Given(points) => given(uavs, points),
             }
             if self.config.user_speed > 0.0 {
-                self.walks.push(Walk::new(seed, n, self.config.user_speed));
+                self.walks.push(RandomWalk::new(seed, n, self.config.user_speed));
             }
         }
     }
 
-    /// One slot: UAVs move, the boundary rule, users walk (where they do), data is collected, the reward (B).
+    /// Advances one slot (docs/model.md, "Step") and returns the rewards (B).
     ///
     /// # Panics
-    /// When the episode is over, or `actions` (B, M) do not fit: see [`BatchEnv::try_step`] for actions from outside.
+    /// If the episode has ended, or `actions` (B, M) are invalid. [`BatchEnv::try_step`] checks them.
     pub fn step(&mut self, actions: &[u8]) -> &[f32] {
-        assert!(self.slot < self.config.slots, "the episode is over");
+        assert!(self.slot < self.config.slots, "the episode has ended");
         assert_eq!(actions.len(), self.copies * self.config.uavs, "one action per UAV");
         let clamp = self.config.boundary == Boundary::Clamp;
         let flying = self.grounded.iter().cycle().map(|grounded| !grounded);
@@ -134,10 +134,11 @@ impl BatchEnv {
         &self.reward
     }
 
-    /// [`BatchEnv::step`] for actions from outside.
+    /// [`BatchEnv::step`] with checks of the actions.
     ///
     /// # Errors
-    /// The episode is over, the number of actions is wrong, or a heading index does not exist.
+    /// [`StepError::Finished`] if the episode has ended, [`StepError::Invalid`] if the number of actions is wrong or a heading index
+    /// does not exist.
     pub fn try_step(&mut self, actions: &[u8]) -> Result<&[f32], StepError> {
         if self.slot >= self.config.slots {
             return Err(StepError::Finished { slots: self.config.slots });
@@ -154,7 +155,7 @@ impl BatchEnv {
         Ok(self.step(actions))
     }
 
-    /// AoI, tally and reward of the slot whose positions are set.
+    /// Collects data at the current positions and computes AoI, metrics and rewards.
     fn collect(&mut self) {
         let (m, n) = (self.config.uavs, self.config.users);
         let range = self.config.transmission_range * self.config.transmission_range;
@@ -173,35 +174,35 @@ impl BatchEnv {
                 *age = if collected { 0.0 } else { *age + 1.0 };
                 sum += weight * f64::from(*age);
             }
-            self.tally.add(b, aoi);
+            self.counter.add(b, aoi);
             self.reward[b] = (-factor * sum / n as f64) as f32;
         }
     }
 
-    /// Until the next reset, UAV `uav` of every copy stays where it is, whatever its actions, and collects nothing.
+    /// Until the next reset, UAV `uav` of every copy ignores its actions, stays in place and collects nothing.
     ///
     /// # Panics
-    /// When there is no such UAV.
+    /// If `uav` is not below M.
     pub fn ground(&mut self, uav: usize) {
         self.grounded[uav] = true;
     }
 
-    /// Mean AoI over the users of copy `b` in this slot (weighted, where users have weights), in slots.
+    /// Mean AoI over the users of copy `b` in the current slot, weighted if users have weights, in slots.
     ///
     /// # Panics
-    /// When `b` is not a copy.
+    /// If `b` is not below the number of copies.
     pub fn mean_aoi(&self, b: usize) -> f64 {
         let n = self.config.users;
         let aoi = &self.aoi[b * n..(b + 1) * n];
         aoi.iter().zip(&self.weights).map(|(&a, w)| w * f64::from(a)).sum::<f64>() / n as f64
     }
 
-    /// Figures of copy `b` over the slots flown so far.
+    /// Metrics of copy `b` over the slots so far.
     ///
     /// # Panics
-    /// When `b` is not a copy.
+    /// If `b` is not below the number of copies.
     pub fn metrics(&self, b: usize) -> EpisodeMetrics {
-        self.tally.metrics(b, self.slot, &self.weights)
+        self.counter.metrics(b, self.slot, &self.weights)
     }
 
     /// The configuration.
@@ -209,17 +210,17 @@ impl BatchEnv {
         &self.config
     }
 
-    /// B.
+    /// B, the number of copies.
     pub fn copies(&self) -> usize {
         self.copies
     }
 
-    /// Slots flown since the reset.
+    /// Slots since the reset.
     pub fn slot(&self) -> usize {
         self.slot
     }
 
-    /// Whether the time limit K is reached.
+    /// Whether the episode has reached the time limit K.
     pub fn done(&self) -> bool {
         self.slot >= self.config.slots
     }
@@ -239,13 +240,13 @@ impl BatchEnv {
         &self.aoi
     }
 
-    /// (B) rewards of the last step; 0 after a reset.
+    /// (B) rewards of the last step, 0 after a reset.
     pub fn reward(&self) -> &[f32] {
         &self.reward
     }
 }
 
-/// Coordinates uniform in the unit square from the episode's stream `name`.
+/// Draws coordinates uniformly in the unit square, from the stream `name` of the episode.
 fn uniform(xy: &mut [f32], seed: u64, name: &str) {
     let mut rng = rng::stream(seed, name, 0);
     for x in xy {

@@ -1,4 +1,4 @@
-//! The environment's configuration (spec 1): names, units, defaults, limits.
+//! Configuration of the environment: fields, units, defaults and limits (docs/model.md, "Environment").
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -7,18 +7,18 @@ use super::point::Point;
 use super::schema::Weight;
 use crate::invalid::{Invalid, in_range};
 
-/// What happens at the border of the unit square.
+/// Rule at the border of the unit square.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Boundary {
     /// Each coordinate is clamped to [0, 1].
     #[default]
     Clamp,
-    /// UAVs may leave the square.
+    /// UAVs can leave the square.
     Free,
 }
 
-/// Where UAVs are at slot 0.
+/// Positions of the UAVs in slot 0.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Start {
@@ -31,7 +31,7 @@ pub enum Start {
     Given(Vec<Point>),
 }
 
-/// Where users are at slot 0.
+/// Positions of the users in slot 0.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Layout {
@@ -42,7 +42,7 @@ pub enum Layout {
     Given(Vec<Point>),
 }
 
-/// Everything that fixes an environment but the episode's seed (spec 1). Lengths are in units of the square's side.
+/// Everything that determines an environment except the episode's seed. Lengths are in units of the square's side.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields, default)]
 #[schema(as = Environment, default)]
@@ -62,7 +62,7 @@ pub struct EnvConfig {
     /// t, range within which a user's data is collected.
     #[schema(minimum = 0, maximum = 2)]
     pub transmission_range: f64,
-    /// d, range within which nodes see each other; at least t.
+    /// d, range within which nodes detect each other; at least t.
     #[schema(minimum = 1e-6, maximum = 2)]
     pub detection_range: f64,
     /// Adds a ninth action that stays in place.
@@ -72,14 +72,14 @@ pub struct EnvConfig {
     /// Factor of the reward -`reward_scale` * mean AoI; absent: 1/K.
     #[schema(minimum = 1e-9, maximum = 1e9)]
     pub reward_scale: Option<f64>,
-    /// UAV positions at slot 0.
+    /// UAV positions in slot 0.
     pub start: Start,
-    /// User positions at slot 0.
+    /// User positions in slot 0.
     pub layout: Layout,
-    /// Weight of each user in the reward and the mean AoI (scaled to mean 1); absent: all equal.
+    /// Weight of each user in the reward and in the mean AoI, scaled to mean 1. Absent: equal weights.
     #[schema(value_type = Option<Vec<Weight>>)]
     pub weights: Option<Vec<f64>>,
-    /// Distance a user walks per slot, in a direction that turns a little each slot; 0: users stay.
+    /// Distance that a user moves per slot, in a direction that changes slightly in each slot. 0: users do not move.
     #[schema(minimum = 0, maximum = 1)]
     pub user_speed: f64,
 }
@@ -108,7 +108,7 @@ impl EnvConfig {
     /// Number of headings spaced by 45 degrees.
     pub const COMPASS: usize = 8;
 
-    /// A, the number of actions: 8 headings, and hovering where allowed.
+    /// A, the number of actions: 8 headings, and hovering if `hover` is set.
     pub fn headings(&self) -> usize {
         Self::COMPASS + usize::from(self.hover)
     }
@@ -118,7 +118,7 @@ impl EnvConfig {
         self.uavs + self.users
     }
 
-    /// The factor of the reward, its default 1/K filled in.
+    /// `reward_scale`, or its default 1/K.
     pub fn reward_factor(&self) -> f64 {
         self.reward_scale.unwrap_or(1.0 / self.slots as f64)
     }
@@ -133,7 +133,7 @@ impl EnvConfig {
     /// Checks every field.
     ///
     /// # Errors
-    /// The first field that is out of range, with its value and what is allowed.
+    /// [`Invalid`] for the first field that is out of range.
     pub fn validate(&self) -> Result<(), Invalid> {
         in_range("uavs", self.uavs, 1..=4096)?;
         in_range("users", self.users, 1..=65_536)?;

@@ -1,4 +1,4 @@
-//! One environment for one caller: points and checked actions instead of batches. Whoever hosts environments builds on this.
+//! A single environment with points and checked actions, instead of a batch.
 
 use super::{BatchEnv, EnvConfig, EpisodeMetrics, Point, StepError, points};
 use crate::invalid::Invalid;
@@ -11,26 +11,26 @@ pub struct Episode {
 }
 
 impl Episode {
-    /// The episode with this seed, at slot 0.
+    /// The episode with seed `seed`, at slot 0.
     ///
     /// # Errors
-    /// The first field of `config` that is out of range.
+    /// [`Invalid`] for the first field of `config` that is out of range.
     pub fn new(config: &EnvConfig, seed: u64) -> Result<Self, Invalid> {
         let mut episode = Self { env: BatchEnv::new(config, 1)?, seed };
         episode.reset(seed);
         Ok(episode)
     }
 
-    /// Begins the episode with another seed, or the same one again.
+    /// Starts the episode with seed `seed`.
     pub fn reset(&mut self, seed: u64) {
         self.seed = seed;
         self.env.reset(&[seed]);
     }
 
-    /// Flies one slot, one heading index per UAV; the reward.
+    /// Advances one slot, with one heading index per UAV, and returns the reward.
     ///
     /// # Errors
-    /// The episode is over, the number of headings is wrong, or one does not exist.
+    /// As [`BatchEnv::try_step`].
     pub fn step(&mut self, headings: &[u8]) -> Result<f32, StepError> {
         self.env.try_step(headings).map(|reward| reward[0])
     }
@@ -45,12 +45,12 @@ impl Episode {
         self.seed
     }
 
-    /// Slots flown.
+    /// Slots since the reset.
     pub fn slot(&self) -> usize {
         self.env.slot()
     }
 
-    /// Whether the time limit K is reached.
+    /// Whether the episode has reached the time limit K.
     pub fn done(&self) -> bool {
         self.env.done()
     }
@@ -70,7 +70,7 @@ impl Episode {
         self.env.aoi()
     }
 
-    /// Figures over the slots flown so far.
+    /// Metrics over the slots so far.
     pub fn metrics(&self) -> EpisodeMetrics {
         self.env.metrics(0)
     }

@@ -1,27 +1,27 @@
-//! What an episode is judged by (spec 1). Percentiles come from counting: AoI are small integers, nothing is sorted.
+//! Metrics of an episode (docs/model.md, "Metrics"). AoI are small integers, so percentiles are computed from counts.
 
 use serde::{Deserialize, Serialize};
 
-/// Figures of one episode over slots 1..K, or the mean of them over episodes. AoI is in slots.
+/// Metrics of one episode over slots 1..K, or their means over episodes. AoI is in slots.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct EpisodeMetrics {
-    /// Mean AoI over users (weighted, where users have weights) and slots.
+    /// Mean AoI over users and slots, weighted if users have weights.
     pub mean_aoi: f64,
     /// Largest AoI of any user in any slot.
     pub peak_aoi: f64,
     /// 95th percentile of AoI over users and slots (nearest rank).
     pub p95_aoi: f64,
-    /// Share of users ever visited.
+    /// Share of the users whose data was collected at least once.
     pub coverage: f64,
-    /// Jain's fairness index of the users' mean AoI, (sum x)^2 / (N sum x^2); 1 when all are 0.
+    /// Jain's fairness index of the users' mean AoI x, (sum x)^2 / (N sum x^2); 1 if all are 0.
     pub fairness: f64,
 }
 
 impl EpisodeMetrics {
-    /// Mean of each figure over `episodes`; all 0 when there are none.
+    /// Mean of each metric over `episodes`; all 0 without episodes.
     pub fn mean(episodes: &[Self]) -> Self {
         let n = episodes.len().max(1) as f64;
-        let mean = |figure: fn(&Self) -> f64| episodes.iter().map(figure).sum::<f64>() / n;
+        let mean = |metric: fn(&Self) -> f64| episodes.iter().map(metric).sum::<f64>() / n;
         Self {
             mean_aoi: mean(|e| e.mean_aoi),
             peak_aoi: mean(|e| e.peak_aoi),
@@ -32,9 +32,9 @@ impl EpisodeMetrics {
     }
 }
 
-/// Counts that the figures of B running episodes are made of.
+/// Counts from which the metrics of B running episodes are computed.
 #[derive(Clone, Debug)]
-pub(super) struct Tally {
+pub(super) struct MetricsCounter {
     users: usize,
     /// K + 1, the number of values an AoI can take.
     values: usize,
@@ -42,11 +42,11 @@ pub(super) struct Tally {
     counts: Vec<u32>,
     /// (B, N) sum of AoI over slots.
     sums: Vec<u64>,
-    /// (B, N) whether the user was visited.
+    /// (B, N) whether the user's data was collected.
     visited: Vec<bool>,
 }
 
-impl Tally {
+impl MetricsCounter {
     pub(super) fn new(copies: usize, users: usize, slots: usize) -> Self {
         let values = slots + 1;
         Self {
@@ -75,7 +75,7 @@ impl Tally {
         }
     }
 
-    /// Figures of copy `b` after `slots` slots; all 0 (coverage, fairness: 0 and 1) before the first.
+    /// Metrics of copy `b` after `slots` slots. Before the first slot all are 0, except fairness, which is 1.
     pub(super) fn metrics(&self, b: usize, slots: usize, weights: &[f64]) -> EpisodeMetrics {
         let n = self.users as f64;
         let slots = slots.max(1) as f64;

@@ -1,5 +1,5 @@
-//! How users move, where they do (`user_speed`): a constant pace in a direction that turns a little each slot, reflected at
-//! the border of the square.
+//! Moving users (`user_speed`): constant speed, a direction that changes slightly in each slot, reflection at the border of the
+//! square.
 
 use std::f64::consts::{FRAC_PI_8, PI, TAU};
 
@@ -8,18 +8,18 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::rng;
 
-/// The walk of one episode's users.
+/// The movement of one episode's users.
 #[derive(Clone, Debug)]
-pub(super) struct Walk {
+pub(super) struct RandomWalk {
     rng: ChaCha8Rng,
     speed: f64,
     /// Direction of each user in radians.
     directions: Vec<f64>,
 }
 
-impl Walk {
-    /// Largest turn per slot in radians.
-    const TURN: f64 = FRAC_PI_8;
+impl RandomWalk {
+    /// Largest change of direction per slot, in radians.
+    const MAX_TURN: f64 = FRAC_PI_8;
 
     pub(super) fn new(seed: u64, users: usize, speed: f64) -> Self {
         let mut rng = rng::stream(seed, "walk", 0);
@@ -27,10 +27,10 @@ impl Walk {
         Self { rng, speed, directions }
     }
 
-    /// Moves every user of `xy` (N, 2) by one slot.
+    /// Moves every user in `xy` (N, 2) for one slot.
     pub(super) fn step(&mut self, xy: &mut [f32]) {
         for (xy, direction) in xy.chunks_exact_mut(2).zip(&mut self.directions) {
-            *direction += self.rng.random_range(-Self::TURN..=Self::TURN);
+            *direction += self.rng.random_range(-Self::MAX_TURN..=Self::MAX_TURN);
             let x = f64::from(xy[0]) + self.speed * direction.cos();
             let y = f64::from(xy[1]) + self.speed * direction.sin();
             if !(0.0..=1.0).contains(&x) {
@@ -45,7 +45,7 @@ impl Walk {
     }
 }
 
-/// A coordinate mirrored back into [0, 1]; a step is at most 1 long, so one mirror is enough.
+/// Reflects a coordinate into [0, 1]. A step is at most 1 long, so one reflection is enough.
 fn reflect(x: f64) -> f64 {
     let x = if x < 0.0 { -x } else { x };
     if x > 1.0 { 2.0 - x } else { x }

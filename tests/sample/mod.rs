@@ -6,7 +6,7 @@ use qedgix::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, ObservationK
 use qedgix::rng;
 use rand::RngExt;
 
-/// Qedgix as the paper has it, but for the mean.
+/// Qedgix as in the paper, except for the aggregation by the mean.
 pub const AGENT: AgentConfig = AgentConfig {
     gnn: Gnn::EdgeConv,
     layers: 2,
@@ -19,7 +19,7 @@ pub const AGENT: AgentConfig = AgentConfig {
     normalise: false,
 };
 
-/// Episodes of UAVs that fly at random from the centre, each among users of its own.
+/// Episodes of UAVs that fly at random from the centre. Each episode has its own users.
 pub fn episodes(dims: &Dims, len: usize, seed: u64) -> Episodes {
     let Dims { uavs, users, actions, slots, .. } = *dims;
     let mut stream = rng::stream(seed, "episodes", 0);
