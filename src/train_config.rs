@@ -1,6 +1,6 @@
-//! What a training run is made of (spec 5): algorithm, preset, and the resolved configuration that fixes every bit of it.
+//! The configuration of a training run: algorithm, preset, and all resolved fields (docs/model.md, "Presets").
 //!
-//! Below `checkpoint`, which carries it, and `learner`, which follows it.
+//! `learner` trains from it, and `checkpoint` stores it with the parameters.
 
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use serde_json::{Map, Value};
@@ -11,7 +11,7 @@ use crate::invalid::{Invalid, expectation, in_range};
 use crate::policy::mixer::MixerKind;
 use crate::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, ObservationKind};
 
-/// The algorithms of the paper and its usual company.
+/// The algorithms of the paper, and common baselines.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Algorithm {
@@ -19,7 +19,7 @@ pub enum Algorithm {
     Qmix,
     /// GRU agents, summed values.
     Vdn,
-    /// GRU agents that learn alone.
+    /// GRU agents, each with its own target.
     Iql,
     /// GRU and `EdgeConv` agents, monotonic mixing: the paper's method.
     #[default]
@@ -30,25 +30,25 @@ pub enum Algorithm {
     Rgcn,
 }
 
-/// Named starting points of a configuration (spec 5).
+/// Presets: named configurations that fields can override (docs/model.md, "Presets").
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Preset {
-    /// What the paper writes.
+    /// As in the paper.
     Paper,
-    /// What the authors' code does.
+    /// As in the code of the paper's authors.
     Authors,
-    /// What measures best.
+    /// The best results in our experiments.
     #[default]
     Practical,
 }
 
-/// Everything about learning that is not the environment. `steps` counts environment slots.
+/// The fields of learning. Environment steps are slots, counted over all episodes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
-#[allow(clippy::struct_excessive_bools, reason = "a document of independent switches")]
+#[allow(clippy::struct_excessive_bools, reason = "independent switches of a document")]
 pub struct Training {
-    /// Observation of every node.
+    /// Observation of each node.
     pub observation: ObservationKind,
     /// Identity of a UAV.
     pub identity: Identity,
@@ -61,11 +61,12 @@ pub struct Training {
     pub self_position: bool,
     /// Whether a node is its own neighbour.
     pub self_loops: bool,
-    /// Links over which a UAV without a graph network observes: 1 is its own range, L + 1 all that L graph layers reach.
+    /// Without a graph network: number of links over which a UAV observes. 1: its own detections; L + 1: what L graph layers
+    /// bring.
     #[serde(default = "one")]
     #[schema(minimum = 1, maximum = 9)]
     pub hops: usize,
-    /// Whether relative positions are divided by d in flat observations too, and own positions scaled to [-1, 1].
+    /// Whether relative positions are divided by the detection range in flat observations, and own positions scaled to [-1, 1].
     #[serde(default)]
     pub normalise: bool,
     /// Mixer.
@@ -74,17 +75,17 @@ pub struct Training {
     #[serde(default = "unit")]
     #[schema(minimum = 0.0, maximum = 10.0)]
     pub hyper_init: f64,
-    /// Environment steps (slots) to train for.
+    /// Environment steps to train for.
     #[schema(minimum = 1, maximum = 1e12)]
     pub steps: u64,
-    /// Adam's learning rate at the beginning.
+    /// Learning rate of Adam at the start.
     #[schema(minimum = 1e-12, maximum = 1.0)]
     pub learning_rate: f64,
-    /// Share of the learning rate that is left at the end; it falls linearly over `steps`. 1: constant.
+    /// Share of the learning rate that is left at the end; it falls linearly over `steps`. 1: the rate is constant.
     #[serde(default = "unit")]
     #[schema(minimum = 0.0, maximum = 1.0)]
     pub learning_rate_decay: f64,
-    /// Discount.
+    /// Discount factor.
     #[schema(minimum = 0.0, maximum = 1.0)]
     pub gamma: f64,
     /// lambda of TD(lambda).
@@ -93,10 +94,10 @@ pub struct Training {
     /// Global L2 norm that gradients are clipped to.
     #[schema(minimum = 1e-9, maximum = 1e9)]
     pub clip: f64,
-    /// Exploration at the end.
+    /// Final epsilon.
     #[schema(minimum = 0.0, maximum = 1.0)]
     pub epsilon_end: f64,
-    /// Environment steps over which exploration falls from 1 to its end.
+    /// Environment steps over which epsilon falls linearly from 1 to `epsilon_end`.
     #[schema(minimum = 1, maximum = 1e12)]
     pub epsilon_anneal: u64,
     /// Episodes per update.
@@ -105,46 +106,48 @@ pub struct Training {
     /// Updates per iteration; an iteration collects `envs` episodes.
     #[schema(minimum = 1, maximum = 1024)]
     pub updates_per_iteration: usize,
-    /// Episodes collected together.
+    /// Episodes collected per iteration.
     #[schema(minimum = 1, maximum = 4096)]
     pub envs: usize,
-    /// Episodes held in replay.
+    /// Capacity of replay, in episodes.
     #[schema(minimum = 1, maximum = 1_000_000)]
     pub buffer: usize,
-    /// Episodes between copies of the online networks to the targets.
+    /// Episodes between copies of the online networks to the target networks.
     #[schema(minimum = 1, maximum = 1e9)]
     pub target_every: u64,
-    /// Share of the online networks that every update mixes into the targets, instead of copies; 0: copies.
+    /// Share by which the target networks move to the online networks after each update. 0: they are copied every
+    /// `target_every` episodes.
     #[serde(default)]
     #[schema(minimum = 0.0, maximum = 1.0)]
     pub target_tau: f64,
-    /// Weights that are evaluated and published: the mean of the online weights over about this many updates, fading; 0 or
-    /// 1: the online weights themselves.
+    /// The weights that are evaluated and published are an exponential moving average over about this many updates. 0 or 1: the
+    /// online weights.
     #[serde(default)]
     #[schema(minimum = 0, maximum = 1e9)]
     pub average: u64,
-    /// Whether the learner is rewarded for the age it collects instead of punished for the age there is: the same optimal
-    /// policies (potential-based shaping), but the reward tells at once what an action was good for.
+    /// Whether the reward of a slot is the AoI collected in it instead of minus the AoI of all users. The optimal policies are the
+    /// same (potential-based shaping).
     #[serde(default)]
     pub shaping: bool,
-    /// Whether replayed episodes are turned and mirrored at random, by the eight symmetries of the square.
+    /// Whether replayed episodes are rotated and mirrored at random, by the eight symmetries of the square.
     #[serde(default)]
     pub augment: bool,
     /// Environment steps between evaluations.
     #[schema(minimum = 1, maximum = 1e12)]
     pub eval_every: u64,
-    /// Episodes of an evaluation.
+    /// Episodes per evaluation.
     #[schema(minimum = 1, maximum = 4096)]
     pub eval_episodes: usize,
 }
 
-/// A training run, resolved: (this, code, processor kind) fixes every metric and weight, bit for bit.
+/// The resolved configuration of a training run. With the code and the kind of processor, it fixes every metric and weight bit for
+/// bit.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrainConfig {
     /// Algorithm.
     pub algorithm: Algorithm,
-    /// Preset that `environment` and `training` started from.
+    /// Preset of the fields that were not overridden.
     pub preset: Preset,
     /// Environment.
     pub environment: EnvConfig,
@@ -167,7 +170,7 @@ impl Algorithm {
 }
 
 impl TrainConfig {
-    /// The configuration of `algorithm` in `preset`, nothing overridden (spec 5's table).
+    /// The configuration of `algorithm` and `preset` without overrides.
     pub fn preset(algorithm: Algorithm, preset: Preset) -> Self {
         let mut environment = EnvConfig::default();
         let mut training = Training {
@@ -232,10 +235,10 @@ impl TrainConfig {
         Self { algorithm, preset, environment, training, seed: 1 }
     }
 
-    /// A preset with fields of `environment` and `training` overridden by what was sent, checked as a whole.
+    /// The preset with the fields of `environment` and `training` overridden, checked as a whole.
     ///
     /// # Errors
-    /// An unknown field, a value of the wrong type, or one out of range; the field is named as `training.batch`.
+    /// [`Invalid`] for a field that is unknown, of the wrong type or out of range; the field is named as `training.batch`.
     pub fn resolve(
         algorithm: Algorithm,
         preset: Preset,
@@ -275,18 +278,18 @@ impl TrainConfig {
         }
     }
 
-    /// Sizes that agents are made for.
+    /// The sizes of the agents.
     pub fn dims(&self) -> Dims {
         let env = &self.environment;
         Dims { uavs: env.uavs, users: env.users, actions: env.headings(), detection_range: env.detection_range, slots: env.slots }
     }
 
-    /// Checks every field and how they fit together.
+    /// Checks each field and their combination.
     ///
     /// # Errors
-    /// The first field that is wrong.
+    /// [`Invalid`] for the first invalid field.
     pub fn validate(&self) -> Result<(), Invalid> {
-        /// Bytes that a replay may take.
+        /// Largest size of replay in bytes.
         const LIMIT: usize = 8 << 30;
         self.environment.validate().map_err(|e| e.within("environment"))?;
         self.training.validate().map_err(|e| e.within("training"))?;
@@ -353,7 +356,7 @@ fn unit() -> f64 {
     1.0
 }
 
-/// The letters of the paper, accepted for the fields they stand for.
+/// Symbols of the paper, accepted as names of fields.
 const LETTERS: [(&str, &str); 9] = [
     ("M", "uavs"),
     ("N", "users"),
@@ -366,10 +369,10 @@ const LETTERS: [(&str, &str); 9] = [
     ("anneal", "epsilon_anneal"),
 ];
 
-/// The environment that a document describes: its fields over the defaults, every default filled in.
+/// The environment of a document: the defaults with its fields overridden.
 ///
 /// # Errors
-/// The first field that is unknown, of the wrong type or out of range, named as `environment.uavs`.
+/// [`Invalid`] for the first field that is unknown, of the wrong type or out of range, named as `environment.uavs`.
 pub fn environment(mut document: Value) -> Result<EnvConfig, Invalid> {
     integral(&mut document);
     let Value::Object(fields) = &document else {
@@ -381,10 +384,10 @@ pub fn environment(mut document: Value) -> Result<EnvConfig, Invalid> {
     Ok(config)
 }
 
-/// Largest integer that every JSON reader and a `google.protobuf.Struct` hold exactly.
+/// Largest integer that all JSON readers and `google.protobuf.Struct` represent exactly.
 pub const EXACT: u64 = (1 << 53) - 1;
 
-/// Makes whole numbers integers however they are written, because a `google.protobuf.Struct` has no integers.
+/// Converts whole numbers to integers, because `google.protobuf.Struct` has no integers.
 pub fn integral(value: &mut Value) {
     match value {
         Value::Number(number) => {
@@ -399,7 +402,7 @@ pub fn integral(value: &mut Value) {
     }
 }
 
-/// `base` with the fields of `patch` put over it, one at a time, so that a message names the field that is wrong.
+/// `base` with the fields of `patch` overridden, one at a time, so that an error names the invalid field.
 fn overridden<T: Serialize + DeserializeOwned>(section: &str, base: &T, patch: &Map<String, Value>) -> Result<T, Invalid> {
     let mut fields = serde_json::to_value(base).expect("a configuration is plain data");
     let known: Vec<String> = fields.as_object().into_iter().flatten().map(|(name, _)| name.clone()).collect();
@@ -424,11 +427,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_table_of_presets_in_the_documentation_is_the_presets() {
+    fn the_documented_presets_are_the_presets() {
         let text = include_str!("../docs/algorithms.md");
         let fields = |preset| {
             let mut config = TrainConfig::resolve(Algorithm::Qedgix, preset, &Map::new(), &Map::new(), 1).unwrap();
-            // What the table writes in terms of K and N.
+            // The table states it in terms of K and N.
             config.environment.reward_scale = None;
             let (mut all, training) = (serde_json::to_value(&config.environment).unwrap(), config.training);
             let Value::Object(training) = serde_json::to_value(training).unwrap() else { unreachable!("a struct") };
@@ -450,6 +453,6 @@ mod tests {
             }
             checked += 1;
         }
-        assert_eq!(checked, 18, "rows of the table that name a field");
+        assert_eq!(checked, 18, "rows of the table with the name of a field");
     }
 }

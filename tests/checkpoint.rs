@@ -1,4 +1,4 @@
-//! Checkpoints: what is written is read back, the same content is the same bytes, and no bytes whatever cause a panic.
+//! Checkpoints: they are read back as written, the same content gives the same bytes, and no bytes cause a panic.
 
 use proptest::prelude::*;
 use qedgix::checkpoint::{self, Checkpoint, Error};
@@ -14,7 +14,7 @@ fn config() -> TrainConfig {
     config
 }
 
-/// Weights of plausible size, different everywhere.
+/// Weights of typical size, all different.
 fn weights(config: &TrainConfig) -> Vec<f32> {
     (0..checkpoint::layout(config).len()).map(|i| ((i * 7919 % 1000) as f32 / 1000.0 - 0.5) * 0.2).collect()
 }
@@ -31,7 +31,7 @@ fn parts(bytes: &[u8]) -> (Value, Vec<u8>) {
     (serde_json::from_slice(&bytes[8..8 + n]).unwrap(), bytes[8 + n..].to_vec())
 }
 
-/// A file of a changed header.
+/// A file with this header and data.
 fn file(header: &Value, data: &[u8]) -> Vec<u8> {
     let header = header.to_string();
     let mut bytes = (header.len() as u64).to_le_bytes().to_vec();
@@ -40,15 +40,15 @@ fn file(header: &Value, data: &[u8]) -> Vec<u8> {
     bytes
 }
 
-/// The error of reading the example after `change` to its header.
-fn refused(change: impl FnOnce(&mut Value)) -> String {
+/// The error of reading the example after `change` of its header.
+fn error_after(change: impl FnOnce(&mut Value)) -> String {
     let (mut header, data) = parts(&example(config()).to_bytes());
     change(&mut header);
     Checkpoint::from_bytes(&file(&header, &data)).unwrap_err().to_string()
 }
 
 #[test]
-fn what_is_written_is_read_back() {
+fn checkpoints_are_read_back_as_written() {
     for algorithm in [Algorithm::Qedgix, Algorithm::Qmix, Algorithm::Vdn, Algorithm::Iql] {
         for preset in [Preset::Paper, Preset::Authors, Preset::Practical] {
             let checkpoint = example(TrainConfig::preset(algorithm, preset));
@@ -62,7 +62,7 @@ fn what_is_written_is_read_back() {
 }
 
 #[test]
-fn the_same_content_is_the_same_bytes() {
+fn the_same_content_gives_the_same_bytes() {
     let (a, b) = (example(config()).to_bytes(), example(config()).to_bytes());
     assert_eq!(a, b);
     assert_eq!(checkpoint::digest(&a), checkpoint::digest(&b));
@@ -71,12 +71,12 @@ fn the_same_content_is_the_same_bytes() {
     other[5] += 1e-6;
     let other = Checkpoint::new(config(), 12_800, None, other).unwrap();
     assert_ne!(checkpoint::digest(&other.to_bytes()), checkpoint::digest(&a));
-    // Reading and writing again changes nothing.
+    // A checkpoint that was read is written with the same bytes.
     assert_eq!(Checkpoint::from_bytes(&a).unwrap().to_bytes(), a);
 }
 
 #[test]
-fn names_and_shapes_are_those_of_the_golden_files() {
+fn names_and_shapes_equal_the_golden_files() {
     for name in ["qmix", "vdn", "qedgix_paper", "qedgix_authors", "qedgix_set_phase", "qedgix_set_token"] {
         let path = format!("{}/tests/golden/{name}.safetensors", env!("CARGO_MANIFEST_DIR"));
         let (golden, _) = parts(&std::fs::read(path).unwrap());
@@ -108,7 +108,7 @@ fn names_and_shapes_are_those_of_the_golden_files() {
 }
 
 #[test]
-fn a_policy_needs_no_mixer() {
+fn mixer_tensors_are_optional() {
     let (mut header, data) = parts(&example(config()).to_bytes());
     // Names sort `agent` before `mixer`, so the agent's data comes first.
     let tensors = header.as_object_mut().unwrap();
@@ -123,27 +123,27 @@ fn a_policy_needs_no_mixer() {
 }
 
 #[test]
-fn what_is_wrong_is_named() {
+fn metadata_errors_name_the_entry() {
     let meta = |key: &'static str, value: Value| move |h: &mut Value| h["__metadata__"][key] = value;
-    assert!(refused(meta("format", json!("pt"))).contains("not a checkpoint of this program"));
-    assert!(refused(meta("version", json!("2"))).contains("version Some(\"2\") cannot be read"));
-    assert!(refused(meta("step", json!("-1"))).contains("metadata `step`"));
-    assert!(refused(meta("metrics", json!("{"))).contains("metadata `metrics`"));
-    assert!(refused(meta("config", json!("{}"))).contains("metadata `config`: missing field"));
+    assert!(error_after(meta("format", json!("pt"))).contains("not a checkpoint of this program"));
+    assert!(error_after(meta("version", json!("2"))).contains("version Some(\"2\") cannot be read"));
+    assert!(error_after(meta("step", json!("-1"))).contains("metadata `step`"));
+    assert!(error_after(meta("metrics", json!("{"))).contains("metadata `metrics`"));
+    assert!(error_after(meta("config", json!("{}"))).contains("metadata `config`: missing field"));
     let mut bad = config();
     bad.environment.speed = -1.0;
     let bad = serde_json::to_string(&bad).unwrap();
     assert_eq!(
-        refused(meta("config", json!(bad))),
+        error_after(meta("config", json!(bad))),
         "metadata `config`: environment.speed: -1 is not valid; expected a number from 0 to 1"
     );
-    assert!(refused(|h| drop(h.as_object_mut().unwrap().remove("__metadata__"))).contains("not a checkpoint"));
+    assert!(error_after(|h| drop(h.as_object_mut().unwrap().remove("__metadata__"))).contains("not a checkpoint"));
 }
 
 #[test]
-fn tensors_must_be_those_of_the_configuration() {
+fn tensors_must_match_the_configuration() {
     let renamed = |from: &'static str, to: &'static str| {
-        refused(move |h| {
+        error_after(move |h| {
             let tensor = h.as_object_mut().unwrap().remove(from).unwrap();
             h[to] = tensor;
         })
@@ -155,18 +155,18 @@ fn tensors_must_be_those_of_the_configuration() {
     data.extend([0; 4]);
     let error = Checkpoint::from_bytes(&file(&header, &data)).unwrap_err();
     assert_eq!(error, Error::Unexpected { name: "extra".into() });
-    let reshaped = refused(|h| h["agent.rnn.weight_hh"]["shape"] = json!([64, 192]));
+    let reshaped = error_after(|h| h["agent.rnn.weight_hh"]["shape"] = json!([64, 192]));
     assert_eq!(reshaped, "tensor `agent.rnn.weight_hh` has shape [64, 192]; expected [192, 64]");
-    assert_eq!(refused(|h| h["agent.fc.bias"]["dtype"] = json!("I32")), "tensor `agent.fc.bias` has type I32; expected F32");
-    // Another configuration is another set of parameters.
+    assert_eq!(error_after(|h| h["agent.fc.bias"]["dtype"] = json!("I32")), "tensor `agent.fc.bias` has type I32; expected F32");
+    // Another configuration has other parameters.
     let mut other = config();
     other.training.mixer = MixerKind::Qmix;
     let other = serde_json::to_string(&other).unwrap();
-    assert!(refused(|h| h["__metadata__"]["config"] = json!(other)).contains("tensor `mixer."));
+    assert!(error_after(|h| h["__metadata__"]["config"] = json!(other)).contains("tensor `mixer."));
 }
 
 #[test]
-fn values_must_be_numbers_of_sensible_size() {
+fn values_must_be_finite_and_not_too_large() {
     for bad in [f32::NAN, f32::INFINITY, -f32::INFINITY, 1e30] {
         let (header, mut data) = parts(&example(config()).to_bytes());
         let at = header["agent.fc.weight"]["data_offsets"][0].as_u64().unwrap() as usize;
@@ -181,7 +181,7 @@ fn values_must_be_numbers_of_sensible_size() {
 }
 
 #[test]
-fn containers_that_lie_are_refused() {
+fn inconsistent_containers_are_rejected() {
     let good = example(config()).to_bytes();
     let length = u64::from_le_bytes(good[..8].try_into().unwrap());
     let announcing = |length: u64| {
@@ -199,7 +199,7 @@ fn containers_that_lie_are_refused() {
         let error = Checkpoint::from_bytes(&good[..cut]).unwrap_err().to_string();
         assert!(error.contains("less than the length of a header"), "{error}");
     }
-    let offsets = |name: &'static str, from: u64, to: u64| refused(move |h| h[name]["data_offsets"] = json!([from, to]));
+    let offsets = |name: &'static str, from: u64, to: u64| error_after(move |h| h[name]["data_offsets"] = json!([from, to]));
     // Names are in the order of their data: the first tensor is agent.fc.bias, 256 bytes.
     let (header, data) = parts(&good);
     let first = "agent.fc.bias";
@@ -213,12 +213,12 @@ fn containers_that_lie_are_refused() {
     assert!(offsets(first, 0, 255).contains("of shape [64] has 255 bytes"));
     let huge = usize::MAX as u64;
     assert!(offsets(first, 0, huge).contains(&format!("is bytes 0 to {huge} of {} bytes", data.len())));
-    let overflowing = refused(|h| h[first]["shape"] = json!([1_u64 << 62, 1_u64 << 62]));
+    let overflowing = error_after(|h| h[first]["shape"] = json!([1_u64 << 62, 1_u64 << 62]));
     assert!(overflowing.contains("of shape [4611686018427387904, 4611686018427387904] has 256 bytes"), "{overflowing}");
     let longer = Checkpoint::from_bytes(&[&good[..], &[0; 4]].concat()).unwrap_err().to_string();
     assert!(longer.contains(&format!("{} bytes of data, of which tensors take {}", data.len() + 4, data.len())), "{longer}");
-    assert!(refused(|h| h[first]["color"] = json!("red")).contains("unknown field `color`"));
-    assert!(refused(|h| h[first]["shape"] = json!([-1])).contains("its header: invalid value"));
+    assert!(error_after(|h| h[first]["color"] = json!("red")).contains("unknown field `color`"));
+    assert!(error_after(|h| h[first]["shape"] = json!([-1])).contains("its header: invalid value"));
     let text = header.to_string();
     for name in [first, "__metadata__"] {
         let entry = format!("\"{name}\":{}", header[name]);
@@ -232,12 +232,12 @@ fn containers_that_lie_are_refused() {
     assert!(matches!(Checkpoint::from_bytes(&bytes), Err(Error::Container(_))));
 }
 
-/// Flies a few slots with the fleet that the checkpoint was trained with and, where it may, with others.
-fn fly(checkpoint: &Checkpoint, seed: u64) {
+/// Runs the policy for a few slots with the fleet of its training and, if possible, with others.
+fn run_policy(checkpoint: &Checkpoint, seed: u64) {
     let (policy, dims) = (checkpoint.policy(), checkpoint.config().dims());
     let policy: &dyn Policy = &policy;
     for (uavs, users) in [(dims.uavs, dims.users), (1, 1), (5, 9)] {
-        // Larger ones fly in `service`, where observations are bounded.
+        // Larger fleets are tested in `service`, where observations are bounded.
         if policy.check_fleet(uavs, users).is_err() || uavs + users > 64 {
             continue;
         }
@@ -262,7 +262,7 @@ fn fly(checkpoint: &Checkpoint, seed: u64) {
     }
 }
 
-/// Configurations of every kind of agent and mixer, small, with their neighbours on the far side of valid.
+/// Small configurations with every kind of agent and mixer.
 fn configurations() -> impl Strategy<Value = TrainConfig> {
     let algorithm = prop::sample::select(vec!["qmix", "vdn", "iql", "qedgix", "agggnn", "rgcn"]);
     let preset = prop::sample::select(vec!["paper", "authors", "practical"]);
@@ -284,20 +284,20 @@ fn configurations() -> impl Strategy<Value = TrainConfig> {
     )
 }
 
-/// All places in a document.
-fn places(value: &Value, at: &str, found: &mut Vec<String>) {
+/// The JSON pointers of all values in a document.
+fn pointers(value: &Value, at: &str, found: &mut Vec<String>) {
     found.push(at.to_owned());
     match value {
-        Value::Object(fields) => fields.iter().for_each(|(name, value)| places(value, &format!("{at}/{name}"), found)),
-        Value::Array(items) => items.iter().enumerate().for_each(|(i, value)| places(value, &format!("{at}/{i}"), found)),
+        Value::Object(fields) => fields.iter().for_each(|(name, value)| pointers(value, &format!("{at}/{name}"), found)),
+        Value::Array(items) => items.iter().enumerate().for_each(|(i, value)| pointers(value, &format!("{at}/{i}"), found)),
         _ => {}
     }
 }
 
-/// `document` with what is at one of its places put in another's place, or replaced by something of no sense.
-fn disarranged(document: &mut Value, (to, from, other): (usize, usize, usize)) {
+/// Replaces a value of `document` by another of its values, or by an unusual value.
+fn disarrange(document: &mut Value, (to, from, other): (usize, usize, usize)) {
     let mut all = Vec::new();
-    places(document, "", &mut all);
+    pointers(document, "", &mut all);
     let odd = [
         json!(null),
         json!(0),
@@ -318,32 +318,32 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(200))]
 
     #[test]
-    fn no_bytes_panic(cut in 0.0..1.0_f64, flips in prop::collection::vec((0.0..1.0_f64, 0..8_u32), 0..4), head: bool) {
+    fn damaged_bytes_do_not_panic(cut in 0.0..1.0_f64, flips in prop::collection::vec((0.0..1.0_f64, 0..8_u32), 0..4), head: bool) {
         let mut bytes = example(config()).to_bytes();
-        // Half of the damage goes to the header, which is a small part of the file.
+        // In half of the cases, only the header is damaged, because it is a small part of the file.
         let reach = if head { parts(&bytes).0.to_string().len() + 8 } else { bytes.len() };
         for (at, bit) in &flips {
             bytes[(at * reach as f64) as usize] ^= 1 << bit;
         }
         if flips.len() % 2 == 0 {
             bytes.truncate((cut * bytes.len() as f64) as usize);
-            prop_assert!(Checkpoint::from_bytes(&bytes).is_err(), "a truncated file is never whole");
+            prop_assert!(Checkpoint::from_bytes(&bytes).is_err(), "a truncated file is an error");
         } else if let Ok(checkpoint) = Checkpoint::from_bytes(&bytes) {
             prop_assert!(checkpoint.parameters().iter().all(|x| x.is_finite()));
-            fly(&checkpoint, 1);
+            run_policy(&checkpoint, 1);
         }
     }
 
     #[test]
-    fn whatever_is_accepted_flies(config in configurations(), scale in prop::sample::select(vec![0.1, 10.0, 1e6]), seed: u64) {
+    fn every_valid_checkpoint_runs(config in configurations(), scale in prop::sample::select(vec![0.1, 10.0, 1e6]), seed: u64) {
         let mut rng = qedgix::rng::stream(seed, "test-weights", 0);
         let weights = (0..checkpoint::layout(&config).len()).map(|_| rng.random_range(-scale..scale)).collect();
         let bytes = Checkpoint::new(config, 1, None, weights).unwrap().to_bytes();
-        fly(&Checkpoint::from_bytes(&bytes).unwrap(), seed);
+        run_policy(&Checkpoint::from_bytes(&bytes).unwrap(), seed);
     }
 
     #[test]
-    fn disarranged_headers_are_refused_or_fly(
+    fn disarranged_headers_are_rejected_or_run(
         config in configurations(),
         changes in prop::collection::vec((any::<usize>(), any::<usize>(), 0..20_usize), 1..3),
         inner: bool,
@@ -352,22 +352,22 @@ proptest! {
         for &change in &changes {
             if inner {
                 let mut inside: Value = serde_json::from_str(header["__metadata__"]["config"].as_str().unwrap()).unwrap();
-                disarranged(&mut inside, change);
+                disarrange(&mut inside, change);
                 header["__metadata__"]["config"] = inside.to_string().into();
             } else {
-                disarranged(&mut header, change);
+                disarrange(&mut header, change);
                 if header["__metadata__"]["config"].as_str().is_none() {
                     break;
                 }
             }
         }
         if let Ok(checkpoint) = Checkpoint::from_bytes(&file(&header, &data)) {
-            fly(&checkpoint, 1);
+            run_policy(&checkpoint, 1);
         }
     }
 
     #[test]
-    fn noise_is_refused(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
+    fn random_bytes_are_rejected(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
         prop_assert!(Checkpoint::from_bytes(&bytes).is_err());
     }
 }

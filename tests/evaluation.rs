@@ -1,4 +1,4 @@
-//! What reports are made of: surveys agree with plain evaluations, and disturbances do what they say and no more.
+//! Traced evaluations: they agree with plain evaluations, and disturbances have their documented effect only.
 
 use std::sync::Mutex;
 
@@ -8,7 +8,7 @@ use qedgix::learner::{Disturbance, LostUav, TracedEvaluation, evaluate, evaluate
 use qedgix::policy::baselines::{self, EnvParams};
 use qedgix::policy::{FleetStep, Policy, RequiredInput};
 
-fn flown(name: &str, env: &EnvConfig, disturbance: &Disturbance, threads: usize) -> TracedEvaluation {
+fn evaluated(name: &str, env: &EnvConfig, disturbance: &Disturbance, threads: usize) -> TracedEvaluation {
     let policy = baselines::by_name(name, EnvParams::from(env)).unwrap();
     evaluate_traced(&*policy, env, &layout_list("valid-v1").unwrap().seeds(11), 7, disturbance, threads).unwrap()
 }
@@ -18,12 +18,12 @@ fn losing(uav: usize, slot: usize) -> Disturbance {
 }
 
 #[test]
-fn without_disturbance_a_survey_is_an_evaluation() {
+fn a_traced_evaluation_has_the_metrics_of_a_plain_one() {
     let env = EnvConfig { user_speed: 0.01, ..EnvConfig::default() };
     let seeds = layout_list("valid-v1").unwrap().seeds(11);
     for name in ["sweep", "random", "greedy-global"] {
         let plain = evaluate(&*baselines::by_name(name, EnvParams::default()).unwrap(), &env, &seeds, 1).unwrap();
-        let evaluation = flown(name, &env, &Disturbance::default(), 1);
+        let evaluation = evaluated(name, &env, &Disturbance::default(), 1);
         assert_eq!(plain, evaluation.episodes, "{name}");
         assert_eq!(evaluation.aoi.len(), env.slots + 1);
         assert_eq!(evaluation.aoi[0], 0.0);
@@ -33,9 +33,9 @@ fn without_disturbance_a_survey_is_an_evaluation() {
 }
 
 #[test]
-fn the_track_is_the_episode_that_was_asked_for() {
+fn the_trajectory_is_of_the_traced_episode() {
     let env = EnvConfig::default();
-    let TracedEvaluation { episodes, trajectory, .. } = flown("sweep", &env, &Disturbance::default(), 3);
+    let TracedEvaluation { episodes, trajectory, .. } = evaluated("sweep", &env, &Disturbance::default(), 3);
     assert_eq!(trajectory.seed, layout_list("valid-v1").unwrap().first + 7);
     assert_eq!((trajectory.uavs.len(), trajectory.users.len(), trajectory.aoi.len()), (env.uavs, env.users, env.users));
     assert!(trajectory.uavs.iter().chain(&trajectory.users).all(|path| path.len() == env.slots + 1));
@@ -44,19 +44,19 @@ fn the_track_is_the_episode_that_was_asked_for() {
 }
 
 #[test]
-fn any_number_of_threads_gives_the_same_bits() {
+fn the_number_of_threads_changes_no_bit() {
     let env = EnvConfig { user_speed: 0.01, ..EnvConfig::default() };
     let disturbance = Disturbance { position_noise: 0.02, ..losing(1, 20) };
     for name in ["sweep", "nearest"] {
-        let one = flown(name, &env, &disturbance, 1);
+        let one = evaluated(name, &env, &disturbance, 1);
         for threads in [2, 3, 50] {
-            assert_eq!(one, flown(name, &env, &disturbance, threads), "{name}, {threads} threads");
+            assert_eq!(one, evaluated(name, &env, &disturbance, threads), "{name}, {threads} threads");
         }
     }
 }
 
 #[test]
-fn a_lost_uav_stays_where_it_was_and_collects_no_more() {
+fn a_lost_uav_does_not_move_or_collect() {
     // One UAV, one user in its range: collected in every slot until the UAV is lost.
     let middle = vec![[0.5, 0.5]];
     let env = EnvConfig {
@@ -67,38 +67,38 @@ fn a_lost_uav_stays_where_it_was_and_collects_no_more() {
         speed: 0.0,
         ..EnvConfig::default()
     };
-    let trajectory = flown("random", &env, &losing(0, 30), 1).trajectory;
+    let trajectory = evaluated("random", &env, &losing(0, 30), 1).trajectory;
     assert!(trajectory.aoi[0][..=30].iter().all(|&a| a == 0.0));
     assert!(trajectory.aoi[0][31..].iter().enumerate().all(|(i, &a)| a == i as f32 + 1.0));
 
     let env = EnvConfig::default();
-    let trajectory = flown("sweep", &env, &losing(2, 10), 1).trajectory;
-    let before = flown("sweep", &env, &Disturbance::default(), 1).trajectory;
+    let trajectory = evaluated("sweep", &env, &losing(2, 10), 1).trajectory;
+    let before = evaluated("sweep", &env, &Disturbance::default(), 1).trajectory;
     assert!(trajectory.uavs[2][10..].iter().all(|at| *at == trajectory.uavs[2][10]));
     assert_eq!(trajectory.uavs[2][..=10], before.uavs[2][..=10]);
-    assert_ne!(trajectory.uavs[0][10], trajectory.uavs[0][11], "the others fly on");
+    assert_ne!(trajectory.uavs[0][10], trajectory.uavs[0][11], "the other UAVs move");
 }
 
-/// Flies east and writes down, per slot, what it was shown: who sees whom, and all positions.
-struct Spy(Mutex<Vec<Shown>>);
+/// A policy with heading 0 that records what it observes in each slot: detections and positions.
+struct RecordingPolicy(Mutex<Vec<ObservedSlot>>);
 
 #[derive(Clone, Debug, PartialEq)]
-struct Shown {
+struct ObservedSlot {
     step: u64,
-    seen: Vec<Vec<u32>>,
+    detected: Vec<Vec<u32>>,
     uavs: Vec<[f64; 2]>,
     users: Vec<[f64; 2]>,
 }
 
-impl Spy {
-    fn shown(env: &EnvConfig, disturbance: &Disturbance) -> Vec<Shown> {
-        let spy = Self(Mutex::default());
-        evaluate_traced(&spy, env, &[5], 0, disturbance, 1).unwrap();
-        spy.0.into_inner().unwrap()
+impl RecordingPolicy {
+    fn observed(env: &EnvConfig, disturbance: &Disturbance) -> Vec<ObservedSlot> {
+        let policy = Self(Mutex::default());
+        evaluate_traced(&policy, env, &[5], 0, disturbance, 1).unwrap();
+        policy.0.into_inner().unwrap()
     }
 }
 
-impl Policy for Spy {
+impl Policy for RecordingPolicy {
     fn actions(&self) -> usize {
         8
     }
@@ -118,10 +118,10 @@ impl Policy for Spy {
     fn act(&self, turns: &mut [FleetStep<'_>]) {
         for turn in turns {
             let slot = turn.slot;
-            let seen = (0..slot.uavs() + slot.users()).map(|i| slot.detections(i).iter().map(|d| d.target).collect());
-            self.0.lock().unwrap().push(Shown {
+            let detected = (0..slot.uavs() + slot.users()).map(|i| slot.detections(i).iter().map(|d| d.target).collect());
+            self.0.lock().unwrap().push(ObservedSlot {
                 step: turn.step,
-                seen: seen.collect(),
+                detected: detected.collect(),
                 uavs: slot.uav_positions().unwrap().to_vec(),
                 users: slot.user_positions().unwrap().to_vec(),
             });
@@ -131,14 +131,14 @@ impl Policy for Spy {
 }
 
 #[test]
-fn a_lost_uav_neither_sees_nor_is_seen() {
+fn a_lost_uav_has_no_detections_and_is_not_detected() {
     for users in [5, 60] {
-        // The largest ranges there are, and errors as large as they may be.
+        // The largest valid range and error.
         let env = EnvConfig { users, detection_range: 2.0, boundary: qedgix::env::Boundary::Free, ..EnvConfig::default() };
         for position_noise in [0.0, 1.0] {
-            let shown = Spy::shown(&env, &Disturbance { position_noise, ..losing(1, 40) });
-            for Shown { step, seen, uavs, .. } in shown {
-                let alone = seen[1].is_empty() && seen.iter().all(|targets| !targets.contains(&1));
+            let slots = RecordingPolicy::observed(&env, &Disturbance { position_noise, ..losing(1, 40) });
+            for ObservedSlot { step, detected, uavs, .. } in slots {
+                let alone = detected[1].is_empty() && detected.iter().all(|targets| !targets.contains(&1));
                 if position_noise == 0.0 || step >= 40 {
                     assert_eq!(alone, step >= 40, "slot {step}");
                 }
@@ -149,22 +149,23 @@ fn a_lost_uav_neither_sees_nor_is_seen() {
 }
 
 #[test]
-fn noise_moves_what_is_seen_by_its_standard_deviation_and_nothing_else() {
+fn position_noise_has_its_standard_deviation_and_does_not_change_the_environment() {
     let env = EnvConfig { users: 40, slots: 200, ..EnvConfig::default() };
-    let truth = Spy::shown(&env, &Disturbance::default());
-    let noisy = Spy::shown(&env, &Disturbance { position_noise: 0.05, ..Disturbance::default() });
-    assert_eq!(noisy, Spy::shown(&env, &Disturbance { position_noise: 0.05, ..Disturbance::default() }));
-    let positions =
-        |shown: &[Shown]| -> Vec<f64> { shown.iter().flat_map(|s| s.uavs.iter().chain(&s.users).flatten().copied()).collect() };
+    let truth = RecordingPolicy::observed(&env, &Disturbance::default());
+    let noisy = RecordingPolicy::observed(&env, &Disturbance { position_noise: 0.05, ..Disturbance::default() });
+    assert_eq!(noisy, RecordingPolicy::observed(&env, &Disturbance { position_noise: 0.05, ..Disturbance::default() }));
+    let positions = |slots: &[ObservedSlot]| -> Vec<f64> {
+        slots.iter().flat_map(|s| s.uavs.iter().chain(&s.users).flatten().copied()).collect()
+    };
     let errors: Vec<f64> = positions(&noisy).iter().zip(positions(&truth)).map(|(a, b)| a - b).collect();
     let n = errors.len() as f64;
     let mean = errors.iter().sum::<f64>() / n;
     let deviation = (errors.iter().map(|e| e * e).sum::<f64>() / n).sqrt();
     assert!(mean.abs() < 2e-3 && (deviation - 0.05).abs() < 2e-3, "mean {mean}, deviation {deviation}");
-    // It flew the same way: the spy ignores what it sees, so the world must not have changed.
+    // The policy ignores its observations, so the metrics must be the same.
     let metrics = |noise| {
         evaluate_traced(
-            &Spy(Mutex::default()),
+            &RecordingPolicy(Mutex::default()),
             &env,
             &[5],
             0,
@@ -176,7 +177,7 @@ fn noise_moves_what_is_seen_by_its_standard_deviation_and_nothing_else() {
 }
 
 #[test]
-fn what_does_not_fit_is_named() {
+fn errors_name_the_invalid_field() {
     let env = EnvConfig::default();
     for (disturbance, field) in [
         (losing(3, 0), "lose.uav"),
@@ -184,8 +185,11 @@ fn what_does_not_fit_is_named() {
         (Disturbance { position_noise: -0.1, ..Disturbance::default() }, "position_noise"),
         (Disturbance { position_noise: f64::NAN, ..Disturbance::default() }, "position_noise"),
     ] {
-        let error = evaluate_traced(&Spy(Mutex::default()), &env, &[1], 0, &disturbance, 1).unwrap_err();
+        let error = evaluate_traced(&RecordingPolicy(Mutex::default()), &env, &[1], 0, &disturbance, 1).unwrap_err();
         assert_eq!(error.field, field);
     }
-    assert_eq!(evaluate_traced(&Spy(Mutex::default()), &env, &[1], 1, &Disturbance::default(), 1).unwrap_err().field, "traced");
+    assert_eq!(
+        evaluate_traced(&RecordingPolicy(Mutex::default()), &env, &[1], 1, &Disturbance::default(), 1).unwrap_err().field,
+        "traced"
+    );
 }

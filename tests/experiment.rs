@@ -1,4 +1,4 @@
-//! `qedgix experiment`: an experiment run whole, interrupted and resumed says the same; mistakes are named before hours pass.
+//! `qedgix experiment`: an interrupted and resumed experiment gives the same results; errors are reported before the first run.
 
 use std::fs;
 use std::path::Path;
@@ -51,14 +51,14 @@ fn run(dir: &Path, words: &[&str]) -> Output {
     qedgix(dir, words).output().unwrap()
 }
 
-fn done(dir: &Path, words: &[&str]) -> String {
+fn run_successfully(dir: &Path, words: &[&str]) -> String {
     let output = run(dir, words);
     let (out, err) = (String::from_utf8(output.stdout).unwrap(), String::from_utf8(output.stderr).unwrap());
     assert!(output.status.success(), "{words:?}: {out}\n{err}");
     out + &err
 }
 
-fn in_a_directory(toml: &str) -> tempfile::TempDir {
+fn directory_with(toml: &str) -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     fs::write(dir.path().join("tiny.toml"), toml).unwrap();
     dir
@@ -68,7 +68,7 @@ fn read(dir: &Path, name: &str) -> String {
     fs::read_to_string(dir.join(name)).unwrap_or_else(|e| panic!("{name}: {e}"))
 }
 
-/// Every file below `dir`, by its path, except what measures time and what a killed process was writing.
+/// All files below `dir` by path, except those that contain times and those that a killed process left.
 fn files(dir: &Path) -> Vec<(String, Vec<u8>)> {
     let mut found = Vec::new();
     let mut left = vec![dir.to_path_buf()];
@@ -87,9 +87,9 @@ fn files(dir: &Path) -> Vec<(String, Vec<u8>)> {
 }
 
 #[test]
-fn interrupted_and_resumed_is_the_same_as_never_stopped() {
-    let dir = in_a_directory(TINY);
-    let whole = done(dir.path(), &["tiny.toml", "--threads", "3"]);
+fn an_interrupted_experiment_gives_the_same_results() {
+    let dir = directory_with(TINY);
+    let whole = run_successfully(dir.path(), &["tiny.toml", "--threads", "3"]);
     assert!(whole.contains("Qedgix, 2 users, seed 2: step"), "{whole}");
     let out = dir.path().join("results/tiny");
     let results: Value = serde_json::from_str(&read(&out, "results.json")).unwrap();
@@ -110,7 +110,7 @@ fn interrupted_and_resumed_is_the_same_as_never_stopped() {
     }
     assert!(read(&out, "parameter.svg").starts_with("<svg"));
 
-    // Killed again and again, at whatever it was doing, then left to finish.
+    // Killed several times at arbitrary points, then run to the end.
     for wait in [20, 60, 120, 200] {
         let mut child = qedgix(dir.path(), &["tiny.toml", "--out", "again", "--threads", "2"])
             .stdout(Stdio::null())
@@ -124,7 +124,7 @@ fn interrupted_and_resumed_is_the_same_as_never_stopped() {
         let _ = child.kill();
         child.wait().unwrap();
     }
-    done(dir.path(), &["tiny.toml", "--out", "again", "--threads", "1"]);
+    run_successfully(dir.path(), &["tiny.toml", "--out", "again", "--threads", "1"]);
     let (whole, again) = (files(&out), files(&dir.path().join("again")));
     assert!(!names(&whole).iter().any(|name| name.contains("snapshot")));
     assert_eq!(names(&whole), names(&again));
@@ -132,11 +132,11 @@ fn interrupted_and_resumed_is_the_same_as_never_stopped() {
         assert!(a == b, "{name} differs");
     }
 
-    // What is finished is not trained again; more layouts are flown with the weights that are there.
-    let second = done(dir.path(), &["tiny.toml"]);
+    // Finished runs are not trained again. With more layouts, their weights are evaluated again.
+    let second = run_successfully(dir.path(), &["tiny.toml"]);
     assert!(!second.contains("step 0"), "{second}");
     fs::write(dir.path().join("tiny.toml"), TINY.replace("episodes = 6", "episodes = 9")).unwrap();
-    let more = done(dir.path(), &["tiny.toml"]);
+    let more = run_successfully(dir.path(), &["tiny.toml"]);
     assert!(!more.contains("step 0"), "{more}");
     let results: Value = serde_json::from_str(&read(&out, "results.json")).unwrap();
     assert_eq!(results["runs"][0]["per_layout"].as_array().unwrap().len(), 9);
@@ -147,16 +147,16 @@ fn names(files: &[(String, Vec<u8>)]) -> Vec<&str> {
 }
 
 #[test]
-fn the_other_figures_are_drawn() {
+fn convergence_and_trajectories_are_plotted() {
     let convergence = TINY.replace("\"parameter\"", "\"convergence\"");
-    let dir = in_a_directory(&convergence);
-    done(dir.path(), &["tiny.toml", "--out", "c", "--steps", "200"]);
+    let dir = directory_with(&convergence);
+    run_successfully(dir.path(), &["tiny.toml", "--out", "c", "--steps", "200"]);
     for name in ["convergence-2-users.svg", "reached-2-users.svg", "convergence-3-users.svg"] {
         assert!(read(&dir.path().join("c"), name).contains("Qedgix"), "{name}");
     }
     fs::write(dir.path().join("tiny.toml"), TINY.replace("\"parameter\"", "\"trajectories\"")).unwrap();
-    // The same runs, drawn otherwise: nothing is trained.
-    let out = done(dir.path(), &["tiny.toml", "--out", "c", "--steps", "200"]);
+    // The same runs with another plot: nothing is trained.
+    let out = run_successfully(dir.path(), &["tiny.toml", "--out", "c", "--steps", "200"]);
     assert!(!out.contains("step 0"), "{out}");
     for name in ["trajectories-qedgix-2-users.svg", "trajectories-qmix-3-users.svg"] {
         assert!(read(&dir.path().join("c"), name).starts_with("<svg"), "{name}");
@@ -164,19 +164,19 @@ fn the_other_figures_are_drawn() {
 }
 
 #[test]
-fn a_dry_run_lists_the_runs_and_does_nothing() {
-    let dir = in_a_directory(TINY);
-    let listed = done(dir.path(), &["tiny.toml", "--dry-run", "--seeds", "7,8,9"]);
+fn a_dry_run_lists_the_runs_without_running_them() {
+    let dir = directory_with(TINY);
+    let listed = run_successfully(dir.path(), &["tiny.toml", "--dry-run", "--seeds", "7,8,9"]);
     assert_eq!(listed.lines().filter(|line| line.contains("to do")).count(), 12, "{listed}");
     assert!(listed.contains("QMIX, 3 users, seed 9"), "{listed}");
     assert!(!dir.path().join("results").exists());
-    let other = done(dir.path(), &["tiny.toml", "--dry-run", "--seeds", "7", "--set", "training.gamma=0.9"]);
+    let other = run_successfully(dir.path(), &["tiny.toml", "--dry-run", "--seeds", "7", "--set", "training.gamma=0.9"]);
     let folder = |text: &str| text.lines().nth(1).unwrap().rsplit(' ').next().unwrap().to_owned();
-    assert_ne!(folder(&listed), folder(&other), "another configuration is another folder");
+    assert_ne!(folder(&listed), folder(&other), "another configuration has another folder");
 }
 
 #[test]
-fn mistakes_name_the_file_the_table_and_the_field() {
+fn errors_name_the_file_the_table_and_the_field() {
     for (from, to, hint) in [
         ("seeds = [1, 2]", "seeds = [1, 1]", "seeds: 1 twice"),
         ("seeds = [1, 2]", "sedes = [1, 2]", "sedes"),
@@ -195,13 +195,13 @@ fn mistakes_name_the_file_the_table_and_the_field() {
         ("[run]", "[run", "line"),
     ] {
         assert!(TINY.contains(from), "{from}");
-        let dir = in_a_directory(&TINY.replacen(from, to, 1));
+        let dir = directory_with(&TINY.replacen(from, to, 1));
         let output = run(dir.path(), &["tiny.toml"]);
         let message = String::from_utf8(output.stderr).unwrap();
         assert!(!output.status.success() && message.contains("tiny.toml") && message.contains(hint), "{to}: {message}");
-        assert!(!dir.path().join("results").exists(), "{to}: nothing is begun");
+        assert!(!dir.path().join("results").exists(), "{to}: no run is started");
     }
-    let dir = in_a_directory(TINY);
+    let dir = directory_with(TINY);
     for (words, hint) in [
         (vec!["tiny.toml", "--set", "training.bach=3"], "command line, training.bach"),
         (vec!["tiny.toml", "--set", "bach=3"], "environment.FIELD"),
@@ -216,26 +216,26 @@ fn mistakes_name_the_file_the_table_and_the_field() {
 }
 
 #[test]
-fn the_experiments_of_the_repository_are_sound() {
+fn the_experiments_of_the_repository_are_valid() {
     let dir = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/experiments"));
     let mut found = Vec::new();
     for entry in fs::read_dir(dir).unwrap() {
         let name = entry.unwrap().file_name().into_string().unwrap();
-        done(dir, &[&name, "--dry-run"]);
+        run_successfully(dir, &[&name, "--dry-run"]);
         found.push(name);
     }
     found.sort();
     let expected = ["convergence", "information", "practical", "range", "scale", "trajectories"];
     assert_eq!(found, expected.map(|name| format!("{name}.toml")));
-    let part = done(dir, &["range.toml", "--dry-run", "--series", "QMIX", "--point", "9 xi", "--point", "4 xi"]);
+    let part = run_successfully(dir, &["range.toml", "--dry-run", "--series", "QMIX", "--point", "9 xi", "--point", "4 xi"]);
     assert!(part.contains(": 6 runs") && !part.contains("Qedgix") && !part.contains("5 xi"), "{part}");
 }
 
 #[cfg(unix)]
 #[test]
-fn ctrl_c_keeps_the_runs_that_are_under_way() {
-    let dir = in_a_directory(TINY);
-    // Too long to end by itself: evaluations only at the beginning and far away.
+fn ctrl_c_saves_the_runs_in_progress() {
+    let dir = directory_with(TINY);
+    // A run that does not end during the test, with one evaluation at the start.
     let long = ["tiny.toml", "--steps", "100000000", "--set", "training.eval_every=100000000", "--threads", "2"];
     let mut child = qedgix(dir.path(), &long).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
     let snapshots = || files(dir.path()).iter().filter(|(name, _)| name.ends_with("snapshot")).count();
@@ -244,10 +244,10 @@ fn ctrl_c_keeps_the_runs_that_are_under_way() {
         std::thread::sleep(Duration::from_millis(10));
     }
     let busy = run(dir.path(), &long);
-    assert!(String::from_utf8_lossy(&busy.stderr).contains("another process"), "two would write the same files");
+    assert!(String::from_utf8_lossy(&busy.stderr).contains("another process"), "two processes must not write the same files");
     let interrupted = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
     assert!(interrupted.success());
     assert!(!child.wait().unwrap().success());
-    let listed = done(dir.path(), &[&long[..5], &["--dry-run"]].concat());
+    let listed = run_successfully(dir.path(), &[&long[..5], &["--dry-run"]].concat());
     assert_eq!(listed.lines().filter(|line| line.contains("at step")).count(), 2, "{listed}");
 }

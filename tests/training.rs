@@ -1,6 +1,6 @@
-//! Training as a whole: it repeats itself bit for bit on any number of threads, and stopping it loses nothing.
+//! Training runs: they are equal bit for bit on any number of threads, and after interruptions.
 
-#![allow(clippy::float_cmp, reason = "runs repeat themselves bit for bit")]
+#![allow(clippy::float_cmp, reason = "runs are equal bit for bit")]
 
 mod sample;
 
@@ -11,11 +11,11 @@ use qedgix::learner::{
     Algorithm, Event, Learner, Preset, Rollout, SnapshotError, Symmetry, TrainConfig, Trainer, evaluate, layout_list,
 };
 
-/// A run of a few iterations that meets everything: updates, target copies, a full ring, evaluations.
-fn small(algorithm: Algorithm) -> TrainConfig {
+/// A run of a few iterations with updates, target copies, a full replay and evaluations.
+fn small_config(algorithm: Algorithm) -> TrainConfig {
     let mut config = TrainConfig::preset(algorithm, Preset::Practical);
     config.environment.slots = 10;
-    // 1/K of 7 significant bits repeats for ever in decimals.
+    // 1/7 has no finite decimal or binary representation.
     config.environment.reward_scale = Some(1.0 / 7.0);
     let t = &mut config.training;
     t.steps = 1200;
@@ -33,9 +33,9 @@ fn small(algorithm: Algorithm) -> TrainConfig {
 const ALGORITHMS: [Algorithm; 6] =
     [Algorithm::Qmix, Algorithm::Vdn, Algorithm::Iql, Algorithm::Qedgix, Algorithm::Agggnn, Algorithm::Rgcn];
 
-/// The same with everything that the presets of the paper leave out turned on, or off where `small` has it.
-fn other(algorithm: Algorithm) -> TrainConfig {
-    let mut config = small(algorithm);
+/// As [`small_config`], with the opposite of each option.
+fn opposite_config(algorithm: Algorithm) -> TrainConfig {
+    let mut config = small_config(algorithm);
     let t = &mut config.training;
     t.augment = !t.augment;
     t.target_tau = if t.target_tau > 0.0 { 0.0 } else { 0.02 };
@@ -48,14 +48,14 @@ fn other(algorithm: Algorithm) -> TrainConfig {
     config
 }
 
-fn run(trainer: &mut Trainer) -> Vec<Event> {
+fn collect_events(trainer: &mut Trainer) -> Vec<Event> {
     trainer.collect()
 }
 
 #[test]
-fn events_come_in_order_and_end() {
-    let mut trainer = Trainer::new(small(Algorithm::Qmix), 1).unwrap();
-    let events = run(&mut trainer);
+fn events_are_in_order_and_end() {
+    let mut trainer = Trainer::new(small_config(Algorithm::Qmix), 1).unwrap();
+    let events = collect_events(&mut trainer);
     assert!(trainer.finished() && trainer.next().is_none());
     assert_eq!(events.last(), Some(&Event::Finished { step: 1200 }));
     let evaluations: Vec<u64> =
@@ -66,7 +66,7 @@ fn events_come_in_order_and_end() {
     for (n, i) in iterations.iter().enumerate() {
         let done = n as u64 + 1;
         assert_eq!((i.step, i.episodes), (40 * done, 4 * done));
-        // 16 episodes are held after the fourth iteration.
+        // Replay holds 16 episodes after the fourth iteration.
         let learning = done.saturating_sub(3);
         assert_eq!(i.updates, 2 * learning);
         assert_eq!(i.loss.is_some(), learning > 0);
@@ -77,8 +77,8 @@ fn events_come_in_order_and_end() {
 }
 
 #[test]
-fn the_best_weights_are_kept_and_fly_as_they_were_evaluated() {
-    let mut trainer = Trainer::new(small(Algorithm::Qmix), 1).unwrap();
+fn the_best_weights_are_kept_and_reproduce_their_evaluation() {
+    let mut trainer = Trainer::new(small_config(Algorithm::Qmix), 1).unwrap();
     assert!(trainer.best().unwrap().is_none());
     let mut lowest = f64::INFINITY;
     for event in trainer.by_ref() {
@@ -90,91 +90,91 @@ fn the_best_weights_are_kept_and_fly_as_they_were_evaluated() {
     assert_eq!(best.metrics().unwrap().mean_aoi, lowest);
     assert_eq!(trainer.best_evaluation().unwrap().step, best.step());
     let seeds = layout_list("valid-v1").unwrap().seeds(6);
-    let flown = evaluate(&best.policy(), &best.config().environment, &seeds, 1).unwrap();
-    assert_eq!(EpisodeMetrics::mean(&flown), *best.metrics().unwrap());
+    let metrics = evaluate(&best.policy(), &best.config().environment, &seeds, 1).unwrap();
+    assert_eq!(EpisodeMetrics::mean(&metrics), *best.metrics().unwrap());
     let last = trainer.checkpoint().unwrap();
     assert_eq!(last.step(), 1200);
     assert!(last.metrics().is_some(), "evaluated at the end");
 }
 
 #[test]
-fn threads_change_no_bit() {
-    for config in ALGORITHMS.iter().flat_map(|&a| [small(a), other(a)]) {
+fn the_number_of_threads_changes_no_bit() {
+    for config in ALGORITHMS.iter().flat_map(|&a| [small_config(a), opposite_config(a)]) {
         let mut one = Trainer::new(config.clone(), 1).unwrap();
         let mut two = Trainer::new(config, 2).unwrap();
-        assert_eq!(run(&mut one), run(&mut two));
+        assert_eq!(collect_events(&mut one), collect_events(&mut two));
         assert_eq!(one.checkpoint().unwrap().to_bytes(), two.checkpoint().unwrap().to_bytes());
         assert!(one.snapshot() == two.snapshot());
     }
 }
 
 #[test]
-fn seeds_change_everything() {
-    let mut other = small(Algorithm::Vdn);
+fn another_seed_gives_other_losses() {
+    let mut other = small_config(Algorithm::Vdn);
     other.seed = 2;
-    let (mut a, mut b) = (Trainer::new(small(Algorithm::Vdn), 1).unwrap(), Trainer::new(other, 1).unwrap());
-    // Ages of episodes too short to reach anybody may agree; losses may not.
-    let told = |trainer: &mut Trainer| -> Vec<Event> {
+    let (mut a, mut b) = (Trainer::new(small_config(Algorithm::Vdn), 1).unwrap(), Trainer::new(other, 1).unwrap());
+    // The AoI of short episodes, in which no user is visited, can be equal; losses cannot.
+    let iterations = |trainer: &mut Trainer| -> Vec<Event> {
         trainer.filter(|e| matches!(e, Event::Iteration(i) if i.loss.is_some())).collect()
     };
-    assert!(told(&mut a).iter().zip(&told(&mut b)).all(|(a, b)| a != b));
+    assert!(iterations(&mut a).iter().zip(&iterations(&mut b)).all(|(a, b)| a != b));
 }
 
 #[test]
-fn resuming_is_never_having_stopped() {
-    for config in ALGORITHMS.iter().flat_map(|&a| [small(a), other(a)]) {
+fn a_resumed_run_equals_a_run_without_interruption() {
+    for config in ALGORITHMS.iter().flat_map(|&a| [small_config(a), opposite_config(a)]) {
         let mut whole = Trainer::new(config.clone(), 2).unwrap();
-        let expected = run(&mut whole);
-        // Interrupted again and again, after every kind of event, on changing numbers of threads.
-        let mut told = Vec::new();
+        let expected = collect_events(&mut whole);
+        // Interrupted several times, after every kind of event, with different numbers of threads.
+        let mut events = Vec::new();
         let mut trainer = Trainer::new(config, 1).unwrap();
-        for (n, events) in [1, 1, 3, 2, 1, 6, 8, 1, 12].into_iter().enumerate() {
-            told.extend(trainer.by_ref().take(events));
+        for (n, count) in [1, 1, 3, 2, 1, 6, 8, 1, 12].into_iter().enumerate() {
+            events.extend(trainer.by_ref().take(count));
             let saved = trainer.snapshot();
             trainer = Trainer::restore(&saved, 1 + n % 2).unwrap();
             assert!(trainer.snapshot() == saved);
         }
-        told.extend(trainer.by_ref());
-        assert_eq!(told, expected);
+        events.extend(trainer.by_ref());
+        assert_eq!(events, expected);
         assert!(trainer.snapshot() == whole.snapshot(), "weights, optimiser, replay and counters");
         assert_eq!(trainer.best().unwrap(), whole.best().unwrap());
     }
 }
 
 #[test]
-fn turned_and_mirrored_episodes_are_what_turned_and_mirrored_fleets_fly() {
+fn transformed_episodes_equal_the_episodes_of_transformed_fleets() {
     let config = EnvConfig { hover: true, ..EnvConfig::default() };
-    let mut train = small(Algorithm::Vdn);
+    let mut train = small_config(Algorithm::Vdn);
     train.environment = config.clone();
     train.training.envs = Symmetry::COUNT.into();
     let learner = Learner::new(&train, 1).unwrap();
     let mut rollout = Rollout::new(&train, learner.agent()).unwrap();
-    let flown = rollout.collect(learner.agent(), learner.agent_parameters(), 1.0, 0).clone();
-    let mut turned = flown.clone();
+    let episodes = rollout.collect(learner.agent(), learner.agent_parameters(), 1.0, 0).clone();
+    let mut transformed = episodes.clone();
     let symmetries: Vec<_> = (0..Symmetry::COUNT).map(Symmetry::number).collect();
-    turned.transform(&symmetries);
-    let (m, n, k) = (flown.uavs, flown.users, flown.slots);
-    for e in 0..flown.len {
-        let users = turned.user_xy[e * n * 2..][..n * 2].as_chunks().0;
+    transformed.transform(&symmetries);
+    let (m, n, k) = (episodes.uavs, episodes.users, episodes.slots);
+    for e in 0..episodes.len {
+        let users = transformed.user_xy[e * n * 2..][..n * 2].as_chunks().0;
         let given = users.iter().map(|p: &[f32; 2]| p.map(f64::from)).collect();
         let mut env = BatchEnv::new(&EnvConfig { layout: Layout::Given(given), ..config.clone() }, 1).unwrap();
         for slot in 0..=k {
             let at = e * (k + 1) + slot;
-            let expected = &turned.uav_xy[at * m * 2..][..m * 2];
+            let expected = &transformed.uav_xy[at * m * 2..][..m * 2];
             assert!(env.uav_xy().iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-5), "symmetry {e}, slot {slot}");
-            assert_eq!(env.aoi(), &turned.aoi[at * n..][..n], "symmetry {e}, slot {slot}");
+            assert_eq!(env.aoi(), &transformed.aoi[at * n..][..n], "symmetry {e}, slot {slot}");
             if slot < k {
-                env.step(&turned.actions[(e * k + slot) * m..][..m]);
+                env.step(&transformed.actions[(e * k + slot) * m..][..m]);
             }
         }
     }
-    assert_eq!(turned.uav_xy[..81 * 6], flown.uav_xy[..81 * 6], "the first symmetry changes nothing");
-    assert_ne!(turned.actions, flown.actions);
+    assert_eq!(transformed.uav_xy[..81 * 6], episodes.uav_xy[..81 * 6], "the first symmetry is the identity");
+    assert_ne!(transformed.actions, episodes.actions);
 }
 
 #[test]
-fn averaged_weights_follow_the_online_ones_from_the_first_update() {
-    let mut config = small(Algorithm::Vdn);
+fn averaged_weights_are_averages_from_the_first_update() {
+    let mut config = small_config(Algorithm::Vdn);
     config.training.average = 4;
     let mut learner = Learner::new(&config, 1).unwrap();
     let batch = sample::episodes(&config.dims(), 4, 1);
@@ -182,7 +182,7 @@ fn averaged_weights_follow_the_online_ones_from_the_first_update() {
     for update in 1..=6_usize {
         learner.update(&batch, 1e-3);
         online.push(learner.parameters().to_vec());
-        // Until it looks back on four updates it is their plain mean; then the older ones fade.
+        // For the first four updates it is their mean; afterwards older updates have less weight.
         if update <= 4 {
             let mean = |i: usize| online.iter().map(|w| w[i]).sum::<f32>() / update as f32;
             let close = learner.published().iter().enumerate().all(|(i, a)| (a - mean(i)).abs() < 1e-6);
@@ -193,31 +193,31 @@ fn averaged_weights_follow_the_online_ones_from_the_first_update() {
 }
 
 #[test]
-fn a_stopped_run_goes_on_when_asked() {
-    let mut whole = Trainer::new(small(Algorithm::Vdn), 1).unwrap();
-    let expected = run(&mut whole);
-    let mut trainer = Trainer::new(small(Algorithm::Vdn), 1).unwrap();
+fn a_stopped_run_continues_when_the_flag_is_cleared() {
+    let mut whole = Trainer::new(small_config(Algorithm::Vdn), 1).unwrap();
+    let expected = collect_events(&mut whole);
+    let mut trainer = Trainer::new(small_config(Algorithm::Vdn), 1).unwrap();
     let stop = trainer.stop_flag();
-    let mut told = Vec::new();
+    let mut events = Vec::new();
     for event in trainer.by_ref() {
-        told.push(event);
-        stop.store(told.len() == 7, Ordering::Relaxed);
+        events.push(event);
+        stop.store(events.len() == 7, Ordering::Relaxed);
     }
-    assert_eq!(told.len(), 7);
+    assert_eq!(events.len(), 7);
     assert!(!trainer.finished());
     stop.store(false, Ordering::Relaxed);
-    told.extend(trainer);
-    assert_eq!(told, expected);
+    events.extend(trainer);
+    assert_eq!(events, expected);
 }
 
 #[test]
 fn a_damaged_snapshot_is_an_error() {
-    let mut trainer = Trainer::new(small(Algorithm::Vdn), 1).unwrap();
+    let mut trainer = Trainer::new(small_config(Algorithm::Vdn), 1).unwrap();
     trainer.by_ref().take(6).for_each(drop);
     let saved = trainer.snapshot();
     let restore = |bytes: &[u8]| Trainer::restore(bytes, 1).err();
     assert_eq!(restore(b""), Some(SnapshotError::Foreign));
-    assert_eq!(restore(b"safetensors, perhaps, but certainly nothing that training wrote"), Some(SnapshotError::Foreign));
+    assert_eq!(restore(b"bytes that are not a snapshot, long enough for a checksum"), Some(SnapshotError::Foreign));
     for len in [12, 44, 50, 1000, saved.len() / 2, saved.len() - 1] {
         assert!(restore(&saved[..len]).is_some(), "cut to {len}");
     }
@@ -226,7 +226,7 @@ fn a_damaged_snapshot_is_an_error() {
         damaged[at] ^= 4;
         assert_eq!(restore(&damaged), Some(SnapshotError::Checksum), "at {at}");
     }
-    // A checksum that fits does not make sense of nonsense.
+    // Changed bytes with a valid checksum do not cause a panic.
     for at in (0..saved.len() - 32).step_by(saved.len() / 200) {
         let mut forged = saved[..saved.len() - 32].to_vec();
         forged[at] ^= 0x40;
@@ -239,8 +239,8 @@ fn a_damaged_snapshot_is_an_error() {
 }
 
 #[test]
-fn invalid_configurations_do_not_start() {
-    let mut config = small(Algorithm::Qmix);
+fn an_invalid_configuration_is_an_error() {
+    let mut config = small_config(Algorithm::Qmix);
     config.training.batch = 0;
     let error = Trainer::new(config, 1).err().unwrap();
     assert_eq!(error.field, "training.batch");

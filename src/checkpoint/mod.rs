@@ -1,9 +1,9 @@
-//! Checkpoints: a training run's parameters as a safetensors file that says what it is.
+//! Checkpoints: the parameters and the configuration of a training run as a safetensors file.
 //!
-//! Metadata: `format`, `version`, `config` (the resolved [`TrainConfig`] as JSON), `step`, and `metrics` where the weights
-//! were evaluated. Tensors have the names and shapes of the golden files; `agent.*` is needed to fly, `mixer.*` to train on.
-//! The same content is the same bytes, so the digest names it. Reading trusts nothing: whatever the bytes, the answer is a
-//! checkpoint that works or an [`Error`] that says what is wrong. Files are opened elsewhere.
+//! Metadata: `format`, `version`, `config` (the resolved [`TrainConfig`] as JSON), `step`, and `metrics` if the weights were
+//! evaluated. Tensors have the names and shapes of the golden files (docs/model.md, "Golden files"); `agent.*` is required to run
+//! the policy, `mixer.*` is optional. The same content gives the same bytes, so the digest identifies it. Reading checks
+//! everything: it returns a usable checkpoint or an [`Error`].
 
 mod error;
 mod file;
@@ -24,13 +24,13 @@ use crate::policy::mixer::Mixer;
 use crate::policy::{Agent, LearnedPolicy};
 use crate::train_config::TrainConfig;
 
-/// Parameters with what they were trained as.
+/// Parameters and the configuration that they were trained with.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Checkpoint {
     config: TrainConfig,
     step: u64,
     metrics: Option<EpisodeMetrics>,
-    /// Flat, as [`layout`] orders them; `agent.*` only, or `mixer.*` too.
+    /// Flat, in the order of [`layout`]: `agent.*`, and `mixer.*` if present.
     parameters: Vec<f32>,
 }
 
@@ -38,7 +38,7 @@ pub struct Checkpoint {
 pub fn layout(config: &TrainConfig) -> ParameterLayout {
     let dims = config.dims();
     let mut layout = Agent::new(config.agent(), dims).layout().clone();
-    Mixer::new(config.training.mixer.into(), &dims, &mut layout);
+    Mixer::new(config.training.mixer, &dims, &mut layout);
     layout
 }
 
@@ -46,8 +46,8 @@ impl Checkpoint {
     /// A checkpoint of `parameters` (flat, as [`layout`] orders them) at environment step `step`.
     ///
     /// # Errors
-    /// The configuration is invalid, or the parameters are not as many as it has, or one is not a finite number of sensible
-    /// size.
+    /// [`Error::Config`] if the configuration is invalid or has another number of parameters; [`Error::Value`] if a parameter is
+    /// not finite or too large.
     pub fn new(config: TrainConfig, step: u64, metrics: Option<EpisodeMetrics>, parameters: Vec<f32>) -> Result<Self, Error> {
         config.validate()?;
         let layout = layout(&config);
@@ -70,35 +70,35 @@ impl Checkpoint {
         &self.config
     }
 
-    /// Environment steps after which it was taken.
+    /// Environment steps of the training run when the checkpoint was taken.
     pub fn step(&self) -> u64 {
         self.step
     }
 
-    /// Figures on the validation layouts, where they were measured.
+    /// Metrics on the validation layouts, if the weights were evaluated.
     pub fn metrics(&self) -> Option<&EpisodeMetrics> {
         self.metrics.as_ref()
     }
 
-    /// The flat vector, as [`layout`] orders it. Where the file had no `mixer.*`, it ends after `agent.*`.
+    /// The flat vector in the order of [`layout`]. Without `mixer.*` in the file, it ends after `agent.*`.
     pub fn parameters(&self) -> &[f32] {
         &self.parameters
     }
 
-    /// The policy that these weights fly.
+    /// The policy with these parameters.
     ///
     /// # Panics
-    /// Never: what the policy asks of its parameters was checked when the checkpoint was made or read.
+    /// Never: the parameters were checked when the checkpoint was created or read.
     pub fn policy(&self) -> LearnedPolicy {
         let (agent, dims) = (self.config.agent(), self.config.dims());
         let len = Agent::new(agent, dims).layout().len();
-        LearnedPolicy::new(agent, dims, self.parameters[..len].to_vec()).expect("checked when it was made or read")
+        LearnedPolicy::new(agent, dims, self.parameters[..len].to_vec()).expect("checked when the checkpoint was created or read")
     }
 
-    /// The file.
+    /// The bytes of the file.
     ///
     /// # Panics
-    /// Never: the configuration is plain data, which always has a JSON form.
+    /// Never: the configuration can always be written as JSON.
     pub fn to_bytes(&self) -> Vec<u8> {
         let json = |value: serde_json::Result<String>| value.expect("plain data with string keys");
         let mut metadata = BTreeMap::from([
@@ -118,10 +118,10 @@ impl Checkpoint {
         file::write(&metadata, &tensors)
     }
 
-    /// Reads a file, from wherever it comes.
+    /// Reads a file from an untrusted source.
     ///
     /// # Errors
-    /// Anything that keeps the checkpoint from being used: see [`Error`].
+    /// [`Error`] if the bytes are not a usable checkpoint.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, Error> {
         let (metadata, tensors) = file::read(bytes)?;
         let entry = |field: &str| metadata.get(field).cloned();
@@ -163,7 +163,7 @@ fn flatten(config: &TrainConfig, tensors: Vec<Tensor>) -> Result<Vec<f32>, Error
     }
 }
 
-/// What a file is known by: SHA-256 of its bytes, in hexadecimal.
+/// The digest of a file: SHA-256 of its bytes, in hexadecimal.
 pub fn digest(bytes: &[u8]) -> String {
     hex::encode(Sha256::digest(bytes))
 }

@@ -1,4 +1,4 @@
-//! The loss of an update and its gradient (spec 5): double Q-learning with a target network and TD(lambda).
+//! The loss of an update and its gradient (docs/model.md, "Targets"): double Q-learning with a target network and TD(lambda).
 //!
 //! ```text
 //! m_k = target_mixer(Q_target(argmax_a Q(o_k, a)), s_k)
@@ -6,8 +6,8 @@
 //! loss = mean over episodes, slots and joint values of (Q_tot - G)^2 / 2
 //! ```
 //!
-//! A batch is split into chunks of episodes whose number depends on sizes only. Each chunk's gradient is its own and they
-//! are summed in order, so the result has the same bits whatever the number of threads.
+//! A batch is split into chunks of episodes; their number depends on sizes only. Each chunk has its own gradient, and the gradients
+//! are summed in a fixed order. The number of threads therefore changes no bit.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -18,26 +18,26 @@ use crate::nn::{Batch, ParameterLayout, Real, Weights, argmax, norm_squared};
 use crate::policy::mixer::{Mixer, MixerCache, MixerKind};
 use crate::policy::{Agent, AgentCache, AgentConfig, Dims, Geometry, Inputs, NO_ACTION, TOKEN, flat_state};
 
-/// UAV rows per slot that a chunk aims at: enough for a product to be efficient, few enough for the caches.
+/// Rows (UAVs of all episodes) per slot of a chunk: enough for efficient matrix products, few enough for the CPU caches.
 const ROWS: usize = 24;
-/// Parameters reduced together.
+/// Parameters per task when gradients are summed.
 const BLOCK: usize = 4096;
 
-/// Episodes of a chunk, for fleets of this size.
-pub fn chunk_of(uavs: usize) -> usize {
+/// Episodes per chunk for fleets of this size.
+pub fn episodes_per_chunk(uavs: usize) -> usize {
     (ROWS / uavs).max(1)
 }
 
-/// Discounting.
+/// The parameters of TD(lambda).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TdLambda {
-    /// gamma.
+    /// Discount factor gamma.
     pub gamma: f64,
-    /// lambda.
+    /// Weight lambda of longer returns.
     pub lambda: f64,
 }
 
-/// What a batch says about the parameters.
+/// Metrics of an update.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct LossMetrics {
     /// The loss.
@@ -48,25 +48,25 @@ pub struct LossMetrics {
     pub q_tot: f64,
 }
 
-/// Everything an update computes on its way, in the order (episode, slot, ...): for tests and curious people.
+/// Intermediate values of an update in the order (episode, slot, ...), for tests.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Trace<T> {
     /// (B, K+1, M, A) Q-values of the online network.
     pub q: Vec<T>,
-    /// (B, K, W) joint values of the actions taken; W is 1, or M when nothing is mixed.
+    /// (B, K, W) joint values of the actions taken; W is 1, or M without a mixer.
     pub q_tot: Vec<T>,
     /// (B, K, W) targets.
     pub target: Vec<T>,
 }
 
-/// The networks and the buffers of an update. Parameters belong to the caller.
+/// The networks and buffers of the loss. The caller owns the parameters.
 #[derive(Debug)]
 pub struct Loss<T: Real> {
     agent: Agent,
     mixer: Mixer,
     layout: ParameterLayout,
     td_lambda: TdLambda,
-    /// Online and target network, see [`Weights`].
+    /// Transposed weights of the online and the target networks, see [`Weights`].
     transposed: [Vec<T>; 2],
     chunks: Vec<Chunk<T>>,
     workspaces: Vec<Mutex<Workspace<T>>>,
@@ -74,7 +74,7 @@ pub struct Loss<T: Real> {
     norms: Vec<f64>,
 }
 
-/// What a chunk of episodes contributes.
+/// The contribution of a chunk.
 #[derive(Debug)]
 struct Chunk<T> {
     grads: Vec<T>,
@@ -105,7 +105,7 @@ struct Workspace<T: Real> {
 }
 
 impl<T: Real> Loss<T> {
-    /// Networks for `config`; `threads` is how many threads will work at most.
+    /// The loss for these networks; `threads` is the largest number of threads that evaluate it.
     pub fn new(config: AgentConfig, dims: Dims, mixer: MixerKind, td_lambda: TdLambda, threads: usize) -> Self {
         let agent = Agent::new(config, dims);
         let mut layout = agent.layout().clone();
@@ -124,7 +124,7 @@ impl<T: Real> Loss<T> {
         }
     }
 
-    /// `agent.*`, then `mixer.*`.
+    /// The parameters: `agent.*`, then `mixer.*`.
     pub fn layout(&self) -> &ParameterLayout {
         &self.layout
     }
@@ -142,7 +142,7 @@ impl<T: Real> Loss<T> {
     /// Computes the loss of a batch and its gradient with respect to `online`. Runs on the current rayon pool.
     ///
     /// # Panics
-    /// When the episodes' sizes are not those of the networks, or there are none.
+    /// If the sizes of the episodes are not those of the networks, or there are no episodes.
     pub fn evaluate(&mut self, online: &[T], target: &[T], episodes: &Episodes, trace: Option<&mut Trace<T>>) -> LossMetrics {
         let dims = *self.agent.dims();
         assert!(episodes.len > 0, "a batch of at least one episode");
@@ -152,7 +152,7 @@ impl<T: Real> Loss<T> {
             self.agent.prepare(flat, transposed);
             self.mixer.prepare(flat, transposed);
         }
-        let per_chunk = chunk_of(dims.uavs);
+        let per_chunk = episodes_per_chunk(dims.uavs);
         let count = episodes.len.div_ceil(per_chunk);
         let len = self.layout.len();
         let empty = || Chunk { grads: vec![T::ZERO; len], loss: 0.0, q_tot: 0.0, trace: Trace::default() };
@@ -171,7 +171,7 @@ impl<T: Real> Loss<T> {
         let workspaces = &self.workspaces;
         self.chunks[..count].par_iter_mut().with_max_len(1).enumerate().for_each(|(i, chunk)| {
             let thread = rayon::current_thread_index().unwrap_or(0) % workspaces.len();
-            // A poisoned workspace is as good as any: every buffer is written before it is read.
+            // A poisoned workspace is usable: every buffer is written before it is read.
             let mut workspace = workspaces[thread].lock().unwrap_or_else(PoisonError::into_inner);
             let first = i * per_chunk;
             pass.run(first..(first + per_chunk).min(episodes.len), &mut workspace, chunk);
@@ -197,7 +197,7 @@ impl<T: Real> Loss<T> {
     }
 }
 
-/// What all chunks of a batch share.
+/// The inputs that all chunks of a batch share.
 struct Pass<'a, T> {
     agent: &'a Agent,
     mixer: &'a Mixer,
@@ -220,7 +220,7 @@ impl<T: Real> Pass<'_, T> {
             self.agent.forward(weights, &inputs, slots, cache);
         }
 
-        // The online network chooses, the target network says what the choice is worth; slot 0 is nobody's future.
+        // Double Q-learning: the online network chooses the action, the target network gives its value. Slot 0 is not needed.
         let actions = self.agent.dims().actions;
         let action = |row: usize| usize::from(ep.actions[((range.start + row / m % b) * k + row / per_slot) * m + row % m]);
         w.best.reset(m, k * b);
@@ -242,11 +242,11 @@ impl<T: Real> Pass<'_, T> {
         w.td_target.reset(values, k * b);
         self.td_targets(range.start, b, w.target_total.as_slice(), w.td_target.as_mut_slice());
         if self.traced {
-            trace(w, (b, slots, m), &mut out.trace);
+            record_trace(w, (b, slots, m), &mut out.trace);
         }
         let share = T::from_f64(1.0 / (ep.len * k * values) as f64);
         (out.loss, out.q_tot) = (0.0, 0.0);
-        // From here on `total` is its own gradient.
+        // This loop replaces `total` by the gradient of the loss with respect to it.
         for (total, &td_target) in w.total.as_mut_slice().iter_mut().zip(w.td_target.as_slice()) {
             out.q_tot += total.to_f64();
             *total -= td_target;
@@ -264,7 +264,7 @@ impl<T: Real> Pass<'_, T> {
         self.agent.backward(self.online, (&inputs, slots), w.dq.rows(), &mut w.online, &mut out.grads);
     }
 
-    /// TD(lambda), from the last slot backwards; `future` begins with slot 1.
+    /// Computes TD(lambda) targets from the last slot backwards; `future` starts at slot 1.
     fn td_targets(&self, first: usize, b: usize, future: &[T], td_target: &mut [T]) {
         let k = self.episodes.slots;
         let stride = b * self.mixer.values();
@@ -282,7 +282,7 @@ impl<T: Real> Pass<'_, T> {
 }
 
 impl<T: Real> Workspace<T> {
-    /// Lays out the episodes `range`, time-major.
+    /// Loads the episodes `range`, time-major.
     fn load(&mut self, agent: &Agent, ep: &Episodes, range: std::ops::Range<usize>) {
         let (m, n, k) = (ep.uavs, ep.users, ep.slots);
         let config = agent.geometry();
@@ -313,8 +313,8 @@ impl<T: Real> Workspace<T> {
     }
 }
 
-/// Writes a chunk's part of the trace, episode-major.
-fn trace<T: Real>(w: &Workspace<T>, (b, slots, m): (usize, usize, usize), out: &mut Trace<T>) {
+/// Writes the trace of a chunk, episode-major.
+fn record_trace<T: Real>(w: &Workspace<T>, (b, slots, m): (usize, usize, usize), out: &mut Trace<T>) {
     let reorder = |from: &[T], slots: usize, to: &mut Vec<T>| {
         to.clear();
         let width = from.len() / (slots * b);

@@ -1,17 +1,17 @@
-//! Collecting episodes (spec 5): several fleets at once, epsilon-greedy, each UAV drawing on its own.
+//! Collects episodes with epsilon-greedy exploration (docs/model.md, "Exploration"). Several episodes are stepped together.
 //!
-//! With `training.shaping` the reward recorded is that of the age collected (a_i before the slot, a'_i after it):
+//! With `training.shaping`, the recorded reward is the AoI collected in the slot (a_i before the slot, a'_i after it):
 //!
 //! ```text
 //! r' = r + gamma Phi(a') - Phi(a) = reward_scale / (1 - gamma) * mean_i w_i (a_i + 1) [a'_i = 0]
 //! Phi(a) = -reward_scale * mean_i w_i (a_i / (1 - gamma) + 1 / (1 - gamma)^2)
 //! ```
 //!
-//! Phi is what the future is worth to a fleet that never collects again, so by Ng, Harada and Russell (1999) the optimal
-//! policies stay what they are.
+//! Phi is the discounted return of a fleet that collects nothing from now on. It is a potential, so the optimal policies are the
+//! same (Ng, Harada and Russell 1999).
 //!
-//! Randomness is per episode: layout, tokens and exploration of episode number e are streams of e, whichever fleets fly
-//! beside it. Nothing is allocated per slot.
+//! The random streams of an episode (layout, tokens, exploration) depend on its number only, not on the episodes collected with it.
+//! Nothing is allocated per slot.
 
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
@@ -24,7 +24,7 @@ use crate::nn::argmax;
 use crate::policy::{Actor, Agent, StepInput, TOKEN};
 use crate::rng;
 
-/// The environments and the actor of a training run, and the last episodes flown.
+/// The environments and the actor of a training run, and the last collected episodes.
 #[derive(Debug)]
 pub struct Rollout {
     seed: u64,
@@ -34,15 +34,15 @@ pub struct Rollout {
     seeds: Vec<u64>,
     explorers: Vec<ChaCha8Rng>,
     actions: Vec<u8>,
-    /// Per user reward_scale / (1 - gamma) * w_i / N where age collected is what counts.
+    /// With shaping: per user reward_scale / (1 - gamma) * w_i / N.
     collected: Option<Vec<f64>>,
 }
 
 impl Rollout {
-    /// `training.envs` fleets for `agent`.
+    /// A rollout of `training.envs` episodes at a time.
     ///
     /// # Errors
-    /// The environment is invalid.
+    /// [`Invalid`] if the environment is invalid.
     pub fn new(config: &TrainConfig, agent: &Agent) -> Result<Self, Invalid> {
         let (environment, fleets) = (&config.environment, config.training.envs);
         let (m, n, k) = (environment.uavs, environment.users, environment.slots);
@@ -74,7 +74,7 @@ impl Rollout {
         })
     }
 
-    /// Flies the episodes number `first`, `first + 1`, ... of the run with this probability of a random action.
+    /// Collects the episodes with the numbers `first`, `first + 1`, ..; `epsilon` is the probability of a random action.
     pub fn collect(&mut self, agent: &Agent, parameters: &[f32], epsilon: f64, first: u64) -> &Episodes {
         let numbers = first..first + self.env.copies() as u64;
         self.seeds.clear();
@@ -107,13 +107,13 @@ impl Rollout {
         &self.episodes
     }
 
-    /// Mean AoI of the last episodes flown.
+    /// Mean AoI of the last collected episodes.
     pub fn mean_aoi(&self) -> f64 {
         let b = self.env.copies();
         (0..b).map(|b| self.env.metrics(b).mean_aoi).sum::<f64>() / b as f64
     }
 
-    /// Positions and AoI of the current slot.
+    /// Records positions and AoI of the current slot.
     fn record_scene(&mut self) {
         let (e, slot) = (&mut self.episodes, self.env.slot());
         place(&mut e.uav_xy, self.env.uav_xy(), e.len, slot);
@@ -123,7 +123,7 @@ impl Rollout {
         }
     }
 
-    /// Actions and rewards of the slot just flown.
+    /// Records actions and rewards of the last step.
     fn record_step(&mut self) {
         let (e, slot) = (&mut self.episodes, self.env.slot() - 1);
         place(&mut e.actions, &self.actions, e.len, slot);
@@ -140,7 +140,7 @@ impl Rollout {
     }
 }
 
-/// Writes (B, W) as entry `slot` of (B, T, W).
+/// Writes `now` (B, W) to slot `slot` of `all` (B, T, W).
 fn place<T: Copy>(all: &mut [T], now: &[T], episodes: usize, slot: usize) {
     let (total, width) = (all.len() / episodes, now.len() / episodes);
     for (all, now) in all.chunks_exact_mut(total).zip(now.chunks_exact(width)) {
@@ -149,7 +149,7 @@ fn place<T: Copy>(all: &mut [T], now: &[T], episodes: usize, slot: usize) {
 }
 
 #[cfg(test)]
-#[allow(clippy::float_cmp, reason = "what is recorded is what happened, exactly")]
+#[allow(clippy::float_cmp, reason = "recorded values are exact")]
 mod tests {
     use super::*;
     use crate::env::{Layout, Start};
@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_recorded_is_what_the_actions_lead_to() {
+    fn recorded_episodes_equal_a_repetition_of_their_actions() {
         for user_speed in [0.0, 0.02] {
             let config = config(3, user_speed);
             let e = flown(&config, 0.5, 10);
@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn an_episode_is_the_same_whatever_flies_beside_it() {
+    fn an_episode_does_not_depend_on_the_others() {
         let (eight, three) = (flown(&config(8, 0.0), 1.0, 0), flown(&config(3, 0.0), 1.0, 4));
         let width = eight.slots * eight.uavs;
         assert_eq!(eight.actions[4 * width..7 * width], three.actions);
@@ -236,7 +236,7 @@ mod tests {
     #[test]
     fn each_uav_explores_on_its_own() {
         let mut config = config(8, 0.0);
-        // With one layout and no identity, greedy UAVs and fleets all do the same.
+        // With one layout and no identity, all greedy UAVs of all fleets take the same actions.
         config.environment.start = Start::Center;
         config.environment.layout = Layout::Given(vec![[0.1, 0.2]; 5]);
         config.training.identity = crate::policy::Identity::None;

@@ -1,9 +1,9 @@
-//! A training run as an iterator of events (spec 5): collect, update, copy targets, evaluate.
+//! A training run as an iterator of events (docs/model.md, "Learner").
 //!
-//! The order is that of the reference: an iteration flies `envs` episodes, then makes its updates, then copies the targets
-//! when due. The greedy policy is evaluated at step 0, every `eval_every` steps and at the end, on `valid-v1`; `eval-v1` is
-//! never touched. (configuration, seed) fixes every event and weight, whatever the number of threads, and a run restored
-//! from a snapshot goes on as if it had never stopped. No clock, no files, no jobs: whoever iterates adds those.
+//! An iteration collects `envs` episodes, makes its updates, and copies the target networks when due. The greedy policy is evaluated
+//! at step 0, every `eval_every` steps and at the end, on `valid-v1`; training never uses `eval-v1`. (configuration, seed) fixes
+//! every event and weight, whatever the number of threads. A run restored from a snapshot yields the same events and weights as a
+//! run without interruption.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -35,10 +35,10 @@ pub struct Trainer {
 }
 
 impl Trainer {
-    /// A run at its beginning.
+    /// A new run.
     ///
     /// # Errors
-    /// The configuration is invalid.
+    /// [`Invalid`] if the configuration is invalid or the threads cannot be started.
     pub fn new(config: TrainConfig, threads: usize) -> Result<Self, Invalid> {
         config.validate()?;
         let learner = Learner::new(&config, threads)?;
@@ -55,10 +55,10 @@ impl Trainer {
         })
     }
 
-    /// The run that [`Trainer::snapshot`] saved, to go on with any number of threads.
+    /// The run of a [`Trainer::snapshot`], with any number of threads.
     ///
     /// # Errors
-    /// The bytes are damaged, of another version, or do not hold a run that can be.
+    /// [`SnapshotError`] if the bytes are damaged, of another version, or inconsistent.
     pub fn restore(bytes: &[u8], threads: usize) -> Result<Self, SnapshotError> {
         let snapshot = snapshot::decode(bytes)?;
         let mut trainer = Self::new(snapshot.config, threads)?;
@@ -68,12 +68,12 @@ impl Trainer {
         Ok(trainer)
     }
 
-    /// Everything needed to go on later, elsewhere, as if the run had never stopped.
+    /// Everything needed to resume the run later, also on another machine.
     pub fn snapshot(&self) -> Vec<u8> {
         snapshot::encode(&self.config, &self.run, &self.learner.state(), &self.replay)
     }
 
-    /// Once set, [`Iterator::next`] returns `None` after the event it is working on; cleared, the run goes on.
+    /// A flag that stops the run: while it is set, [`Iterator::next`] returns `None`. The event in progress is still returned.
     pub fn stop_flag(&self) -> Arc<AtomicBool> {
         Arc::clone(&self.stop)
     }
@@ -83,20 +83,20 @@ impl Trainer {
         &self.config
     }
 
-    /// Environment slots flown.
+    /// Environment steps made.
     pub fn step(&self) -> u64 {
         self.run.counters.step
     }
 
-    /// Whether there is nothing more to tell: all steps are done, or the run diverged.
+    /// Whether the run has ended: all steps are made, or training diverged.
     pub fn finished(&self) -> bool {
         self.run.counters.phase == Phase::Finished
     }
 
-    /// The current weights, with their figures where they were just evaluated.
+    /// The current weights, with metrics if they were just evaluated.
     ///
     /// # Errors
-    /// Training has diverged: a weight is no sensible number.
+    /// [`checkpoint::Error::Value`] if training diverged.
     pub fn checkpoint(&self) -> Result<Checkpoint, checkpoint::Error> {
         let latest = self.run.latest.filter(|e| e.step == self.run.counters.step);
         let weights = self.learner.published().to_vec();
@@ -106,13 +106,13 @@ impl Trainer {
     /// The weights with the lowest mean AoI on the validation layouts so far; `None` before the first evaluation.
     ///
     /// # Errors
-    /// Training has diverged: a weight is no sensible number.
+    /// [`checkpoint::Error::Value`] if training diverged.
     pub fn best(&self) -> Result<Option<Checkpoint>, checkpoint::Error> {
         let best = self.run.best.as_ref();
         best.map(|(e, weights)| Checkpoint::new(self.config.clone(), e.step, Some(e.metrics), weights.clone())).transpose()
     }
 
-    /// Figures of the best weights and the step they are of, without copying them.
+    /// The evaluation of the best weights.
     pub fn best_evaluation(&self) -> Option<Evaluation> {
         self.run.best.as_ref().map(|(e, _)| *e)
     }
@@ -120,8 +120,9 @@ impl Trainer {
     fn evaluate(&mut self) -> Event {
         let t = &self.config.training;
         let weights = self.learner.published()[..self.learner.agent().layout().len()].to_vec();
-        let policy = LearnedPolicy::new(self.config.agent(), self.config.dims(), weights).expect("as many as the agent has");
-        let seeds = layout_list("valid-v1").expect("a list of this program").seeds(t.eval_episodes);
+        let policy = LearnedPolicy::new(self.config.agent(), self.config.dims(), weights)
+            .expect("the weights have the length of the agent's layout");
+        let seeds = layout_list("valid-v1").expect("valid-v1 exists").seeds(t.eval_episodes);
         let flown = evaluate(&policy, &self.config.environment, &seeds, self.threads).expect("an agent fits its environment");
         let now = Evaluation { step: self.run.counters.step, metrics: EpisodeMetrics::mean(&flown) };
         self.run.latest = Some(now);
@@ -203,13 +204,13 @@ impl Iterator for Trainer {
     }
 }
 
-/// Learning rate at an environment step: linear from its beginning to its end.
+/// The learning rate at an environment step. It falls linearly to `learning_rate_decay` of its start value.
 fn learning_rate(t: &Training, step: u64) -> f64 {
     let done = (step as f64 / t.steps as f64).min(1.0);
     t.learning_rate * (1.0 - (1.0 - t.learning_rate_decay) * done)
 }
 
-/// Exploration at an environment step: linear from 1 to its end, then constant.
+/// Epsilon at an environment step. It falls linearly from 1 to `epsilon_end`, then is constant.
 fn epsilon(t: &Training, step: u64) -> f64 {
     if step >= t.epsilon_anneal {
         return t.epsilon_end;
@@ -224,7 +225,7 @@ mod tests {
     use crate::train_config::{Algorithm, Preset};
 
     #[test]
-    fn a_run_that_diverges_says_so_and_keeps_its_best() {
+    fn a_diverged_run_ends_and_keeps_its_best_weights() {
         let mut config = TrainConfig::preset(Algorithm::Vdn, Preset::Practical);
         config.environment.slots = 5;
         config.training.batch = 8;
@@ -239,11 +240,11 @@ mod tests {
         assert!(trainer.checkpoint().is_err());
         assert_eq!(trainer.best().unwrap(), Some(best));
         let mut restored = Trainer::restore(&trainer.snapshot(), 1).unwrap();
-        assert!(restored.next().is_none(), "a run that diverged stays ended");
+        assert!(restored.next().is_none(), "a restored run that diverged yields no events");
     }
 
     #[test]
-    fn exploration_falls_linearly_to_its_end() {
+    fn epsilon_falls_linearly_to_its_final_value() {
         let t = TrainConfig::preset(Algorithm::Qedgix, Preset::Practical).training;
         assert_eq!(epsilon(&t, 0), 1.0);
         assert!((epsilon(&t, 50_000) - 0.525).abs() < 1e-12);

@@ -1,4 +1,4 @@
-//! The learner: parameters, targets and optimiser, and the update that moves them (spec 5).
+//! The learner: online and target networks, the optimiser, and the update (docs/model.md, "Optimiser").
 
 use rayon::ThreadPool;
 
@@ -10,12 +10,12 @@ use crate::policy::Agent;
 use crate::rng;
 use crate::train_config::TrainConfig;
 
-/// Everything of a learner that a snapshot must hold; vectors as long as [`Learner::layout`].
+/// The state of a learner in a snapshot. Vectors have the length of [`Learner::layout`].
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LearnerState {
-    /// Parameters.
+    /// Parameters of the online networks.
     pub online: Vec<f32>,
-    /// Target parameters.
+    /// Parameters of the target networks.
     pub target: Vec<f32>,
     /// Adam's first moments.
     pub adam_m: Vec<f32>,
@@ -23,18 +23,18 @@ pub struct LearnerState {
     pub adam_v: Vec<f32>,
     /// Adam's steps.
     pub adam_steps: u64,
-    /// Averaged parameters, empty where none are kept.
+    /// Averaged parameters; empty without averaging.
     pub average: Vec<f32>,
 }
 
-/// Online and target networks with their optimiser. Same configuration, same episodes: same bits, on any number of threads.
+/// Online and target networks and the optimiser. The same configuration and episodes give the same bits on any number of threads.
 #[derive(Debug)]
 pub struct Learner {
     loss: Loss<f32>,
     online: Vec<f32>,
     target: Vec<f32>,
     adam: Adam<f32>,
-    /// Averaged parameters and the number of updates they look back on; empty where none are kept.
+    /// Averaged parameters and the number of updates they average over; empty without averaging.
     average: (Vec<f32>, u64),
     clip: f64,
     tau: f32,
@@ -42,10 +42,10 @@ pub struct Learner {
 }
 
 impl Learner {
-    /// A learner with parameters drawn from the configuration's seed, targets equal to them.
+    /// A learner with parameters initialised from the configuration's seed, and equal target networks.
     ///
     /// # Errors
-    /// When `threads` is not in 1..=1024, or that many cannot be started.
+    /// [`Invalid`] if `threads` is not in 1..=1024, or the threads cannot be started.
     pub fn new(config: &TrainConfig, threads: usize) -> Result<Self, Invalid> {
         in_range("threads", threads, 1..=1024)?;
         let training = &config.training;
@@ -73,10 +73,10 @@ impl Learner {
         })
     }
 
-    /// One step of Adam at this learning rate against the loss of `episodes`; then targets and averages follow.
+    /// One Adam step on the loss of `episodes`, then the updates of target networks and averaged parameters.
     ///
     /// # Panics
-    /// When the episodes' sizes are not those of the configuration, or there are none.
+    /// If the sizes of the episodes are not those of the configuration, or there are no episodes.
     pub fn update(&mut self, episodes: &Episodes, learning_rate: f64) -> LossMetrics {
         let Self { loss, online, target, adam, pool, .. } = self;
         let metrics = pool.install(|| loss.evaluate(online, target, episodes, None));
@@ -85,14 +85,14 @@ impl Learner {
             blend(&mut self.target, &self.online, self.tau);
         }
         if self.average.1 > 0 {
-            // In the beginning the mean is over what there is, not over what the parameters were drawn as.
+            // The first averages are over the updates so far, and exclude the initial parameters.
             let seen = self.adam.steps.min(self.average.1);
             blend(&mut self.average.0, &self.online, 1.0 / seen as f32);
         }
         metrics
     }
 
-    /// Copies the online networks to the targets.
+    /// Copies the online networks to the target networks.
     pub fn sync_targets(&mut self) {
         self.target.copy_from_slice(&self.online);
     }
@@ -112,7 +112,7 @@ impl Learner {
         &self.online
     }
 
-    /// What is evaluated and published: the averaged parameters where there are, else the online networks'.
+    /// The parameters that are evaluated and published: the averaged ones, or those of the online networks without averaging.
     pub fn published(&self) -> &[f32] {
         if self.average.1 > 0 { &self.average.0 } else { &self.online }
     }
@@ -122,7 +122,7 @@ impl Learner {
         &self.online[..self.agent().layout().len()]
     }
 
-    /// A copy of everything that training changes.
+    /// A copy of the state.
     pub fn state(&self) -> LearnerState {
         LearnerState {
             online: self.online.clone(),
@@ -134,10 +134,10 @@ impl Learner {
         }
     }
 
-    /// Puts a state back.
+    /// Restores a state.
     ///
     /// # Errors
-    /// When a vector's length is not that of this architecture.
+    /// [`Invalid`] if a vector has another length.
     pub fn restore(&mut self, state: LearnerState) -> Result<(), Invalid> {
         let len = self.online.len();
         let parts = [("online", &state.online), ("target", &state.target), ("adam_m", &state.adam_m), ("adam_v", &state.adam_v)];
@@ -161,7 +161,7 @@ impl Learner {
     }
 }
 
-/// Moves every number of `to` by `share` of the way to `from`.
+/// Moves `to` towards `from` by `share` of the difference.
 fn blend(to: &mut [f32], from: &[f32], share: f32) {
     to.iter_mut().zip(from).for_each(|(t, f)| *t += share * (f - *t));
 }

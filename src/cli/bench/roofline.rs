@@ -7,7 +7,7 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use crate::learner::Episodes;
-use crate::learner::loss::chunk_of;
+use crate::learner::loss::episodes_per_chunk;
 use crate::nn::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
 use crate::policy::{Agent, Geometry};
 
@@ -21,7 +21,7 @@ pub(super) struct Roofline {
 
 /// Measures the roofline of an update with `batch`.
 pub(super) fn measure(agent: &Agent, batch: &Episodes, threads: usize, repeat: usize) -> Roofline {
-    let chunks = batch.len.div_ceil(chunk_of(batch.uavs));
+    let chunks = batch.len.div_ceil(episodes_per_chunk(batch.uavs));
     let slots = batch.slots + 1;
     let products: Vec<[usize; 3]> = agent
         .products(&geometry(agent, batch), slots)

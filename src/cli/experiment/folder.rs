@@ -1,8 +1,8 @@
-//! The folder of a run: what it holds, and how far the run has come.
+//! The folder of a run and the progress of the run.
 //!
-//! `config.json`, `curve.csv`, `progress.json`; `snapshot` while the run is under way; `policy.safetensors` and
-//! `last.safetensors` when training is over; `result.json` when the weights were flown. Every file is whole or absent, and
-//! they are written in an order in which the later one vouches for the earlier.
+//! Always: `config.json`, `curve.csv`, `progress.json`. During training: `snapshot`. After training: `policy.safetensors` and
+//! `last.safetensors`. After evaluation: `result.json`. Files are written atomically, and a file is written after those that it
+//! implies.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -21,21 +21,21 @@ pub struct RunFolder {
     path: PathBuf,
 }
 
-/// How far a run had come when its files were last written.
+/// The progress of a run when its files were last written.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct RunProgress {
     /// Environment steps.
     pub step: u64,
     /// Seconds of training.
     pub seconds: f64,
-    /// Whether training is over and the weights are there.
+    /// Whether training has ended and the weights are written.
     pub trained: bool,
-    /// Whether it ended because a weight left the range of sensible numbers.
+    /// Whether training ended because it diverged.
     pub diverged: bool,
 }
 
 impl RunFolder {
-    /// The folder of `run` below `root`; not made yet.
+    /// The folder of `run` below `root`. Does not create it.
     pub fn new(root: &Path, run: &Run) -> Self {
         Self { path: root.join("runs").join(&run.folder) }
     }
@@ -48,27 +48,27 @@ impl RunFolder {
         write_atomic(&self.path.join(name), bytes)
     }
 
-    /// Makes the folder, and writes the configuration that it is named after.
+    /// Creates the folder and writes the configuration.
     pub fn create(&self, run: &Run) -> anyhow::Result<()> {
-        fs::create_dir_all(&self.path).with_context(|| format!("cannot make {}", self.path.display()))?;
+        fs::create_dir_all(&self.path).with_context(|| format!("cannot create {}", self.path.display()))?;
         self.write("config.json", &serde_json::to_vec_pretty(&run.config)?)
     }
 
-    /// What the run left, if it is finished and was flown on the layouts of this experiment.
+    /// The result of the run, if it is finished and was evaluated on the layouts of this experiment.
     pub fn result(&self, experiment: &Experiment) -> anyhow::Result<Option<RunResult>> {
         let Some(bytes) = self.read("result.json")? else { return Ok(None) };
-        // A result of another version is no result; the weights are flown again.
+        // A result of another version is ignored, and the weights are evaluated again.
         let result: Option<RunResult> = serde_json::from_slice(&bytes).ok();
         Ok(result.filter(|o| o.layouts == experiment.layouts && o.best.episodes.len() == experiment.layout_seeds.len()))
     }
 
-    /// How far training has come.
+    /// The progress of the run.
     pub fn progress(&self) -> anyhow::Result<RunProgress> {
         let bytes = self.read("progress.json")?;
         Ok(bytes.and_then(|bytes| serde_json::from_slice(&bytes).ok()).unwrap_or_default())
     }
 
-    /// The run where its snapshot left it, with its curve; at its beginning where there is none that can be used.
+    /// The trainer, curve and seconds of the last snapshot; a new trainer if there is no usable snapshot.
     pub fn restore(&self, run: &Run, threads: usize) -> anyhow::Result<(Trainer, TrainingCurve, f64)> {
         if let Some(bytes) = self.read("snapshot")?
             && let Ok(trainer) = Trainer::restore(&bytes, threads)
@@ -88,15 +88,15 @@ impl RunFolder {
         TrainingCurve::parse(&text).with_context(|| format!("{}/curve.csv", self.path.display()))
     }
 
-    /// Keeps a run that is under way.
+    /// Saves the state of a run in progress.
     pub fn save(&self, snapshot: &[u8], curve: &TrainingCurve, progress: &RunProgress) -> anyhow::Result<()> {
-        // The curve first: rows after the snapshot are computed again, missing ones are not.
+        // The curve first: rows after the snapshot are computed again, rows before it are not.
         self.write("curve.csv", curve.csv().as_bytes())?;
         self.write("snapshot", snapshot)?;
         self.write("progress.json", &serde_json::to_vec(progress)?)
     }
 
-    /// Keeps the weights of a run whose training is over.
+    /// Saves the weights of a run whose training has ended.
     pub fn save_weights(
         &self,
         best: &Checkpoint,
@@ -124,11 +124,11 @@ impl RunFolder {
 
     fn weights(&self, name: &str) -> anyhow::Result<Checkpoint> {
         let path = self.path.join(name);
-        let bytes = self.read(name)?.with_context(|| format!("{} is not there", path.display()))?;
+        let bytes = self.read(name)?.with_context(|| format!("{} does not exist", path.display()))?;
         Checkpoint::from_bytes(&bytes).with_context(|| path.display().to_string())
     }
 
-    /// Ends the run: its result is there, its snapshot is of no more use.
+    /// Writes the result and removes the snapshot.
     pub fn finish(&self, result: &RunResult) -> anyhow::Result<()> {
         self.write("result.json", &serde_json::to_vec(result)?)?;
         let snapshot = self.path.join("snapshot");

@@ -1,6 +1,6 @@
-//! `qedgix experiment`: runs, resumes and draws an experiment described in a TOML file.
+//! `qedgix experiment`: runs or resumes an experiment described in a TOML file, and writes tables and plots of its results.
 //!
-//! This file owns the flags and what is written in the end. What a file means and what results say is `crate::experiment`.
+//! This file owns the flags and writes the results. `crate::experiment` resolves the file and summarizes the results.
 
 mod folder;
 mod runner;
@@ -28,35 +28,35 @@ use crate::policy::baselines;
 /// Flags of `experiment`.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  qedgix experiment experiments/convergence.toml --dry-run      # which runs, and how far they have come
-  qedgix experiment experiments/convergence.toml                # stop with ctrl-c; the same command goes on
+  qedgix experiment experiments/convergence.toml --dry-run      # lists the runs and their progress
+  qedgix experiment experiments/convergence.toml                # ctrl-c stops it; the same command resumes it
   qedgix experiment experiments/range.toml --seeds 1 --steps 50000 --point '4 xi' --point '9 xi' --out quick")]
 pub struct ExperimentArgs {
-    /// The experiment, as TOML
+    /// The experiment as a TOML file
     #[arg(env = "QEDGIX_EXPERIMENT")]
     file: PathBuf,
-    /// Where runs, tables and figures go [default: results/NAME OF THE FILE]
+    /// Directory for runs, tables and plots [default: results/NAME OF THE FILE]
     #[arg(long, env = "QEDGIX_OUT")]
     out: Option<PathBuf>,
-    /// Runs at a time, a thread each [default: all cores]
+    /// Number of threads; each trains one run at a time [default: all cores]
     #[arg(long, env = "QEDGIX_THREADS")]
     threads: Option<usize>,
-    /// Environment steps of every run, instead of the file's
+    /// Environment steps of every run; overrides the file
     #[arg(long, env = "QEDGIX_STEPS")]
     steps: Option<u64>,
-    /// Seeds, instead of the file's
+    /// Seeds; override those of the file
     #[arg(long, env = "QEDGIX_SEEDS", value_delimiter = ',')]
     seeds: Option<Vec<u64>>,
-    /// Runs only this series; may be repeated
+    /// Runs only the series with this name; may be repeated
     #[arg(long, env = "QEDGIX_SERIES", value_name = "NAME", value_delimiter = ';')]
     series: Vec<String>,
-    /// Runs only this point; may be repeated
+    /// Runs only the point with this name; may be repeated
     #[arg(long, env = "QEDGIX_POINT", value_name = "NAME", value_delimiter = ';')]
     point: Vec<String>,
     /// Overrides one field of every run; may be repeated
     #[arg(long = "set", value_name = "SECTION.FIELD=VALUE")]
     set: Vec<String>,
-    /// Lists the runs and how far they have come, and does nothing
+    /// Lists the runs and their progress without running them
     #[arg(long)]
     dry_run: bool,
 }
@@ -64,7 +64,7 @@ pub struct ExperimentArgs {
 /// Runs the command.
 ///
 /// # Errors
-/// A file that describes no experiment, a run that fails, an interruption.
+/// The file is not a valid experiment, a run fails, or ctrl-c stops the command.
 pub async fn run(args: ExperimentArgs) -> anyhow::Result<()> {
     let experiment = read(&args)?;
     let out = match &args.out {
@@ -82,21 +82,21 @@ pub async fn run(args: ExperimentArgs) -> anyhow::Result<()> {
         }
     });
     tokio::task::spawn_blocking(move || {
-        fs::create_dir_all(&out).with_context(|| format!("cannot make {}", out.display()))?;
-        let lock = fs::File::create(out.join(".lock")).with_context(|| format!("cannot write into {}", out.display()))?;
+        fs::create_dir_all(&out).with_context(|| format!("cannot create {}", out.display()))?;
+        let lock = fs::File::create(out.join(".lock")).with_context(|| format!("cannot write to {}", out.display()))?;
         if lock.try_lock().is_err() {
-            bail!("{} is being worked on by another process", out.display());
+            bail!("{} is in use by another process", out.display());
         }
         let threads = args.threads.unwrap_or_else(all_cores);
         if !Runner::new(&experiment, &out, threads, &stop).run()? {
-            bail!("stopped; the same command goes on");
+            bail!("stopped; the same command resumes the experiment");
         }
-        conclude(&experiment, &out, threads, &command(&args))
+        write_results(&experiment, &out, threads, &command(&args))
     })
     .await?
 }
 
-/// The experiment of the file, with what the flags override.
+/// The experiment of the file, with the overrides of the flags.
 fn read(args: &ExperimentArgs) -> anyhow::Result<Experiment> {
     let name = args.file.display().to_string();
     let text = fs::read_to_string(&args.file).with_context(|| name.clone())?;
@@ -110,7 +110,7 @@ fn read(args: &ExperimentArgs) -> anyhow::Result<Experiment> {
     Experiment::resolve(document, &overrides).context(name)
 }
 
-/// The command that does the same again, from the same directory.
+/// The command that repeats the experiment, from the same directory.
 fn command(args: &ExperimentArgs) -> String {
     let here = std::env::current_dir().unwrap_or_default();
     let file = args.file.strip_prefix(here).unwrap_or(&args.file);
@@ -127,7 +127,7 @@ fn command(args: &ExperimentArgs) -> String {
     words.join(" ")
 }
 
-/// Prints the runs.
+/// Prints the runs and their progress.
 fn list(experiment: &Experiment, out: &Path) -> anyhow::Result<()> {
     outln!("{}: {} runs below {}", experiment.title, experiment.runs.len(), out.display())?;
     for run in &experiment.runs {
@@ -144,8 +144,8 @@ fn list(experiment: &Experiment, out: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Writes what all runs say together: numbers, a page, figures; and the measured seconds, which differ from time to time.
-fn conclude(experiment: &Experiment, out: &Path, threads: usize, command: &str) -> anyhow::Result<()> {
+/// Writes and prints the results: results.json, README.md and plots; and timing.json, which differs between repetitions.
+fn write_results(experiment: &Experiment, out: &Path, threads: usize, command: &str) -> anyhow::Result<()> {
     let mut results: Vec<RunResult> = Vec::new();
     let mut curves: Vec<TrainingCurve> = Vec::new();
     for run in &experiment.runs {
@@ -153,10 +153,10 @@ fn conclude(experiment: &Experiment, out: &Path, threads: usize, command: &str) 
         results.push(folder.result(experiment)?.with_context(|| format!("{} has no result", run.folder))?);
         curves.push(folder.curve()?);
     }
-    let summary = ExperimentSummary::new(experiment, &results, &references(experiment, threads)?);
-    let drawn = plots(experiment, &summary, &curves, &trajectories(experiment, out)?);
-    let names: Vec<String> = drawn.iter().map(|(name, _)| name.clone()).collect();
-    for (name, svg) in &drawn {
+    let summary = ExperimentSummary::new(experiment, &results, &evaluate_baselines(experiment, threads)?);
+    let files = plots(experiment, &summary, &curves, &trajectories(experiment, out)?);
+    let names: Vec<String> = files.iter().map(|(name, _)| name.clone()).collect();
+    for (name, svg) in &files {
         write_atomic(&out.join(name), svg.as_bytes())?;
     }
     let seconds: Vec<Value> = (experiment.runs.iter().zip(&results))
@@ -175,21 +175,21 @@ fn conclude(experiment: &Experiment, out: &Path, threads: usize, command: &str) 
     Ok(())
 }
 
-/// The episodes of every baseline at every point.
-fn references(experiment: &Experiment, threads: usize) -> anyhow::Result<Vec<Vec<Vec<EpisodeMetrics>>>> {
+/// Per point and baseline, the metrics of the episodes.
+fn evaluate_baselines(experiment: &Experiment, threads: usize) -> anyhow::Result<Vec<Vec<Vec<EpisodeMetrics>>>> {
     let mut all = Vec::new();
     for point in &experiment.points {
-        let mut flown = Vec::new();
+        let mut evaluated = Vec::new();
         for name in &experiment.baselines {
             let policy = baselines::by_name(name, (&point.environment).into()).context("checked when the file was read")?;
-            flown.push(evaluate(policy.as_ref(), &point.environment, &experiment.layout_seeds, threads)?);
+            evaluated.push(evaluate(policy.as_ref(), &point.environment, &experiment.layout_seeds, threads)?);
         }
-        all.push(flown);
+        all.push(evaluated);
     }
     Ok(all)
 }
 
-/// What the best weights of the first seed fly on the first layout, where that is what the experiment draws.
+/// Trajectories of the best weights of the first seed on the first layout, if the experiment plots trajectories.
 fn trajectories(experiment: &Experiment, out: &Path) -> anyhow::Result<Vec<Trajectories>> {
     if experiment.plot != PlotKind::Trajectories {
         return Ok(Vec::new());

@@ -1,6 +1,6 @@
-//! Runs several runs at a time, a thread each; with fewer runs left than threads, those that are left get more.
+//! Runs several training runs at a time, one thread each. If fewer runs than threads are left, they get several threads each.
 //!
-//! Training is bit-exact for any number of threads, so a run may change its number at an evaluation, and only time is told.
+//! Training is bit-exact for any number of threads, so a run may change its number of threads at an evaluation.
 
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -15,7 +15,7 @@ use crate::cli::progress;
 use crate::experiment::{EvaluatedWeights, Experiment, Run, RunResult};
 use crate::learner::{Event, Trainer, evaluate};
 
-/// What the threads share.
+/// Runs the runs of an experiment.
 pub struct Runner<'a> {
     experiment: &'a Experiment,
     root: &'a Path,
@@ -28,7 +28,7 @@ pub struct Runner<'a> {
 }
 
 impl<'a> Runner<'a> {
-    /// A runner of this experiment, its files below `root`. Set, `stop` makes it keep what is under way and return.
+    /// A runner of this experiment with its files below `root`. When `stop` is set, it saves the runs in progress and returns.
     pub fn new(experiment: &'a Experiment, root: &'a Path, threads: usize, stop: &'a AtomicBool) -> Self {
         let bars = MultiProgress::new();
         let overall =
@@ -45,10 +45,10 @@ impl<'a> Runner<'a> {
         }
     }
 
-    /// Runs what is not finished; whether everything is now.
+    /// Runs all unfinished runs. Returns whether all runs are finished.
     ///
     /// # Errors
-    /// The first run that fails; the others are kept where they are.
+    /// The error of the first run that fails. The other runs are saved.
     pub fn run(&self) -> anyhow::Result<bool> {
         let mut pending = Vec::new();
         for run in &self.experiment.runs {
@@ -75,7 +75,7 @@ impl<'a> Runner<'a> {
         self.stop.load(Ordering::Relaxed)
     }
 
-    /// Threads for each run that is left.
+    /// Threads per unfinished run.
     fn share(&self) -> usize {
         (self.threads / self.unfinished.load(Ordering::Relaxed).max(1)).max(1)
     }
@@ -85,10 +85,10 @@ impl<'a> Runner<'a> {
             let label = self.experiment.label(run);
             let bar = progress::bar_among(&self.bars, run.config.training.steps, "steps");
             bar.set_message(label.clone());
-            let ended = self.one(run, &label, &bar).with_context(|| format!("{label} ({})", run.folder));
+            let ended = self.run_one(run, &label, &bar).with_context(|| format!("{label} ({})", run.folder));
             bar.finish_and_clear();
             self.bars.remove(&bar);
-            // The others keep what they have; there is no use in hours of work that end with an error.
+            // Stops the other runs, as the command ends with an error anyway.
             if ended.is_err() {
                 self.stop.store(true, Ordering::Relaxed);
             }
@@ -96,7 +96,7 @@ impl<'a> Runner<'a> {
                 self.count(self.unfinished.fetch_sub(1, Ordering::Relaxed) - 1);
                 let aoi = result.best.episodes.iter().map(|e| e.mean_aoi).sum::<f64>() / result.best.episodes.len() as f64;
                 let note = if result.diverged { "  (diverged)" } else { "" };
-                self.say(&format!("done  {label}: mean AoI {aoi:.2} on {}{note}", result.layouts));
+                self.print(&format!("done  {label}: mean AoI {aoi:.2} on {}{note}", result.layouts));
             }
         }
         Ok(())
@@ -107,8 +107,8 @@ impl<'a> Runner<'a> {
         self.overall.set_message(format!("{} of {all} runs done", all - unfinished));
     }
 
-    /// A line above the bars, or on standard error where nobody sees bars.
-    fn say(&self, line: &str) {
+    /// Prints a line above the bars, or on standard error if there are no bars.
+    fn print(&self, line: &str) {
         if self.overall.is_hidden() {
             errln!("{line}");
         } else {
@@ -116,15 +116,15 @@ impl<'a> Runner<'a> {
         }
     }
 
-    /// Trains and flies one run; `None` when it was stopped before its end.
-    fn one(&self, run: &Run, label: &str, bar: &ProgressBar) -> anyhow::Result<Option<RunResult>> {
+    /// Trains and evaluates a run. Returns `None` if it was stopped.
+    fn run_one(&self, run: &Run, label: &str, bar: &ProgressBar) -> anyhow::Result<Option<RunResult>> {
         let folder = RunFolder::new(self.root, run);
         folder.create(run)?;
         if !folder.progress()?.trained && !self.train(run, &folder, label, bar)? {
             return Ok(None);
         }
         let progress = folder.progress()?;
-        let fly = |checkpoint: &crate::checkpoint::Checkpoint| -> anyhow::Result<EvaluatedWeights> {
+        let evaluate_weights = |checkpoint: &crate::checkpoint::Checkpoint| -> anyhow::Result<EvaluatedWeights> {
             let seeds = &self.experiment.layout_seeds;
             let episodes = evaluate(&checkpoint.policy(), &run.config.environment, seeds, self.share())?;
             Ok(EvaluatedWeights { step: checkpoint.step(), episodes })
@@ -133,15 +133,15 @@ impl<'a> Runner<'a> {
             layouts: self.experiment.layouts.clone(),
             steps: progress.step,
             diverged: progress.diverged,
-            best: fly(&folder.best()?)?,
-            last: if progress.diverged { None } else { Some(fly(&folder.last()?)?) },
+            best: evaluate_weights(&folder.best()?)?,
+            last: if progress.diverged { None } else { Some(evaluate_weights(&folder.last()?)?) },
             seconds: progress.seconds,
         };
         folder.finish(&result)?;
         Ok(Some(result))
     }
 
-    /// Trains to the end, or until stopped; whether it is the end.
+    /// Trains a run. Returns whether training has ended; false if it was stopped.
     fn train(&self, run: &Run, folder: &RunFolder, label: &str, bar: &ProgressBar) -> anyhow::Result<bool> {
         let mut threads = self.share();
         let (mut trainer, mut curve, before) = folder.restore(run, threads)?;
@@ -153,17 +153,17 @@ impl<'a> Runner<'a> {
             diverged,
         };
         let steps = run.config.training.steps;
-        let mut told = trainer.step().min(steps);
-        bar.set_position(told);
+        let mut reported = trainer.step().min(steps);
+        bar.set_position(reported);
         bar.reset_eta();
-        self.overall.inc(told);
+        self.overall.inc(reported);
         while let Some(event) = trainer.next() {
             for (step, name, value) in event.rows() {
                 curve.push(step, name, value);
             }
             let step = trainer.step().min(steps);
             bar.set_position(step);
-            self.overall.inc(step - std::mem::replace(&mut told, step));
+            self.overall.inc(step - std::mem::replace(&mut reported, step));
             let evaluated = if let Event::Evaluation(e) = event { Some((e.step, e.metrics.mean_aoi)) } else { None };
             if evaluated.is_none() && !self.stopped() {
                 continue;
@@ -184,8 +184,8 @@ impl<'a> Runner<'a> {
                 trainer = Trainer::restore(&snapshot, threads)?;
             }
         }
-        let best = trainer.best()?.context("a run that is over has been evaluated")?;
-        // The last weights of a run that diverged are no checkpoint.
+        let best = trainer.best()?.context("a finished run has been evaluated")?;
+        // The last weights of a diverged run are not a valid checkpoint.
         let last = trainer.checkpoint().ok();
         folder.save_weights(&best, last.as_ref(), &curve, &progress(&trainer, true, last.is_none()))?;
         Ok(true)

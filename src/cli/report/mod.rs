@@ -1,7 +1,6 @@
-//! The report of an evaluation (spec 7) as files: a page, the same as Markdown, the figures, the numbers as JSON.
+//! The report of an evaluation as files: an HTML page, the same as Markdown, plots, and the numbers as JSON.
 //!
-//! What it says is here; how a page or Markdown spells it is in `render`. Nothing of this machine gets into it but what was
-//! typed on the command line.
+//! This file owns the content; `render` writes HTML and Markdown. Of this machine, the report contains the command line only.
 
 mod render;
 
@@ -14,16 +13,15 @@ use crate::learner::{Difference, Interval};
 use crate::plot::{self, Bar, Chart, Series, Trajectories};
 use render::{ReportPage, ReportPlot, ReportSection, ReportTable};
 
-/// Writes `index.html`, `report.md`, `report.json` and the figures into `directory`, which is made where it is missing;
-/// files of these names are replaced.
+/// Writes `index.html`, `report.md`, `report.json` and the plots to `directory`. Creates the directory and replaces existing files.
 ///
 /// # Errors
 /// The directory or a file cannot be written.
 pub fn write(directory: &Path, comparison: &Comparison, command: &str) -> anyhow::Result<()> {
     let page = page(comparison, command)?;
     fs::create_dir_all(directory)?;
-    for figure in page.sections.iter().flat_map(|s| &s.plots) {
-        fs::write(directory.join(&figure.file), &figure.svg)?;
+    for plot in page.sections.iter().flat_map(|s| &s.plots) {
+        fs::write(directory.join(&plot.file), &plot.svg)?;
     }
     fs::write(directory.join("index.html"), render::html(&page))?;
     fs::write(directory.join("report.md"), render::markdown(&page))?;
@@ -32,15 +30,15 @@ pub fn write(directory: &Path, comparison: &Comparison, command: &str) -> anyhow
 }
 
 fn page(comparison: &Comparison, command: &str) -> anyhow::Result<ReportPage> {
-    let flown = comparison.best_first();
-    let mut sections = vec![conditions(comparison), policies(&flown)];
+    let evaluations = comparison.best_first();
+    let mut sections = vec![conditions(comparison), policies(&evaluations)];
     for name in Comparison::REFERENCES {
         sections.extend(gaps(name, &comparison.gaps(name)?));
     }
     sections.extend(pairs(&comparison.pairs()?));
-    sections.push(over_slots(&flown));
-    sections.push(over_layouts(&flown));
-    sections.push(flights(comparison, &flown));
+    sections.push(over_slots(&evaluations));
+    sections.push(over_layouts(&evaluations));
+    sections.push(trajectories(comparison, &evaluations));
     Ok(ReportPage { title: "Evaluation of UAV policies".to_owned(), command: command.to_owned(), sections })
 }
 
@@ -53,10 +51,10 @@ fn conditions(comparison: &Comparison) -> ReportSection {
         row("UAVs, users, slots", format!("{}, {}, {}", env.uavs, env.users, env.slots)),
         row("speed of UAVs", format!("{} per slot", env.speed)),
         row("transmission range, detection range", format!("{}, {}", env.transmission_range, env.detection_range)),
-        row("users", if env.user_speed > 0.0 { format!("walk {} per slot", env.user_speed) } else { "stay".to_owned() }),
+        row("users", if env.user_speed > 0.0 { format!("move {} per slot", env.user_speed) } else { "stay".to_owned() }),
         row("lost UAV", disturbance.lose.map_or_else(|| "none".to_owned(), |l| format!("UAV {} from slot {} on", l.uav, l.slot))),
         row(
-            "error of the positions seen",
+            "error of observed positions",
             if disturbance.position_noise > 0.0 {
                 format!("Gaussian, standard deviation {}", disturbance.position_noise)
             } else {
@@ -65,27 +63,28 @@ fn conditions(comparison: &Comparison) -> ReportSection {
         ),
     ];
     ReportSection {
-        title: "What was flown".to_owned(),
-        text: "Every policy flew the same layouts. Lengths are in units of the square's side; the age of information (AoI) is \
-               in slots, and less is fresher."
-            .to_owned(),
+        title: "Conditions".to_owned(),
+        text:
+            "All policies are evaluated on the same layouts. Lengths are in units of the square's side; the age of information \
+               (AoI) is in slots, and lower is better."
+                .to_owned(),
         table: Some(ReportTable { header: vec!["condition".to_owned(), "value".to_owned()], rows, numbers_from: 2 }),
         plots: Vec::new(),
     }
 }
 
-fn policies(flown: &[&PolicyEvaluation]) -> ReportSection {
+fn policies(evaluations: &[&PolicyEvaluation]) -> ReportSection {
     let header = ["policy", "mean AoI", "95 % interval", "p95 AoI", "peak AoI", "coverage", "fairness"];
-    let rows = flown.iter().map(|f| {
+    let rows = evaluations.iter().map(|f| {
         let name = if f.reference { format!("{} (reference)", f.name) } else { f.name.clone() };
         std::iter::once(name).chain(metric_cells(&f.summary.mean_aoi, &f.summary.mean)).collect()
     });
-    let bars: Vec<Bar> = flown.iter().map(|f| bar(f, f.summary.mean_aoi)).collect();
+    let bars: Vec<Bar> = evaluations.iter().map(|f| bar(f, f.summary.mean_aoi)).collect();
     ReportSection {
-        title: "Policies, the freshest first".to_owned(),
+        title: "Policies, the best first".to_owned(),
         text: "Means over layouts; the interval of the mean AoI is a 95 % bootstrap interval. p95 and peak are over the users \
                and slots of an episode, coverage is the share of users ever visited, fairness is Jain's index of the users' \
-               mean AoI. References flew only to be compared with; `tour` is a planner that knows everything, not a bound."
+               mean AoI. References are added for comparison; `tour` is a planner with full information, not a bound."
             .to_owned(),
         table: Some(ReportTable { header: header.map(str::to_owned).to_vec(), rows: rows.collect(), numbers_from: 1 }),
         plots: vec![ReportPlot {
@@ -96,21 +95,20 @@ fn policies(flown: &[&PolicyEvaluation]) -> ReportSection {
     }
 }
 
-/// Nothing when the reference did not fly, or nobody else did.
+/// `None` if the reference or all other policies are missing.
 fn gaps(name: &str, gaps: &[Pair]) -> Option<ReportSection> {
     let others = gaps.iter().filter(|(f, reference, _)| f.name != reference.name);
     let rows: Vec<Vec<String>> = others.map(|(f, _, d)| difference_row([&f.name], d)).collect();
     if rows.is_empty() {
         return None;
     }
-    // The reference keeps its bar, of length 0, so that every policy keeps its colour.
+    // The reference has a bar of length 0, so that every policy has the same colour in all plots.
     let bars: Vec<Bar> = gaps.iter().map(|(f, _, d)| bar(f, d.mean_aoi)).collect();
     let header = ["policy", "gap", "95 % interval", "better on"];
     Some(ReportSection {
         title: format!("Gap to {name}"),
         text: format!(
-            "Mean AoI of the policy minus that of {name} on the same layout, averaged over layouts: negative where the policy \
-             is better."
+            "Mean AoI of the policy minus that of {name} on the same layout, averaged over layouts. Negative: the policy is better."
         ),
         table: Some(ReportTable { header: header.map(str::to_owned).to_vec(), rows, numbers_from: 1 }),
         plots: vec![ReportPlot {
@@ -121,27 +119,28 @@ fn gaps(name: &str, gaps: &[Pair]) -> Option<ReportSection> {
     })
 }
 
-/// Nothing when only one policy was asked for.
+/// `None` if only one policy was requested.
 fn pairs(pairs: &[Pair]) -> Option<ReportSection> {
     let rows: Vec<_> = pairs.iter().map(|(a, b, d)| difference_row([&a.name, &b.name], d)).collect();
     let header = ["first", "second", "first minus second", "95 % interval", "first better on"];
     (!rows.is_empty()).then(|| ReportSection {
-        title: "Every pair".to_owned(),
-        text: "Paired differences of mean AoI on the same layouts. Where the interval holds 0, these layouts do not tell which \
-               is better."
-            .to_owned(),
+        title: "Differences".to_owned(),
+        text:
+            "Paired differences of mean AoI on the same layouts. If the interval contains 0, these layouts do not decide which \
+               policy is better. The intervals cover the variation over layouts; they exclude seed variance."
+                .to_owned(),
         table: Some(ReportTable { header: header.map(str::to_owned).to_vec(), rows, numbers_from: 2 }),
         plots: Vec::new(),
     })
 }
 
-fn over_slots(flown: &[&PolicyEvaluation]) -> ReportSection {
-    let series = flown.iter().map(|f| {
+fn over_slots(evaluations: &[&PolicyEvaluation]) -> ReportSection {
+    let series = evaluations.iter().map(|f| {
         let points = f.evaluation.aoi.iter().enumerate().map(|(slot, &aoi)| [slot as f64, aoi]).collect();
         Series { name: f.name.clone(), points, band: None }
     });
     let chart = Chart {
-        title: "AoI in the course of an episode".to_owned(),
+        title: "AoI during an episode".to_owned(),
         x: "slot".to_owned(),
         y: "mean AoI (slots)".to_owned(),
         series: series.collect(),
@@ -149,9 +148,10 @@ fn over_slots(flown: &[&PolicyEvaluation]) -> ReportSection {
     };
     ReportSection {
         title: "Over slots".to_owned(),
-        text: "All data is fresh at slot 0. A curve that levels off keeps up with its users; one that keeps rising leaves some \
-               of them alone."
-            .to_owned(),
+        text:
+            "At slot 0 all AoI are 0. A curve that becomes flat means that all users are visited regularly; a curve that keeps \
+               rising means that some users are not visited."
+                .to_owned(),
         table: None,
         plots: vec![ReportPlot {
             file: "aoi.svg".to_owned(),
@@ -161,12 +161,12 @@ fn over_slots(flown: &[&PolicyEvaluation]) -> ReportSection {
     }
 }
 
-fn over_layouts(flown: &[&PolicyEvaluation]) -> ReportSection {
+fn over_layouts(evaluations: &[&PolicyEvaluation]) -> ReportSection {
     let values = |f: &&PolicyEvaluation| (f.name.clone(), f.evaluation.episodes.iter().map(|e| e.mean_aoi).collect());
-    let series: Vec<(String, Vec<f64>)> = flown.iter().map(values).collect();
+    let series: Vec<(String, Vec<f64>)> = evaluations.iter().map(values).collect();
     ReportSection {
         title: "Over layouts".to_owned(),
-        text: "A curve further left is better; a long tail to the right says that some layouts went badly.".to_owned(),
+        text: "A curve further left is better. A long tail to the right means that the policy is bad on some layouts.".to_owned(),
         table: None,
         plots: vec![ReportPlot {
             file: "distribution.svg".to_owned(),
@@ -176,12 +176,12 @@ fn over_layouts(flown: &[&PolicyEvaluation]) -> ReportSection {
     }
 }
 
-fn flights(comparison: &Comparison, flown: &[&PolicyEvaluation]) -> ReportSection {
-    let seed = flown.first().map_or(0, |f| f.evaluation.trajectory.seed);
+fn trajectories(comparison: &Comparison, evaluations: &[&PolicyEvaluation]) -> ReportSection {
+    let seed = evaluations.first().map_or(0, |f| f.evaluation.trajectory.seed);
     let index = seed.saturating_sub(comparison.layouts.first) as usize;
-    let figures = flown.iter().enumerate().map(|(i, f)| {
+    let plots = evaluations.iter().enumerate().map(|(i, f)| {
         let trajectory = &f.evaluation.trajectory;
-        let flight = Trajectories {
+        let paths = Trajectories {
             uavs: trajectory.uavs.clone(),
             users: trajectory.users.iter().filter_map(|path| path.first().copied()).collect(),
             transmission_range: comparison.env.transmission_range,
@@ -190,20 +190,23 @@ fn flights(comparison: &Comparison, flown: &[&PolicyEvaluation]) -> ReportSectio
         ReportPlot {
             file: format!("flight-{}-{}.svg", i + 1, file_name(&f.name)),
             caption: format!("{}: mean AoI {aoi:.2} on this layout.", f.name),
-            svg: plot::trajectories(&f.name, &flight),
+            svg: plot::trajectories(&f.name, &paths),
         }
     });
-    let walking = if comparison.env.user_speed > 0.0 { " Users are drawn where they start." } else { "" };
+    let note = if comparison.env.user_speed > 0.0 { " Users are shown at their start positions." } else { "" };
     ReportSection {
-        title: format!("Flights on layout {index}"),
-        text: format!("What each fleet flew on layout {index} of {} (seed {seed}), all slots.{walking}", comparison.layouts.name),
+        title: format!("Trajectories on layout {index}"),
+        text: format!(
+            "The paths of the UAVs on layout {index} of {} (seed {seed}), in all slots.{note}",
+            comparison.layouts.name
+        ),
         table: None,
-        plots: figures.collect(),
+        plots: plots.collect(),
     }
 }
 
-fn bar(flown: &PolicyEvaluation, interval: Interval) -> Bar {
-    Bar { name: flown.name.clone(), mean: interval.mean, low: interval.low, high: interval.high }
+fn bar(evaluation: &PolicyEvaluation, interval: Interval) -> Bar {
+    Bar { name: evaluation.name.clone(), mean: interval.mean, low: interval.low, high: interval.high }
 }
 
 /// A row of names and their difference.
@@ -211,7 +214,7 @@ fn difference_row<const N: usize>(names: [&String; N], difference: &Difference) 
     names.into_iter().cloned().chain(difference_cells(&difference.mean_aoi, difference.wins)).collect()
 }
 
-/// `name` as a part of a file's name that every system takes.
+/// `name` as part of a file name on every system.
 fn file_name(name: &str) -> String {
     let last = name.rsplit(['/', '\\']).next().unwrap_or(name);
     last.chars().take(40).map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect()

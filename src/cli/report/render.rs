@@ -1,16 +1,16 @@
-//! A report as a page that needs nothing else, and as Markdown beside its figures. Names come from users and are escaped.
+//! Renders a report as a self-contained HTML page, and as Markdown with the plots beside it. Names come from users and are escaped.
 
 use std::fmt::Write;
 
 /// A report.
 pub(super) struct ReportPage {
     pub(super) title: String,
-    /// The command that repeats it.
+    /// The command that repeats the evaluation.
     pub(super) command: String,
     pub(super) sections: Vec<ReportSection>,
 }
 
-/// A heading with what follows it.
+/// A section of the page.
 pub(super) struct ReportSection {
     pub(super) title: String,
     pub(super) text: String,
@@ -18,14 +18,14 @@ pub(super) struct ReportSection {
     pub(super) plots: Vec<ReportPlot>,
 }
 
-/// Rows as wide as the header; columns from `numbers_from` on are aligned right.
+/// A table. Rows have the width of the header; columns from `numbers_from` on are aligned right.
 pub(super) struct ReportTable {
     pub(super) header: Vec<String>,
     pub(super) rows: Vec<Vec<String>>,
     pub(super) numbers_from: usize,
 }
 
-/// A figure and the file it is in.
+/// A plot and its file.
 pub(super) struct ReportPlot {
     pub(super) file: String,
     pub(super) caption: String,
@@ -52,22 +52,22 @@ figcaption { color: #555; font-size: .9rem; padding-left: 1rem; overflow-wrap: a
 footer { margin-top: 3rem; color: #777; font-size: .9rem; }
 ";
 
-/// The page.
+/// The report as HTML.
 pub(super) fn html(document: &ReportPage) -> String {
-    let title = escaped(&document.title);
+    let title = escaped_html(&document.title);
     let mut page = format!(
         "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<title>{title}</title>\n\
          <style>{STYLE}</style>\n</head>\n<body>\n<h1>{title}</h1>\n<pre>{}</pre>\n",
-        escaped(&document.command)
+        escaped_html(&document.command)
     );
     for section in &document.sections {
-        let _ = write!(page, "<h2>{}</h2>\n<p>{}</p>\n", escaped(&section.title), code(&escaped(&section.text)));
+        let _ = write!(page, "<h2>{}</h2>\n<p>{}</p>\n", escaped_html(&section.title), code(&escaped_html(&section.text)));
         page += "<div class=\"row\">\n";
         page += &section.table.as_ref().map(html_table).unwrap_or_default();
-        for figure in &section.plots {
-            let caption = escaped(&figure.caption);
-            let _ = write!(page, "<figure>\n{}<figcaption>{caption}</figcaption>\n</figure>\n", figure.svg);
+        for plot in &section.plots {
+            let caption = escaped_html(&plot.caption);
+            let _ = write!(page, "<figure>\n{}<figcaption>{caption}</figcaption>\n</figure>\n", plot.svg);
         }
         page += "</div>\n";
     }
@@ -78,7 +78,7 @@ fn html_table(table: &ReportTable) -> String {
     let cells = |row: &[String], tag: &str| -> String {
         let cell = |(i, text): (usize, &String)| {
             let class = if i >= table.numbers_from { " class=\"n\"" } else { "" };
-            format!("<{tag}{class}>{}</{tag}>", escaped(text))
+            format!("<{tag}{class}>{}</{tag}>", escaped_html(text))
         };
         format!("<tr>{}</tr>\n", row.iter().enumerate().map(cell).collect::<String>())
     };
@@ -86,28 +86,28 @@ fn html_table(table: &ReportTable) -> String {
     format!("<div class=\"wide\"><table>\n<thead>{}</thead>\n<tbody>{rows}</tbody>\n</table></div>\n", cells(&table.header, "th"))
 }
 
-/// The same as Markdown.
+/// The report as Markdown.
 pub(super) fn markdown(document: &ReportPage) -> String {
     let mut text = format!("# {}\n\n```sh\n{}\n```\n", document.title, document.command.replace("```", "'''"));
     for section in &document.sections {
-        let _ = write!(text, "\n## {}\n\n{}\n", plain(&section.title), section.text);
+        let _ = write!(text, "\n## {}\n\n{}\n", escaped_markdown(&section.title), section.text);
         if let Some(table) = &section.table {
             let line = |cells: Vec<String>| format!("| {} |\n", cells.join(" | "));
             text += "\n";
-            text += &line(table.header.iter().map(|c| plain(c)).collect());
+            text += &line(table.header.iter().map(|c| escaped_markdown(c)).collect());
             text +=
                 &line((0..table.header.len()).map(|i| if i < table.numbers_from { ":--" } else { "--:" }.to_owned()).collect());
-            text.extend(table.rows.iter().map(|row| line(row.iter().map(|c| plain(c)).collect())));
+            text.extend(table.rows.iter().map(|row| line(row.iter().map(|c| escaped_markdown(c)).collect())));
         }
-        for figure in &section.plots {
-            let _ = write!(text, "\n![{}]({})\n", plain(&figure.caption), figure.file);
+        for plot in &section.plots {
+            let _ = write!(text, "\n![{}]({})\n", escaped_markdown(&plot.caption), plot.file);
         }
     }
     text
 }
 
-/// `text` as HTML shows it, in elements and in attributes.
-fn escaped(text: &str) -> String {
+/// `text` escaped for HTML elements and attributes.
+fn escaped_html(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
         match c {
@@ -122,14 +122,14 @@ fn escaped(text: &str) -> String {
     out
 }
 
-/// Escaped text with what stands between backquotes as code.
+/// Escaped text, with text between backquotes as code.
 fn code(text: &str) -> String {
     let parts = text.split('`').enumerate();
     parts.map(|(i, part)| if i % 2 == 1 { format!("<code>{part}</code>") } else { part.to_owned() }).collect()
 }
 
-/// `text` in one line without anything that Markdown would take for markup.
-fn plain(text: &str) -> String {
+/// `text` on one line, escaped for Markdown.
+fn escaped_markdown(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
         match c {
@@ -148,11 +148,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_cannot_break_out() {
+    fn names_are_escaped() {
         let name = "<script>alert('x')</script> | `a` & \"b\"\n# c";
         let table = ReportTable { header: vec!["policy".to_owned()], rows: vec![vec![name.to_owned()]], numbers_from: 1 };
-        let figure = ReportPlot { file: "a.svg".to_owned(), caption: name.to_owned(), svg: "<svg></svg>\n".to_owned() };
-        let section = ReportSection { title: name.to_owned(), text: "t".to_owned(), table: Some(table), plots: vec![figure] };
+        let plot = ReportPlot { file: "a.svg".to_owned(), caption: name.to_owned(), svg: "<svg></svg>\n".to_owned() };
+        let section = ReportSection { title: name.to_owned(), text: "t".to_owned(), table: Some(table), plots: vec![plot] };
         let document = ReportPage { title: "t".to_owned(), command: name.to_owned(), sections: vec![section] };
         let page = html(&document);
         assert!(!page.contains("<script") && page.contains("&lt;script&gt;"));
