@@ -117,8 +117,8 @@ fn mixer_tensors_are_optional() {
     let lean = Checkpoint::from_bytes(&file(&header, &data[..end])).unwrap();
     let full = example(config());
     let seeds = layout_list("eval-v1").unwrap().seeds(4);
-    let flown = |c: &Checkpoint| evaluate(&c.policy(), &config().environment, &seeds, 1).unwrap();
-    assert_eq!(flown(&lean), flown(&full));
+    let metrics = |c: &Checkpoint| evaluate(&c.policy(), &config().environment, &seeds, 1).unwrap();
+    assert_eq!(metrics(&lean), metrics(&full));
     assert_eq!(Checkpoint::from_bytes(&lean.to_bytes()).unwrap(), lean);
 }
 

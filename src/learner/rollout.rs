@@ -35,7 +35,7 @@ pub struct Rollout {
     explorers: Vec<ChaCha8Rng>,
     actions: Vec<u8>,
     /// With shaping: per user reward_scale / (1 - gamma) * w_i / N.
-    collected: Option<Vec<f64>>,
+    shaping_factors: Option<Vec<f64>>,
 }
 
 impl Rollout {
@@ -67,7 +67,7 @@ impl Rollout {
             seeds: Vec::with_capacity(fleets),
             explorers: Vec::with_capacity(fleets),
             actions: vec![0; fleets * m],
-            collected: config.training.shaping.then(|| {
+            shaping_factors: config.training.shaping.then(|| {
                 let factor = environment.reward_factor() / (1.0 - config.training.gamma) / n as f64;
                 environment.user_weights().iter().map(|w| w * factor).collect()
             }),
@@ -127,7 +127,7 @@ impl Rollout {
     fn record_step(&mut self) {
         let (e, slot) = (&mut self.episodes, self.env.slot() - 1);
         place(&mut e.actions, &self.actions, e.len, slot);
-        let Some(factors) = &self.collected else {
+        let Some(factors) = &self.shaping_factors else {
             place(&mut e.reward, self.env.reward(), e.len, slot);
             return;
         };
@@ -164,7 +164,7 @@ mod tests {
         config
     }
 
-    fn flown(config: &TrainConfig, epsilon: f64, first: u64) -> Episodes {
+    fn collect_episodes(config: &TrainConfig, epsilon: f64, first: u64) -> Episodes {
         let agent = Agent::new(config.agent(), config.dims());
         let parameters: Vec<f32> = agent.layout().initialise(&mut rng::stream(5, "test", 0));
         Rollout::new(config, &agent).unwrap().collect(&agent, &parameters, epsilon, first).clone()
@@ -174,7 +174,7 @@ mod tests {
     fn recorded_episodes_equal_a_repetition_of_their_actions() {
         for user_speed in [0.0, 0.02] {
             let config = config(3, user_speed);
-            let e = flown(&config, 0.5, 10);
+            let e = collect_episodes(&config, 0.5, 10);
             let (m, n, k) = (e.uavs, e.users, e.slots);
             for b in 0..e.len {
                 let mut env = BatchEnv::new(&config.environment, 1).unwrap();
@@ -200,10 +200,10 @@ mod tests {
         let mut config = config(4, 0.0);
         config.environment.weights = Some(vec![1.0, 2.0, 3.0, 0.0, 4.0]);
         config.environment.slots = 60;
-        let plain = flown(&config, 1.0, 0);
+        let plain = collect_episodes(&config, 1.0, 0);
         config.training.shaping = true;
         config.training.gamma = 0.9;
-        let shaped = flown(&config, 1.0, 0);
+        let shaped = collect_episodes(&config, 1.0, 0);
         assert_eq!(shaped.actions, plain.actions);
         let (gamma, scale) = (0.9, 1.0 / 60.0);
         let weights = [0.5, 1.0, 1.5, 0.0, 2.0];
@@ -227,7 +227,7 @@ mod tests {
 
     #[test]
     fn an_episode_does_not_depend_on_the_others() {
-        let (eight, three) = (flown(&config(8, 0.0), 1.0, 0), flown(&config(3, 0.0), 1.0, 4));
+        let (eight, three) = (collect_episodes(&config(8, 0.0), 1.0, 0), collect_episodes(&config(3, 0.0), 1.0, 4));
         let width = eight.slots * eight.uavs;
         assert_eq!(eight.actions[4 * width..7 * width], three.actions);
         assert_eq!(eight.token[4 * 12..7 * 12], three.token);
@@ -240,10 +240,10 @@ mod tests {
         config.environment.start = Start::Center;
         config.environment.layout = Layout::Given(vec![[0.1, 0.2]; 5]);
         config.training.identity = crate::policy::Identity::None;
-        let greedy = flown(&config, 0.0, 0).actions;
+        let greedy = collect_episodes(&config, 0.0, 0).actions;
         assert!(greedy.chunks(3).all(|a| a[0] == a[1] && a[1] == a[2]));
         assert!(greedy.chunks(90).all(|episode| episode == &greedy[..90]));
-        let random = flown(&config, 1.0, 0).actions;
+        let random = collect_episodes(&config, 1.0, 0).actions;
         let together = random.chunks(3).filter(|a| a[0] == a[1] && a[1] == a[2]).count();
         // 240 slots, one in 64 expected.
         assert!(together < 15, "{together}");
@@ -252,7 +252,7 @@ mod tests {
             counts[a as usize] += 1;
         }
         assert!(counts.iter().all(|c| (50..130).contains(c)), "{counts:?}: 90 each expected");
-        let half = flown(&config, 0.5, 0).actions;
+        let half = collect_episodes(&config, 0.5, 0).actions;
         assert_ne!(half, greedy);
         assert_ne!(half, random);
     }

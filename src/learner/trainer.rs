@@ -123,8 +123,8 @@ impl Trainer {
         let policy = LearnedPolicy::new(self.config.agent(), self.config.dims(), weights)
             .expect("the weights have the length of the agent's layout");
         let seeds = layout_list("valid-v1").expect("valid-v1 exists").seeds(t.eval_episodes);
-        let flown = evaluate(&policy, &self.config.environment, &seeds, self.threads).expect("an agent fits its environment");
-        let now = Evaluation { step: self.run.counters.step, metrics: EpisodeMetrics::mean(&flown) };
+        let metrics = evaluate(&policy, &self.config.environment, &seeds, self.threads).expect("an agent fits its environment");
+        let now = Evaluation { step: self.run.counters.step, metrics: EpisodeMetrics::mean(&metrics) };
         self.run.latest = Some(now);
         if self.run.best.as_ref().is_none_or(|(best, _)| now.metrics.mean_aoi < best.metrics.mean_aoi) {
             self.run.best = Some((now, self.learner.published().to_vec()));
@@ -140,10 +140,10 @@ impl Trainer {
         let p = &mut self.run.counters;
         let epsilon = epsilon(t, p.step);
         let learning_rate = learning_rate(t, p.step);
-        let flown = self.rollout.collect(self.learner.agent(), self.learner.agent_parameters(), epsilon, p.episodes);
-        p.step += (flown.len * flown.slots) as u64;
-        p.episodes += flown.len as u64;
-        self.replay.push(flown);
+        let episodes = self.rollout.collect(self.learner.agent(), self.learner.agent_parameters(), epsilon, p.episodes);
+        p.step += (episodes.len * episodes.slots) as u64;
+        p.episodes += episodes.len as u64;
+        self.replay.push(episodes);
         let (mut loss, mut grad_norm, mut q_tot) = (0.0, 0.0, 0.0);
         let learning = self.replay.len() >= t.batch;
         if learning {
