@@ -2,7 +2,7 @@
 
 use tokio_util::sync::CancellationToken;
 
-/// The flag; cheap to clone. Once set it stays set: new work is refused, work in flight goes on.
+/// The flag; cheap to clone. Once set it stays set: new work is refused, work in flight continues.
 #[derive(Clone, Debug, Default)]
 pub struct Draining(CancellationToken);
 

@@ -34,6 +34,7 @@ use crate::files;
 use crate::invalid::Invalid;
 use crate::jobs::{LocalProcess, Scheduler, SchedulerConfig};
 use crate::service::keys::{Keyring, Rate};
+use crate::service::policies::UploadLimit;
 use crate::service::{App, Watchers, operations, policies};
 use crate::serving::{Engine, Environments, EnvironmentsConfig, Limits, Sessions};
 use crate::store::{self, Store};
@@ -207,6 +208,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
     let draining = Draining::default();
     let app = App {
         keys,
+        uploads: UploadLimit::default(),
         scheduler: Scheduler::open(store.clone(), scheduler, Arc::new(executor), clock.clone(), draining.clone()).await?,
         store,
         registry: Arc::default(),

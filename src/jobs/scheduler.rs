@@ -292,7 +292,7 @@ mod tests {
         while scheduler.0.store.job(id).await.unwrap().unwrap().state != JobState::Running {
             changes.changed().await.unwrap();
         }
-        // A correction of the wall time by a day kills nobody; the attempt that ends afterwards shows the corrected time.
+        // A correction of the wall time by a day does not kill the worker. The attempt ends at the corrected time.
         time.set_wall(Timestamp::from_second(90_000).unwrap());
         for _ in 0..100 {
             tokio::task::yield_now().await;

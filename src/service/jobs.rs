@@ -4,14 +4,13 @@ use serde_json::Value;
 use uuid::Uuid;
 
 use super::paging::{self, number};
-use super::worker::is_metric_name;
 use super::{App, Error, Page, PageRequest, policies};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::jobs::spec;
 use crate::store::{
     ActionResult, Attempt, Checkpoint, Job, JobAction, JobId, JobState, JobSummary, MetricCursor, MetricRow, NewJob,
-    PendingAction, SubmitResult,
+    PendingAction, SubmitResult, is_metric_name,
 };
 
 /// Queues a job and returns it, and whether it is new: a repeated idempotency `key` with the same document returns the
@@ -66,7 +65,7 @@ pub async fn get(app: &App, id: &str) -> Result<Job, Error> {
 /// Summaries of jobs, newest first.
 ///
 /// # Errors
-/// [`Error::Invalid`]: the page size is over 1000, or no page returned the token.
+/// [`Error::Invalid`]: the page size is over 1000, or the token is invalid.
 pub async fn list(app: &App, state: Option<JobState>, page: &PageRequest) -> Result<Page<JobSummary>, Error> {
     let (limit, before) = (page.usual_limit()?, page.position(number)?);
     let (jobs, more) = app.store.job_summaries(state, before, limit, paging::MAX_BYTES).await?;
@@ -109,7 +108,7 @@ pub async fn change(app: &App, id: &str, action: JobAction) -> Result<Job, Error
 /// Metrics of a job in order of name and step, 10 000 rows to a page by default.
 ///
 /// # Errors
-/// [`Error::NotFound`]: there is no such job. [`Error::Invalid`]: the page size is over 100 000, or no page returned the token.
+/// [`Error::NotFound`]: there is no such job. [`Error::Invalid`]: the page size is over 100 000, or the token is invalid.
 pub async fn metrics(app: &App, id: &str, name: Option<&str>, page: &PageRequest) -> Result<Page<MetricRow>, Error> {
     let (limit, after) = (page.limit(10_000, 100_000)?, page.position(parse_metric_cursor)?);
     let job = get(app, id).await?;
@@ -132,15 +131,6 @@ fn parse_metric_cursor(cursor: &str) -> Option<MetricCursor> {
 pub async fn checkpoints(app: &App, id: &str) -> Result<Vec<Checkpoint>, Error> {
     let job = get(app, id).await?;
     Ok(app.store.checkpoints(job.id).await?)
-}
-
-/// A checkpoint with its bytes.
-///
-/// # Errors
-/// [`Error::NotFound`].
-pub async fn checkpoint(app: &App, id: &str) -> Result<(Checkpoint, Vec<u8>), Error> {
-    let missing = || Error::not_found("checkpoint", id);
-    app.store.checkpoint(Uuid::try_parse(id).map_err(|_| missing())?).await?.ok_or_else(missing)
 }
 
 /// All attempts of a job with the last output of their workers, oldest first.

@@ -1,6 +1,7 @@
 //! Use cases: one function each, with one error type. Both transports call only this layer.
 
 pub mod act;
+pub mod checkpoints;
 pub mod environments;
 mod error;
 pub mod events;
@@ -41,6 +42,8 @@ pub struct App {
     pub engine: Engine,
     /// API keys.
     pub keys: keys::Keyring,
+    /// The limit of uploads of checkpoints.
+    pub uploads: policies::UploadLimit,
     /// Limits of watches of jobs.
     pub watchers: Watchers,
     /// Wall time and monotonic time.

@@ -8,7 +8,9 @@ use super::{App, Error, policies};
 use crate::error_code::ErrorCode;
 use crate::invalid::{Invalid, in_range};
 use crate::jobs::{Directive, equal_secrets, token_digest};
-use crate::store::{AttemptResult, EndedAttempt, JobId, Lease, Metric, NewCheckpoint, PartialSnapshot, PendingAction, Snapshot};
+use crate::store::{
+    AttemptResult, EndedAttempt, JobId, Lease, Metric, NewCheckpoint, PartialSnapshot, PendingAction, Snapshot, is_metric_name,
+};
 use crate::train_config::TrainConfig;
 
 /// Largest chunk of an upload, in bytes.
@@ -115,11 +117,6 @@ pub async fn report(app: &App, lease: Lease, metrics: &[Metric], step: u64) -> R
         check_step(&format!("metrics[{i}].step"), metric.step)?;
     }
     require_active(app.store.report(lease, metrics, step, app.clock.now()).await?, lease)
-}
-
-pub(super) fn is_metric_name(name: &str) -> bool {
-    let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '/' | '.');
-    (1..=63).contains(&name.len()) && name.chars().all(allowed)
 }
 
 fn check_step(field: &str, step: u64) -> Result<(), Invalid> {

@@ -135,7 +135,7 @@ pub struct JobSpec {
     pub config: TrainConfig,
 }
 
-/// What lists return of a [`JobSpec`]: everything but the environment and the training configuration, which may be large.
+/// The part of a [`JobSpec`] that lists return: all but the environment and the training configuration, which may be large.
 // `Store::job_summaries` reads it from a JSON array in the order of the fields.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SpecSummary {
@@ -155,7 +155,7 @@ pub struct SpecSummary {
     pub preset: Preset,
     /// As in [`TrainConfig`].
     pub seed: u64,
-    /// Environment steps to train for; no field of a job's document.
+    /// Environment steps of the training. Not a field of job documents.
     #[serde(skip_serializing)]
     pub steps: u64,
 }
@@ -177,13 +177,13 @@ impl From<&JobSpec> for SpecSummary {
     }
 }
 
-/// A job as lists return it.
+/// A job as returned by lists.
 pub type JobSummary = Job<SpecSummary>;
 
-/// A job as it stands.
+/// The current record of a job.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Job<S = JobSpec> {
-    /// Its name for ever.
+    /// The id.
     pub id: JobId,
     /// Key of the record; jobs submitted later have larger numbers.
     pub number: i64,
@@ -214,7 +214,7 @@ pub struct Job<S = JobSpec> {
 }
 
 impl Job {
-    /// The job as lists return it, and the configuration that they leave out.
+    /// The job as returned by lists, and the configuration that lists omit.
     pub fn split(self) -> (JobSummary, TrainConfig) {
         let spec = SpecSummary::from(&self.spec);
         let Self { spec: JobSpec { config, .. }, id, number, state, pending_action, reason, attempts, failures, .. } = self;

@@ -39,6 +39,12 @@ pub struct MetricCursor {
     pub step: u64,
 }
 
+/// Whether `name` is a valid name of a metric: 1 to 63 letters, digits, `_`, `-`, `/` and `.`.
+pub fn is_metric_name(name: &str) -> bool {
+    let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '/' | '.');
+    (1..=63).contains(&name.len()) && name.chars().all(allowed)
+}
+
 impl Store {
     /// Stores metrics and progress in one transaction. Returns false if the attempt has ended.
     ///

@@ -18,7 +18,7 @@ pub use jobs::{
     ActionResult, Job, JobAction, JobId, JobKind, JobSpec, JobState, JobSummary, NewJob, PendingAction, SpecSummary, SubmitResult,
 };
 pub use keys::KeyRecord;
-pub use metrics::{Metric, MetricCursor, MetricRow};
+pub use metrics::{Metric, MetricCursor, MetricRow, is_metric_name};
 pub use policies::{NewPolicyVersion, PolicyVersion, PublishedPolicy};
 pub use promotions::{AliasMove, PolicyAlias, Promotion, PromotionFilter};
 pub use snapshots::{PartialSnapshot, Snapshot};

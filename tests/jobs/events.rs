@@ -1,4 +1,4 @@
-//! Following a job: every change of state and every figure once, in order, over both transports, across restarts.
+//! Watching a job: every change of state and every metric once, in order, on both transports, across restarts.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -11,7 +11,7 @@ use sqlx::migrate::Migrator;
 use sqlx::sqlite::{SqliteConnectOptions, SqlitePool};
 use tonic::Code;
 
-use super::harness::{Rest, Server, WATCHERS, Worker, expect, named, signed, tiny, within};
+use super::harness::{MAX_WATCHERS, Rest, Server, Worker, expect, named, signed, tiny, within};
 use super::processes::Process;
 
 /// A server-sent event.
@@ -22,7 +22,7 @@ struct Event {
     data: Value,
 }
 
-/// A stream of server-sent events, read piece by piece.
+/// A stream of server-sent events.
 struct Events {
     response: reqwest::Response,
     text: String,
@@ -42,7 +42,7 @@ impl Events {
         Self { response, text: String::new(), comments: 0 }
     }
 
-    /// The next event; none at the end of the stream, which is a clean one unless the server died.
+    /// The next event; `None` at the end of the stream.
     async fn next(&mut self) -> Option<Event> {
         loop {
             while let Some(end) = self.text.find("\n\n") {
@@ -93,7 +93,7 @@ async fn finish(server: &Server, worker: &Worker) {
     server.worker_client().await.finish(signed(&worker.launch, &worker.launch.token, request)).await.unwrap();
 }
 
-/// Events in short: the new state, or name, step and value of each figure.
+/// Events in short: the new state, or name, step and value of each metric.
 fn brief(events: &[Event]) -> Vec<Value> {
     let of = |event: &Event| match event.name.as_str() {
         "state" => event.data["state"].clone(),
@@ -114,31 +114,31 @@ async fn started() -> (tempfile::TempDir, Server, String, Worker) {
 }
 
 #[tokio::test]
-async fn both_transports_tell_a_job_from_its_beginning_to_its_end() {
+async fn both_transports_stream_all_events_of_a_job() {
     let (_dir, server, id, worker) = started().await;
     let mut live = Events::open(&server, &id, None).await;
     let mut grpc = server.jobs().await;
     let watch = |after| v1::WatchJobRequest { id: id.clone(), after };
     let mut messages = grpc.watch_job(watch(0)).await.unwrap().into_inner();
-    // Told as it happens: each event is there before the next is caused.
-    let mut told = vec![live.next().await.unwrap(), live.next().await.unwrap()];
+    // Each event is received before the next one is caused.
+    let mut events = vec![live.next().await.unwrap(), live.next().await.unwrap()];
     report(&server, &worker, vec![row("loss", 20, 0.5), row("epsilon", 20, 1.0)]).await;
-    told.push(live.next().await.unwrap());
+    events.push(live.next().await.unwrap());
     report(&server, &worker, vec![row("loss", 40, f64::NAN)]).await;
-    told.push(live.next().await.unwrap());
+    events.push(live.next().await.unwrap());
     finish(&server, &worker).await;
-    told.extend(live.rest().await);
+    events.extend(live.rest().await);
     let expected = json!(["queued", "running", [["epsilon", 20, 1.0], ["loss", 20, 0.5]], [["loss", 40, null]], "succeeded"]);
-    assert_eq!(json!(brief(&told)), expected);
-    assert!(told.windows(2).all(|pair| pair[0].id < pair[1].id), "{told:?}");
-    assert_eq!((&told[0].data["attempt"], &told[1].data["attempt"]), (&json!(0), &json!(1)));
+    assert_eq!(json!(brief(&events)), expected);
+    assert!(events.windows(2).all(|pair| pair[0].id < pair[1].id), "{events:?}");
+    assert_eq!((&events[0].data["attempt"], &events[1].data["attempt"]), (&json!(0), &json!(1)));
 
     let mut again = Vec::new();
     while let Some(message) = within(messages.message()).await.unwrap() {
         again.push(message);
     }
-    assert_eq!(again.iter().map(|m| m.id).collect::<Vec<_>>(), told.iter().map(|e| e.id).collect::<Vec<_>>());
-    for (message, event) in again.iter().zip(&told) {
+    assert_eq!(again.iter().map(|m| m.id).collect::<Vec<_>>(), events.iter().map(|e| e.id).collect::<Vec<_>>());
+    for (message, event) in again.iter().zip(&events) {
         match message.what.as_ref().unwrap() {
             v1::job_event::What::State(state) => {
                 assert_eq!(
@@ -154,25 +154,25 @@ async fn both_transports_tell_a_job_from_its_beginning_to_its_end() {
         }
     }
 
-    // From any event on, over either transport, comes exactly what is behind it.
+    // A watch after any event returns exactly the later events, on both transports.
     let job = server.get(&format!("/v1/jobs/{id}")).await;
-    assert_eq!(job["last_event_id"], told.last().unwrap().id);
-    for (i, event) in told.iter().enumerate().take(told.len() - 1) {
-        assert_eq!(all(&server, &id, Some(event.id)).await, told[i + 1..]);
+    assert_eq!(job["last_event_id"], events.last().unwrap().id);
+    for (i, event) in events.iter().enumerate().take(events.len() - 1) {
+        assert_eq!(all(&server, &id, Some(event.id)).await, events[i + 1..]);
         let mut messages = grpc.watch_job(watch(event.id)).await.unwrap().into_inner();
         assert_eq!(messages.message().await.unwrap().unwrap(), again[i + 1]);
     }
-    let by_query = server.request(Method::GET, &format!("/v1/jobs/{id}/events?after={}", told[2].id)).send().await.unwrap();
-    assert!(by_query.text().await.unwrap().starts_with(&format!("id: {}\n", told[3].id)));
-    // Behind the end there is nothing to wait for: a browser stops to ask.
-    let over = server.request(Method::GET, &format!("/v1/jobs/{id}/events")).header("last-event-id", told[4].id.to_string());
+    let by_query = server.request(Method::GET, &format!("/v1/jobs/{id}/events?after={}", events[2].id)).send().await.unwrap();
+    assert!(by_query.text().await.unwrap().starts_with(&format!("id: {}\n", events[3].id)));
+    // After the last event there is nothing to wait for. A browser stops reconnecting on 204.
+    let over = server.request(Method::GET, &format!("/v1/jobs/{id}/events")).header("last-event-id", events[4].id.to_string());
     assert_eq!(over.send().await.unwrap().status(), StatusCode::NO_CONTENT);
-    let mut messages = grpc.watch_job(watch(told[4].id)).await.unwrap().into_inner();
+    let mut messages = grpc.watch_job(watch(events[4].id)).await.unwrap().into_inner();
     assert_eq!(messages.message().await.unwrap(), None);
 }
 
 #[tokio::test]
-async fn what_is_asked_wrongly_is_refused() {
+async fn invalid_watch_requests_are_refused() {
     let (_dir, server, id, _worker) = started().await;
     let path = format!("/v1/jobs/{id}/events");
     for last in ["", "x", "-1", "1.5", "3", "18446744073709551616"] {
@@ -192,21 +192,21 @@ async fn what_is_asked_wrongly_is_refused() {
 }
 
 #[tokio::test]
-async fn a_figure_is_told_again_only_with_another_value() {
+async fn metric_is_sent_again_only_when_its_value_changes() {
     let (_dir, mut server, id, worker) = started().await;
     let mut live = Events::open(&server, &id, Some(2)).await;
     report(&server, &worker, vec![row("loss", 20, 0.5), row("speed", 20, 100.0)]).await;
     // The answer was lost, so the worker sends it again.
     report(&server, &worker, vec![row("loss", 20, 0.5), row("speed", 20, 100.0)]).await;
     report(&server, &worker, vec![row("loss", 40, 0.25)]).await;
-    // The worker dies; the next one does the same work again, and goes on.
+    // The worker dies. The next one repeats the last steps and continues.
     worker.exit("killed by signal 9");
     let worker = server.worker().await;
     report(&server, &worker, vec![row("loss", 20, 0.5), row("speed", 20, 90.0), row("loss", 40, 0.25)]).await;
     report(&server, &worker, vec![row("loss", 60, 0.125)]).await;
-    let mut told = Vec::new();
-    while told.len() < 6 {
-        told.push(live.next().await.unwrap());
+    let mut events = Vec::new();
+    while events.len() < 6 {
+        events.push(live.next().await.unwrap());
     }
     let expected = json!([
         [["loss", 20, 0.5], ["speed", 20, 100.0]],
@@ -216,56 +216,56 @@ async fn a_figure_is_told_again_only_with_another_value() {
         [["speed", 20, 90.0]],
         [["loss", 60, 0.125]]
     ]);
-    assert_eq!(json!(brief(&told)), expected);
-    assert!(told[2].data["reason"].as_str().unwrap().contains("signal 9"), "{:?}", told[2]);
-    // Whoever comes now is told every figure once, as it is now.
+    assert_eq!(json!(brief(&events)), expected);
+    assert!(events[2].data["reason"].as_str().unwrap().contains("signal 9"), "{:?}", events[2]);
+    // A new watch returns every metric once, with its current value.
     let mut late = Events::open(&server, &id, Some(2)).await;
     let first = late.next().await.unwrap();
     assert_eq!(json!(brief(&[first])), json!([[["loss", 20, 0.5]]]));
 }
 
 #[tokio::test]
-async fn long_histories_come_page_by_page_and_every_report_whole() {
+async fn long_histories_are_streamed_with_every_report_complete() {
     let (_dir, server, id, worker) = started().await;
-    // Held open and not read while everything is written.
+    // Open, but not read while the events are written.
     let mut slow = Events::open(&server, &id, None).await;
     let mut grpc = server.jobs().await;
     let mut messages = grpc.watch_job(v1::WatchJobRequest { id: id.clone(), after: 0 }).await.unwrap().into_inner();
-    // One of more rows than a page, one that would not fit behind it, and many small ones.
+    // One event with more rows than a page, one that does not fit on its page, and many small ones.
     let sizes: Vec<u64> = [600, 9_000, 999, 1000, 1].into_iter().chain(std::iter::repeat_n(70, 40)).collect();
     for (i, &size) in sizes.iter().enumerate() {
         let step = i as u64;
-        report(&server, &worker, (0..size).map(|j| row(&format!("figure-{j}"), step, j as f64)).collect()).await;
+        report(&server, &worker, (0..size).map(|j| row(&format!("metric-{j}"), step, j as f64)).collect()).await;
     }
     finish(&server, &worker).await;
-    let told = {
-        let mut told = Vec::new();
+    let events = {
+        let mut events = Vec::new();
         while let Some(event) = slow.next().await {
-            told.push(event);
+            events.push(event);
         }
-        told
+        events
     };
-    assert_eq!(told.len(), sizes.len() + 3);
+    assert_eq!(events.len(), sizes.len() + 3);
     for (i, &size) in sizes.iter().enumerate() {
-        let rows = told[i + 2].data["metrics"].as_array().unwrap();
+        let rows = events[i + 2].data["metrics"].as_array().unwrap();
         assert_eq!(rows.len() as u64, size);
         assert!(rows.iter().all(|row| row["step"] == i));
     }
-    assert_eq!(all(&server, &id, None).await, told);
+    assert_eq!(all(&server, &id, None).await, events);
     let mut ids = Vec::new();
     while let Some(message) = within(messages.message()).await.unwrap() {
         ids.push(message.id);
     }
-    assert_eq!(ids, told.iter().map(|event| event.id).collect::<Vec<_>>());
+    assert_eq!(ids, events.iter().map(|event| event.id).collect::<Vec<_>>());
 }
 
 #[tokio::test]
-async fn a_silent_stream_shows_that_it_lives() {
+async fn stream_without_events_sends_heartbeats() {
     let (_dir, server, id, _worker) = started().await;
     let mut events = Events::open(&server, &id, Some(2)).await;
     let waiting = async {
         while events.comments < 2 {
-            // Cut off where it waits: the stream itself is not touched by that.
+            // The timeout does not affect the stream.
             let _ = tokio::time::timeout(std::time::Duration::from_millis(20), events.next()).await;
         }
     };
@@ -273,12 +273,12 @@ async fn a_silent_stream_shows_that_it_lives() {
 }
 
 #[tokio::test]
-async fn watches_are_bounded_and_their_places_are_given_back() {
+async fn number_of_watches_is_limited_and_permits_are_returned() {
     let (_dir, server, id, _worker) = started().await;
     let mut grpc = server.jobs().await;
     let request = || v1::WatchJobRequest { id: id.clone(), after: 0 };
     let mut watching = Vec::new();
-    for _ in 1..WATCHERS {
+    for _ in 1..MAX_WATCHERS {
         let mut messages = grpc.watch_job(request()).await.unwrap().into_inner();
         messages.message().await.unwrap().unwrap();
         watching.push(messages);
@@ -302,7 +302,7 @@ async fn watches_are_bounded_and_their_places_are_given_back() {
 }
 
 #[tokio::test]
-async fn draining_ends_every_watch_and_starts_none() {
+async fn draining_ends_watches_and_refuses_new_ones() {
     let (_dir, server, id, worker) = started().await;
     let mut grpc = server.jobs().await;
     let mut messages = grpc.watch_job(v1::WatchJobRequest { id: id.clone(), after: 1 }).await.unwrap().into_inner();
@@ -320,28 +320,28 @@ async fn draining_ends_every_watch_and_starts_none() {
 }
 
 #[tokio::test]
-async fn a_watch_goes_on_where_it_was_after_a_crash() {
+async fn watch_resumes_after_a_crash_of_the_server() {
     let dir = tempfile::tempdir().unwrap();
     let mut server = Server::start(dir.path(), 1).await;
     let id = server.submit(&named("long")).await;
     let worker = server.worker().await;
     report(&server, &worker, vec![row("loss", 20, 0.5)]).await;
     let mut live = Events::open(&server, &id, None).await;
-    let mut told = Vec::new();
-    while told.len() < 3 {
-        told.push(live.next().await.unwrap());
+    let mut events = Vec::new();
+    while events.len() < 3 {
+        events.push(live.next().await.unwrap());
     }
     report(&server, &worker, vec![row("loss", 40, 0.25)]).await;
     server.crash().await;
     drop(live);
 
     let mut server = Server::start(dir.path(), 1).await;
-    let mut live = Events::open(&server, &id, Some(told[2].id)).await;
+    let mut live = Events::open(&server, &id, Some(events[2].id)).await;
     let worker = server.worker().await;
     report(&server, &worker, vec![row("loss", 40, 0.25), row("loss", 60, 0.125)]).await;
     finish(&server, &worker).await;
     while let Some(event) = live.next().await {
-        told.push(event);
+        events.push(event);
     }
     let expected = json!([
         "queued",
@@ -353,33 +353,33 @@ async fn a_watch_goes_on_where_it_was_after_a_crash() {
         [["loss", 60, 0.125]],
         "succeeded"
     ]);
-    assert_eq!(json!(brief(&told)), expected);
-    assert_eq!(all(&server, &id, None).await, told);
+    assert_eq!(json!(brief(&events)), expected);
+    assert_eq!(all(&server, &id, None).await, events);
 }
 
 #[tokio::test]
-async fn a_killed_server_loses_and_doubles_nothing_that_was_told() {
+async fn killed_server_loses_and_duplicates_no_event() {
     let dir = tempfile::tempdir().unwrap();
     let mut server = Process::start(dir.path()).await;
     let id = server.rest.submit(&tiny()).await;
     let mut live = Events::open(&server.rest, &id, None).await;
-    let mut told = Vec::new();
-    while !told.iter().any(|event: &Event| event.name == "metrics") {
-        told.push(live.next().await.unwrap());
+    let mut events = Vec::new();
+    while !events.iter().any(|event: &Event| event.name == "metrics") {
+        events.push(live.next().await.unwrap());
     }
     server.kill();
-    // What was on its way.
+    // Events that the server had sent.
     while let Some(event) = live.next().await {
-        told.push(event);
+        events.push(event);
     }
     let server = Process::start(dir.path()).await;
-    told.extend(all(&server.rest, &id, Some(told.last().unwrap().id)).await);
-    assert_eq!(told.last().unwrap().data["state"], "succeeded");
-    assert!(told.windows(2).all(|pair| pair[0].id < pair[1].id), "{told:?}");
-    // Every figure was told, with its last value told last.
-    let mut figures = BTreeMap::new();
-    for metric in told.iter().filter_map(|event| event.data["metrics"].as_array()).flatten() {
-        figures.insert((metric["name"].to_string(), metric["step"].as_u64().unwrap()), metric["value"].clone());
+    events.extend(all(&server.rest, &id, Some(events.last().unwrap().id)).await);
+    assert_eq!(events.last().unwrap().data["state"], "succeeded");
+    assert!(events.windows(2).all(|pair| pair[0].id < pair[1].id), "{events:?}");
+    // Every metric was sent, and its current value was sent last.
+    let mut sent = BTreeMap::new();
+    for metric in events.iter().filter_map(|event| event.data["metrics"].as_array()).flatten() {
+        sent.insert((metric["name"].to_string(), metric["step"].as_u64().unwrap()), metric["value"].clone());
     }
     let kept = server.rest.get(&format!("/v1/jobs/{id}/metrics?page_size=100000")).await;
     let kept: BTreeMap<_, _> = kept["metrics"]
@@ -388,13 +388,13 @@ async fn a_killed_server_loses_and_doubles_nothing_that_was_told() {
         .iter()
         .map(|m| ((m["name"].to_string(), m["step"].as_u64().unwrap()), m["value"].clone()))
         .collect();
-    assert_eq!(figures, kept);
-    // And who comes late is told the same states.
+    assert_eq!(sent, kept);
+    // A new watch returns the same states.
     let states = |events: &[Event]| events.iter().filter(|e| e.name == "state").cloned().collect::<Vec<_>>();
-    assert_eq!(states(&all(&server.rest, &id, None).await), states(&told));
+    assert_eq!(states(&all(&server.rest, &id, None).await), states(&events));
 }
 
-/// A database as it was before events had numbers.
+/// A database of a version in which events had no ids.
 async fn old_database(dir: &Path) -> SqlitePool {
     let migrations = tempfile::tempdir().unwrap();
     for file in ["0001_jobs.sql", "0002_policies.sql"] {
@@ -408,7 +408,7 @@ async fn old_database(dir: &Path) -> SqlitePool {
 }
 
 #[tokio::test]
-async fn jobs_of_an_older_database_have_their_events_in_order() {
+async fn migration_orders_the_events_of_an_older_database() {
     let dir = tempfile::tempdir().unwrap();
     let old = old_database(dir.path()).await;
     let script = "
@@ -431,9 +431,9 @@ async fn jobs_of_an_older_database_have_their_events_in_order() {
         };
         events.into_iter().map(|event| (event.id, of(event.kind))).collect()
     };
-    let told = brief(store.events(1, 0).await.unwrap());
+    let events = brief(store.events(1, 0).await.unwrap());
     let expected = ["queued", "running", "loss@1", "epsilon@2 loss@2", "loss@3", "succeeded"];
-    assert_eq!(told, (1..).zip(expected.map(str::to_owned)).collect::<Vec<_>>());
-    assert_eq!(brief(store.events(1, 4).await.unwrap()), told[4..]);
+    assert_eq!(events, (1..).zip(expected.map(str::to_owned)).collect::<Vec<_>>());
+    assert_eq!(brief(store.events(1, 4).await.unwrap()), events[4..]);
     assert_eq!(brief(store.events(2, 0).await.unwrap()), [(1, JobState::Queued.to_string())]);
 }

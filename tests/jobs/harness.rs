@@ -1,4 +1,4 @@
-//! A server in this process, on free ports, whose workers are the test itself.
+//! A server in this process, on free ports. The test plays its workers.
 
 use std::future::Future;
 use std::net::SocketAddr;
@@ -15,6 +15,7 @@ use qedgix::draining::Draining;
 use qedgix::jobs::{Executor, Launch, Scheduler, SchedulerConfig, WorkerExit};
 use qedgix::server::{self, DataDir, Listeners};
 use qedgix::service::keys::Keyring;
+use qedgix::service::policies::UploadLimit;
 use qedgix::service::{App, Watchers};
 use qedgix::serving::{Engine, EngineConfig, Environments, EnvironmentsConfig, Limits, Sessions};
 use qedgix::store::Store;
@@ -27,11 +28,11 @@ use tokio::task::JoinHandle;
 use tonic::metadata::MetadataValue;
 use tonic::transport::Channel;
 
-/// Longest that anything in these tests may take; only a failure ever waits for it.
-pub const PATIENCE: Duration = Duration::from_secs(30);
+/// Longest time that anything in these tests may take. Only failures wait that long.
+pub const TIMEOUT: Duration = Duration::from_secs(30);
 
-/// Streams of events that a server of these tests allows.
-pub const WATCHERS: usize = 4;
+/// Most watches of a server in these tests.
+pub const MAX_WATCHERS: usize = 4;
 
 /// A worker that the scheduler has started, played by the test.
 pub struct Worker {
@@ -40,12 +41,12 @@ pub struct Worker {
 }
 
 impl Worker {
-    /// The process ends by itself.
+    /// Ends the process.
     pub fn exit(self, how: &str) {
         self.exit.send(WorkerExit(how.into())).expect("the scheduler waits for the exit");
     }
 
-    /// The process lasts until the scheduler kills it.
+    /// Waits until the scheduler kills the process.
     pub async fn killed(self) {
         within(self.launch.kill.cancelled()).await;
         self.exit("killed by signal 9");
@@ -56,14 +57,14 @@ impl Worker {
     }
 }
 
-/// Hands every worker to the test.
+/// Passes every worker to the test.
 struct Manual(mpsc::UnboundedSender<Worker>);
 
 impl Executor for Manual {
     fn start(&self, launch: Launch) -> BoxFuture<'_, std::io::Result<BoxFuture<'static, WorkerExit>>> {
         let (exit, ended) = oneshot::channel();
         self.0.send(Worker { launch, exit }).expect("the test receives workers");
-        async move { Ok(async move { ended.await.unwrap_or(WorkerExit("forgotten".into())) }.boxed()) }.boxed()
+        async move { Ok(async move { ended.await.unwrap_or(WorkerExit("dropped by the test".into())) }.boxed()) }.boxed()
     }
 }
 
@@ -116,7 +117,7 @@ impl Rest {
         self.get(&format!("/v1/jobs/{id}")).await["state"].as_str().unwrap().to_owned()
     }
 
-    /// The job as soon as it is in this state.
+    /// Waits until the job is in this state, and returns it.
     pub async fn reaches(&self, id: &str, state: &str) -> Value {
         within(async {
             loop {
@@ -140,7 +141,7 @@ impl Server {
         Self::start_on(data_dir, cpu_budget, adjust, None).await
     }
 
-    /// With workers of this executor; none: the test plays them.
+    /// With workers of `executor`, or else with workers that the test plays.
     pub async fn start_on(
         data_dir: &Path,
         cpu_budget: usize,
@@ -148,7 +149,7 @@ impl Server {
         executor: Option<Arc<dyn Executor>>,
     ) -> Self {
         let free = SocketAddr::from(([127, 0, 0, 1], 0));
-        let (max_watchers, event_heartbeat) = (WATCHERS, Duration::from_millis(20));
+        let (max_watchers, event_heartbeat) = (MAX_WATCHERS, Duration::from_millis(20));
         let config = Config { grpc_addr: free, http_addr: free, max_watchers, event_heartbeat, ..Config::new(data_dir) };
         let data = DataDir::lock(data_dir).unwrap();
         let listeners = Listeners::bind(&config).await.unwrap();
@@ -168,6 +169,7 @@ impl Server {
             environments: Environments::new(EnvironmentsConfig { limits, memory: 1 << 20 }, clock.clone()),
             engine: Engine::start(EngineConfig { threads: 1, queue: 1, max_batch: 1, max_batch_delay: Duration::ZERO }).unwrap(),
             keys: Keyring::new(None),
+            uploads: UploadLimit::default(),
             watchers: Watchers::new(config.max_watchers, config.event_heartbeat),
             clock,
             draining,
@@ -185,14 +187,14 @@ impl Server {
         }
     }
 
-    /// The end of the server, without any chance to clean up.
+    /// Ends the server without any clean-up.
     pub async fn crash(&mut self) {
         self.running.abort();
-        // Aborted: that is its result.
+        // The result is that it was aborted.
         let _ = (&mut self.running).await;
     }
 
-    /// The next worker that is started.
+    /// The next worker that the scheduler starts.
     pub async fn worker(&mut self) -> Worker {
         within(self.workers.recv()).await.expect("the scheduler lives")
     }
@@ -206,7 +208,7 @@ impl Server {
     }
 }
 
-/// The smallest job.
+/// A job of a second.
 pub fn tiny() -> Value {
     json!({
         "algorithm": "vdn",
@@ -215,12 +217,12 @@ pub fn tiny() -> Value {
     })
 }
 
-/// A job with this name.
+/// The tiny job with this name.
 pub fn named(name: &str) -> Value {
     with(&json!({"name": name}))
 }
 
-/// The smallest job with these fields.
+/// The tiny job with these fields.
 pub fn with(fields: &Value) -> Value {
     let mut job = tiny();
     job.as_object_mut().unwrap().extend(fields.as_object().unwrap().clone());
@@ -246,5 +248,5 @@ pub async fn expect(request: reqwest::RequestBuilder, status: StatusCode) -> Val
 }
 
 pub async fn within<T>(future: impl Future<Output = T>) -> T {
-    tokio::time::timeout(PATIENCE, future).await.expect("it happens in time")
+    tokio::time::timeout(TIMEOUT, future).await.expect("nothing takes longer than the timeout")
 }

@@ -1,4 +1,4 @@
-//! Jobs from outside: submission over both transports, scheduling, the protocol of workers.
+//! Tests of jobs through both transports: submission, scheduling, the protocol of workers, events, and real processes.
 
 mod events;
 mod harness;

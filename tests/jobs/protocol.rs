@@ -1,4 +1,4 @@
-//! `WorkerService` as a worker sees it: tokens, metrics, snapshots, checkpoints.
+//! `WorkerService`: tokens, metrics, snapshots, checkpoints.
 
 use std::collections::HashMap;
 
@@ -23,7 +23,7 @@ async fn started() -> (tempfile::TempDir, Server, String, Worker) {
 }
 
 #[tokio::test]
-async fn a_token_is_good_for_its_own_attempt_only() {
+async fn token_is_valid_for_its_own_attempt_only() {
     let (_dir, mut server, _, worker) = started().await;
     let mut client = server.worker_client().await;
     client.fetch(sign(&worker, v1::FetchRequest {})).await.unwrap();
@@ -37,7 +37,7 @@ async fn a_token_is_good_for_its_own_attempt_only() {
     let foreign = client.fetch(signed(&other.launch, &worker.launch.token, v1::FetchRequest {})).await.unwrap_err();
     assert_eq!(foreign.code(), Code::Unauthenticated);
 
-    // The attempt ends; whatever its worker still sends is refused, and the new attempt's token works.
+    // After the end of the attempt its token is refused; the token of the new attempt is accepted.
     let old = worker.launch.clone();
     worker.exit("exit code 1");
     let new = server.worker().await;
@@ -49,7 +49,7 @@ async fn a_token_is_good_for_its_own_attempt_only() {
 }
 
 #[tokio::test]
-async fn the_token_is_not_in_the_database() {
+async fn token_is_not_stored() {
     let (dir, _server, _, worker) = started().await;
     for file in std::fs::read_dir(dir.path()).unwrap() {
         let bytes = std::fs::read(file.unwrap().path()).unwrap();
@@ -59,7 +59,7 @@ async fn the_token_is_not_in_the_database() {
 }
 
 #[tokio::test]
-async fn metrics_reported_twice_are_there_once() {
+async fn repeated_metrics_are_stored_once() {
     let (_dir, server, id, worker) = started().await;
     let mut client = server.worker_client().await;
     let row = |name: &str, step, value| v1::ReportedMetric { name: name.into(), step, value };
@@ -105,7 +105,7 @@ fn snapshot(step: u64, bytes: &[u8], sha256: String) -> impl futures::Stream<Ite
 }
 
 #[tokio::test]
-async fn a_snapshot_comes_back_as_it_went_and_a_broken_one_changes_nothing() {
+async fn snapshot_is_returned_unchanged_and_a_corrupt_upload_changes_nothing() {
     let (_dir, mut server, _, worker) = started().await;
     let mut client = server.worker_client().await;
     let absent = client.download_snapshot(sign(&worker, v1::DownloadSnapshotRequest {})).await.unwrap_err();
@@ -146,11 +146,11 @@ async fn upload(server: &Server, worker: &Worker, kind: v1::CheckpointKind, step
 }
 
 #[tokio::test]
-async fn the_best_and_the_last_checkpoint_are_kept() {
+async fn best_and_last_checkpoints_are_kept() {
     let (_dir, server, id, worker) = started().await;
     let first = upload(&server, &worker, v1::CheckpointKind::Best, 200, b"first").await;
     let again = upload(&server, &worker, v1::CheckpointKind::Best, 200, b"first").await;
-    assert_eq!(first, again, "the same checkpoint again is the same checkpoint");
+    assert_eq!(first, again, "a repeated upload of a checkpoint changes nothing");
     let better = upload(&server, &worker, v1::CheckpointKind::Best, 300, b"better").await;
     let last = upload(&server, &worker, v1::CheckpointKind::Last, 400, b"last").await;
 

@@ -1,4 +1,4 @@
-//! Who runs when: order, CPU budget, cancel, pause, failures, restarts, draining.
+//! The scheduler: order, CPU budget, cancel, pause, failures, restarts, draining.
 
 use std::time::Duration;
 
@@ -8,21 +8,21 @@ use reqwest::{Method, StatusCode};
 use serde_json::json;
 use tonic::Code;
 
-use super::harness::{PATIENCE, Server, Worker, expect, named, signed, tiny, with, within};
+use super::harness::{Server, TIMEOUT, Worker, expect, named, signed, tiny, with, within};
 
 async fn finish(server: &Server, worker: &Worker, outcome: v1::Outcome) {
-    let request = v1::FinishRequest { outcome: outcome.into(), reason: "told to".into(), permanent: false };
+    let request = v1::FinishRequest { outcome: outcome.into(), reason: "by the test".into(), permanent: false };
     let request = signed(&worker.launch, &worker.launch.token, request);
     server.worker_client().await.finish(request).await.unwrap();
 }
 
-fn impatient(settings: &mut SchedulerConfig) {
+fn without_grace(settings: &mut SchedulerConfig) {
     settings.cancel_grace = Duration::ZERO;
     settings.pause_grace = Duration::ZERO;
 }
 
 #[tokio::test]
-async fn first_in_first_out_within_the_budget() {
+async fn jobs_start_in_order_within_the_cpu_budget() {
     let dir = tempfile::tempdir().unwrap();
     let mut server = Server::start(dir.path(), 2).await;
     let one = server.submit(&named("one")).await;
@@ -37,7 +37,7 @@ async fn first_in_first_out_within_the_budget() {
     server.reaches(&one, "succeeded").await;
     first.exit("exit code 0");
     finish(&server, &second, v1::Outcome::Succeeded).await;
-    // Done, but its process still holds its thread.
+    // The job has succeeded, but its process still occupies a thread.
     server.reaches(&two, "succeeded").await;
     assert_eq!((server.state(&wide).await.as_str(), server.state(&narrow).await.as_str()), ("queued", "queued"));
     assert!(server.workers.try_recv().is_err());
@@ -51,7 +51,7 @@ async fn first_in_first_out_within_the_budget() {
 }
 
 #[tokio::test]
-async fn a_higher_priority_goes_first() {
+async fn higher_priority_starts_first() {
     let dir = tempfile::tempdir().unwrap();
     let mut server = Server::start(dir.path(), 1).await;
     server.submit(&tiny()).await;
@@ -71,7 +71,7 @@ async fn a_higher_priority_goes_first() {
 }
 
 #[tokio::test]
-async fn a_queued_job_is_cancelled_at_once() {
+async fn queued_job_is_cancelled_at_once() {
     let dir = tempfile::tempdir().unwrap();
     let mut server = Server::start(dir.path(), 1).await;
     server.submit(&tiny()).await;
@@ -79,14 +79,14 @@ async fn a_queued_job_is_cancelled_at_once() {
     let waiting = server.submit(&tiny()).await;
     let job = server.post(&format!("/v1/jobs/{waiting}/cancel")).await;
     assert_eq!(job["state"], "cancelled");
-    // Again is no error; resuming is.
+    // A second cancel is accepted; a resume is refused.
     server.post(&format!("/v1/jobs/{waiting}/cancel")).await;
     let resume = server.request(Method::POST, &format!("/v1/jobs/{waiting}/resume"));
     expect(resume, StatusCode::CONFLICT).await;
 }
 
 #[tokio::test]
-async fn a_running_job_is_told_of_the_cancel_and_obeys() {
+async fn running_job_is_cancelled_by_its_worker() {
     let dir = tempfile::tempdir().unwrap();
     let mut server = Server::start(dir.path(), 1).await;
     let id = server.submit(&tiny()).await;
@@ -103,9 +103,9 @@ async fn a_running_job_is_told_of_the_cancel_and_obeys() {
 }
 
 #[tokio::test]
-async fn a_worker_that_does_not_obey_is_killed() {
+async fn worker_that_ignores_a_cancel_is_killed() {
     let dir = tempfile::tempdir().unwrap();
-    let mut server = Server::start_with(dir.path(), 1, impatient).await;
+    let mut server = Server::start_with(dir.path(), 1, without_grace).await;
     let id = server.submit(&tiny()).await;
     let worker = server.worker().await;
     server.post(&format!("/v1/jobs/{id}/cancel")).await;
@@ -114,7 +114,7 @@ async fn a_worker_that_does_not_obey_is_killed() {
 }
 
 #[tokio::test]
-async fn a_cancel_that_was_acknowledged_beats_a_worker_that_finishes() {
+async fn acknowledged_cancel_wins_over_a_worker_that_succeeds() {
     let dir = tempfile::tempdir().unwrap();
     let mut server = Server::start(dir.path(), 1).await;
     let id = server.submit(&tiny()).await;
@@ -125,7 +125,7 @@ async fn a_cancel_that_was_acknowledged_beats_a_worker_that_finishes() {
 }
 
 #[tokio::test]
-async fn a_silent_worker_is_killed_and_its_job_tried_again() {
+async fn worker_without_heartbeats_is_killed_and_its_job_retried() {
     let dir = tempfile::tempdir().unwrap();
     let mut server = Server::start_with(dir.path(), 1, |s| s.heartbeat_timeout = Duration::from_millis(50)).await;
     let id = server.submit(&tiny()).await;
@@ -138,42 +138,42 @@ async fn a_silent_worker_is_killed_and_its_job_tried_again() {
 }
 
 #[tokio::test]
-async fn a_worker_that_always_dies_fails_the_job_with_its_reason_and_log() {
+async fn job_fails_after_max_attempts_with_reason_and_log() {
     let dir = tempfile::tempdir().unwrap();
     let mut server = Server::start(dir.path(), 1).await;
     let id = server.submit(&tiny()).await;
     for attempt in 1..=3 {
         let worker = server.worker().await;
         assert_eq!(worker.launch.lease.attempt, attempt);
-        worker.launch.log.push(format!("out of luck, time {attempt}\n").as_bytes());
+        worker.launch.log.push(format!("output of attempt {attempt}\n").as_bytes());
         let live = server.get(&format!("/v1/jobs/{id}/logs")).await;
-        assert_eq!(live["attempts"][attempt as usize - 1]["log"], format!("out of luck, time {attempt}\n"));
+        assert_eq!(live["attempts"][attempt as usize - 1]["log"], format!("output of attempt {attempt}\n"));
         worker.exit("exit code 101");
     }
     let job = server.reaches(&id, "failed").await;
-    assert_eq!(job["reason"], "the worker ended with exit code 101");
+    assert!(job["reason"].as_str().unwrap().ends_with("exit code 101"), "{job}");
     assert_eq!((&job["attempts"], &job["failures"]), (&json!(3), &json!(3)));
     let logs = server.get(&format!("/v1/jobs/{id}/logs")).await;
     for (i, attempt) in logs["attempts"].as_array().unwrap().iter().enumerate() {
-        assert_eq!(attempt["log"], format!("out of luck, time {}\n", i + 1));
+        assert_eq!(attempt["log"], format!("output of attempt {}\n", i + 1));
         assert_eq!(attempt["outcome"], "failed");
     }
     assert!(server.workers.try_recv().is_err());
 }
 
 #[tokio::test]
-async fn a_failure_that_a_worker_reports_keeps_its_reason() {
+async fn reported_failure_keeps_its_reason() {
     let dir = tempfile::tempdir().unwrap();
     let mut server = Server::start_with(dir.path(), 1, |s| s.max_attempts = 1).await;
     let id = server.submit(&tiny()).await;
     let worker = server.worker().await;
     finish(&server, &worker, v1::Outcome::Failed).await;
     worker.exit("exit code 1");
-    assert_eq!(server.reaches(&id, "failed").await["reason"], "told to");
+    assert_eq!(server.reaches(&id, "failed").await["reason"], "by the test");
 }
 
 #[tokio::test]
-async fn pause_takes_a_job_off_the_machine_and_resume_brings_it_back() {
+async fn paused_job_stops_and_resumes() {
     let dir = tempfile::tempdir().unwrap();
     let mut server = Server::start(dir.path(), 1).await;
     let id = server.submit(&tiny()).await;
@@ -192,7 +192,7 @@ async fn pause_takes_a_job_off_the_machine_and_resume_brings_it_back() {
 }
 
 #[tokio::test]
-async fn a_restart_queues_what_ran_and_fences_its_worker() {
+async fn restart_queues_running_jobs_and_fences_their_workers() {
     let dir = tempfile::tempdir().unwrap();
     let mut server = Server::start(dir.path(), 1).await;
     let id = server.submit(&tiny()).await;
@@ -214,13 +214,13 @@ async fn a_restart_queues_what_ran_and_fences_its_worker() {
 #[tokio::test]
 async fn draining_pauses_workers_and_queues_their_jobs() {
     let dir = tempfile::tempdir().unwrap();
-    let mut server = Server::start_with(dir.path(), 2, impatient).await;
-    let obedient = server.submit(&named("obedient")).await;
-    let deaf = server.submit(&named("deaf")).await;
+    let mut server = Server::start_with(dir.path(), 2, without_grace).await;
+    let pausing = server.submit(&named("pausing")).await;
+    let ignoring = server.submit(&named("ignoring")).await;
     let (first, second) = (server.worker().await, server.worker().await);
     server.app.draining.begin();
     let scheduler = server.app.scheduler.clone();
-    let drain = tokio::spawn(async move { scheduler.drain(PATIENCE).await });
+    let drain = tokio::spawn(async move { scheduler.drain(TIMEOUT).await });
     within(async {
         while !server.app.draining.begun() {
             tokio::task::yield_now().await;
@@ -234,7 +234,7 @@ async fn draining_pauses_workers_and_queues_their_jobs() {
     first.exit("exit code 0");
     second.killed().await;
     within(drain).await.unwrap();
-    for id in [&obedient, &deaf] {
+    for id in [&pausing, &ignoring] {
         let job = server.get(&format!("/v1/jobs/{id}")).await;
         assert_eq!((&job["state"], &job["failures"]), (&json!("queued"), &json!(0)));
     }

@@ -1,4 +1,4 @@
-//! Submitting, listing, deleting; malformed requests; idempotency; both transports agree.
+//! Submitting, listing and deleting jobs; invalid requests; idempotency; both transports.
 
 use std::time::Duration;
 
@@ -17,7 +17,7 @@ async fn server() -> (tempfile::TempDir, Server) {
 }
 
 #[tokio::test]
-async fn a_job_shows_its_whole_configuration_and_can_be_sent_again_as_it_is_shown() {
+async fn job_shows_its_configuration_which_can_be_submitted_again() {
     let (_dir, server) = server().await;
     let id = server.submit(&with(&json!({"name": "first", "labels": {"who": "me"}, "seed": 7}))).await;
     let job = server.get(&format!("/v1/jobs/{id}")).await;
@@ -37,7 +37,7 @@ async fn a_job_shows_its_whole_configuration_and_can_be_sent_again_as_it_is_show
 }
 
 #[tokio::test]
-async fn malformed_requests_get_the_error_of_the_table() {
+async fn invalid_requests_return_the_documented_errors() {
     let (_dir, server) = server().await;
     let post =
         |body: &str| server.request(Method::POST, "/v1/jobs").header("content-type", "application/json").body(body.to_owned());
@@ -96,7 +96,7 @@ async fn unknown_ids_are_not_found() {
 }
 
 #[tokio::test]
-async fn an_idempotency_key_means_one_job() {
+async fn idempotency_key_creates_one_job() {
     let (_dir, server) = server().await;
     let submit = |spec: Value| server.request(Method::POST, "/v1/jobs").header("idempotency-key", "k1").json(&spec);
     let first = expect(submit(tiny()), StatusCode::CREATED).await;
@@ -106,7 +106,7 @@ async fn an_idempotency_key_means_one_job() {
     assert_eq!(conflict["code"], "idempotency_conflict");
     assert_eq!(server.get("/v1/jobs").await["jobs"].as_array().unwrap().len(), 1);
 
-    // The same key and body over the other transport, too.
+    // The same key and body on the other transport.
     let mut grpc = server.jobs().await;
     let request = |spec: Value| v1::SubmitJobRequest { spec: to_struct(&spec), idempotency_key: "k1".into() };
     let same = grpc.submit_job(request(tiny())).await.unwrap().into_inner();
@@ -116,7 +116,7 @@ async fn an_idempotency_key_means_one_job() {
 }
 
 #[tokio::test]
-async fn both_transports_agree() {
+async fn both_transports_accept_and_refuse_the_same() {
     let (_dir, server) = server().await;
     let mut grpc = server.jobs().await;
     let job = grpc.submit_job(v1::SubmitJobRequest { spec: to_struct(&named("twin")), ..Default::default() }).await.unwrap();
@@ -211,14 +211,14 @@ async fn lists_are_bounded_in_bytes() {
 }
 
 #[tokio::test]
-async fn only_what_has_ended_can_be_deleted() {
+async fn only_ended_jobs_can_be_deleted() {
     let dir = tempfile::tempdir().unwrap();
     let mut server = Server::start_with(dir.path(), 1, |s| s.cancel_grace = Duration::ZERO).await;
     let id = server.submit(&tiny()).await;
     let path = format!("/v1/jobs/{id}");
     let problem = expect(server.request(Method::DELETE, &path), StatusCode::CONFLICT).await;
     assert_eq!(problem["code"], "wrong_state");
-    // Cancelled while it waits, it would end without a worker.
+    // Waits for the worker, because a queued job would be cancelled without one.
     let worker = server.worker().await;
     server.post(&format!("{path}/cancel")).await;
     worker.killed().await;

@@ -27,7 +27,7 @@ pub struct Server {
     pub app: Arc<App>,
     pub endpoints: Endpoints,
     pub dir: tempfile::TempDir,
-    time: ManualClock,
+    pub time: ManualClock,
     stop: Option<oneshot::Sender<()>>,
     running: JoinHandle<Result<(), server::Error>>,
 }

@@ -22,3 +22,4 @@ mod rest;
 mod security;
 mod server;
 mod soak;
+mod uploads;

@@ -10,6 +10,7 @@ mod metrics;
 mod middleware;
 mod policy;
 mod stream;
+mod upload;
 mod worker;
 
 use std::sync::Arc;

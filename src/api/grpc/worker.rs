@@ -7,8 +7,8 @@ use futures::Stream;
 use tonic::metadata::MetadataMap;
 use tonic::{Request, Response, Status, Streaming};
 
+use super::upload;
 use crate::api::errors::stream_status;
-use crate::invalid::Invalid;
 use crate::service::worker::{self, CheckpointUpload, Credentials, SnapshotUpload, UploadHeader};
 use crate::service::{App, Error};
 use crate::store::{Lease, Metric};
@@ -37,20 +37,16 @@ impl Service {
     }
 }
 
-fn headless() -> Error {
-    Invalid::new("part", "parts in another order", "one header, then data").into()
-}
-
 #[tonic::async_trait]
 impl WorkerService for Service {
     async fn fetch(&self, request: Request<v1::FetchRequest>) -> Answer<v1::FetchResponse> {
         let lease = self.lease(request.metadata()).await?;
-        let work = worker::fetch(&self.0, lease).await?;
+        let task = worker::fetch(&self.0, lease).await?;
         Ok(Response::new(v1::FetchResponse {
-            config: serde_json::to_string(&work.config).map_err(Error::internal)?,
-            threads: work.threads as u32,
-            snapshot_step: work.snapshot.map(|snapshot| snapshot.step),
-            snapshot_every_ms: work.snapshot_every.as_millis() as u64,
+            config: serde_json::to_string(&task.config).map_err(Error::internal)?,
+            threads: task.threads as u32,
+            snapshot_step: task.snapshot.map(|snapshot| snapshot.step),
+            snapshot_every_ms: task.snapshot_every.as_millis() as u64,
         }))
     }
 
@@ -82,17 +78,15 @@ impl WorkerService for Service {
         &self,
         request: Request<Streaming<v1::UploadSnapshotRequest>>,
     ) -> Answer<v1::UploadSnapshotResponse> {
-        use v1::upload_snapshot_request::Part;
         let lease = self.lease(request.metadata()).await?;
-        let mut parts = request.into_inner();
-        let Some(Part::Header(header)) = parts.message().await?.and_then(|m| m.part) else { return Err(headless().into()) };
-        let announced = UploadHeader { size: header.size, sha256: header.sha256 };
-        let mut upload = SnapshotUpload::begin(&self.0, lease, header.step, announced).await?;
-        while let Some(message) = parts.message().await? {
-            let Some(Part::Data(data)) = message.part else { return Err(headless().into()) };
-            upload.push(&self.0, data).await?;
+        let mut messages = request.into_inner();
+        let header = upload::header(&mut messages).await?;
+        let declared = UploadHeader { size: header.size, sha256: header.sha256 };
+        let mut snapshot = SnapshotUpload::begin(&self.0, lease, header.step, declared).await?;
+        while let Some(data) = upload::chunk(&mut messages).await? {
+            snapshot.push(&self.0, data).await?;
         }
-        upload.complete(&self.0).await?;
+        snapshot.complete(&self.0).await?;
         Ok(Response::new(v1::UploadSnapshotResponse {}))
     }
 
@@ -100,17 +94,15 @@ impl WorkerService for Service {
         &self,
         request: Request<Streaming<v1::UploadCheckpointRequest>>,
     ) -> Answer<v1::UploadCheckpointResponse> {
-        use v1::upload_checkpoint_request::Part;
         let lease = self.lease(request.metadata()).await?;
-        let mut parts = request.into_inner();
-        let Some(Part::Header(header)) = parts.message().await?.and_then(|m| m.part) else { return Err(headless().into()) };
+        let mut messages = request.into_inner();
+        let header = upload::header(&mut messages).await?;
         let size = header.size;
-        let mut upload = CheckpointUpload::begin(lease, header.try_into().map_err(Error::from)?, size)?;
-        while let Some(message) = parts.message().await? {
-            let Some(Part::Data(data)) = message.part else { return Err(headless().into()) };
-            upload.push(data).await?;
+        let mut checkpoint = CheckpointUpload::begin(lease, header.try_into().map_err(Error::from)?, size)?;
+        while let Some(data) = upload::chunk(&mut messages).await? {
+            checkpoint.push(data).await?;
         }
-        let id = upload.complete(&self.0).await?;
+        let id = checkpoint.complete(&self.0).await?;
         Ok(Response::new(v1::UploadCheckpointResponse { id: id.to_string() }))
     }
 

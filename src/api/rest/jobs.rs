@@ -17,7 +17,7 @@ use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
 use super::schemas;
 use crate::api::convert::jobs::{AttemptView, CheckpointView, JobRequest, JobView, MetricView, SummaryView, to_csv};
 use crate::invalid::Invalid;
-use crate::service::{App, Error, PageRequest, jobs};
+use crate::service::{App, Error, PageRequest, checkpoints, jobs};
 use crate::store::{Job, JobAction, JobState};
 
 type Shared = State<Arc<App>>;
@@ -327,7 +327,7 @@ async fn logs(State(app): Shared, Path(id): Path<String>) -> Result<axum::Json<A
     )
 )]
 async fn checkpoint(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    let (checkpoint, bytes) = jobs::checkpoint(&app, &id).await?;
+    let (checkpoint, bytes) = checkpoints::get(&app, &id).await?;
     let headers = [
         (header::CONTENT_TYPE, "application/octet-stream".to_owned()),
         (header::ETAG, format!("\"{}\"", checkpoint.sha256)),

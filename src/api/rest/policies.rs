@@ -8,9 +8,8 @@ use axum::response::IntoResponse;
 use axum::{Extension, Json};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
-use tokio::sync::Semaphore;
 use utoipa::{IntoParams, ToSchema};
-use utoipa_axum::router::{OpenApiRouter, UtoipaMethodRouterExt};
+use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::extract::{self, MaxBody, Path, Query};
@@ -27,16 +26,13 @@ type Shared = State<Arc<App>>;
 
 /// Largest checkpoint that is taken, in bytes, unless bodies may be larger anyway.
 const LARGEST: usize = 64 << 20;
-/// Checkpoints that may be on their way in at once: they are held in memory.
-const AT_ONCE: usize = 4;
 
 /// The routes.
 pub(super) fn router() -> OpenApiRouter<Arc<App>> {
-    let room = Extension(Arc::new(Semaphore::new(AT_ONCE)));
     OpenApiRouter::new()
         .routes(routes!(list))
         .routes(routes!(one))
-        .routes(routes!(upload).layer(room))
+        .routes(routes!(upload))
         .routes(routes!(export))
         .routes(routes!(load))
         .routes(routes!(unload))
@@ -193,18 +189,16 @@ async fn upload(
     State(app): Shared,
     Path(name): Path<String>,
     Query(UploadQuery { alias }): Query<UploadQuery>,
-    Extension(room): Extension<Arc<Semaphore>>,
     Extension(MaxBody(limit)): Extension<MaxBody>,
     caller: Option<Extension<Caller>>,
     request: Request,
 ) -> Result<impl IntoResponse, Error> {
     // Before a large body is read in vain.
     policies::check_publishable(&name)?;
-    let busy = |_| Error::busy(format!("{AT_ONCE} checkpoints are on their way in; the next one has to wait"));
     let source = match extract::media_type(request.headers()) {
         Some(kind) if kind == "application/octet-stream" => {
-            let _room = room.try_acquire().map_err(busy)?;
-            policies::CheckpointSource::Bytes(extract::read(request, LARGEST.max(limit)).await?.into())
+            let permit = app.uploads.acquire()?;
+            policies::CheckpointSource::Bytes(extract::read(request, LARGEST.max(limit)).await?.into(), permit)
         }
         Some(kind) if kind == "application/json" => {
             let OfJob { checkpoint_id } = extract::parse(&extract::read(request, limit).await?)?;

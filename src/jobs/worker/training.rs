@@ -143,8 +143,8 @@ fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Re
 /// Mean AoI of a policy on the reference layouts.
 fn reference(checkpoint: &Checkpoint, threads: usize) -> Result<f64, Box<dyn std::error::Error>> {
     let seeds = layout_list(REFERENCE)?.seeds(usize::MAX);
-    let flown = evaluate(&checkpoint.policy(), &checkpoint.config().environment, &seeds, threads)?;
-    Ok(EpisodeMetrics::mean(&flown).mean_aoi)
+    let episodes = evaluate(&checkpoint.policy(), &checkpoint.config().environment, &seeds, threads)?;
+    Ok(EpisodeMetrics::mean(&episodes).mean_aoi)
 }
 
 /// Selects the iterations that become points of a curve, and measures their speed.

@@ -91,8 +91,8 @@ pub async fn delete_alias(app: &App, change: AliasChange) -> Result<(), Error> {
 /// Moves of aliases of the policy `name`, newest first; of one alias if `alias` is set.
 ///
 /// # Errors
-/// [`Error::NotFound`]: there is no such policy. [`Error::Invalid`]: the page size is out of range, or no page returned the
-/// token.
+/// [`Error::NotFound`]: there is no such policy. [`Error::Invalid`]: the page size is out of range, or the token is
+/// invalid.
 pub async fn history(app: &App, name: &str, alias: Option<&str>, page: &PageRequest) -> Result<Page<Promotion>, Error> {
     check_name("policy", name)?;
     if let Some(alias) = alias {

@@ -6,12 +6,14 @@
 mod aliases;
 mod loading;
 mod publish;
+mod upload_limit;
 
 use std::sync::Arc;
 
 pub use aliases::{AliasChange, aliases, delete_alias, history, set_alias};
 pub use loading::{IndexEntry, index, load, load_policy, unload_policy};
 pub use publish::{CheckpointSource, PolicyUpload, check_publishable, publish, upload};
+pub use upload_limit::{UploadLimit, UploadPermit};
 
 use super::paging::json_bytes;
 use super::{App, Error, Page, PageRequest};

@@ -7,26 +7,27 @@ use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
 use super::aliases::{check_alias, unloaded};
+use super::upload_limit::UploadPermit;
 use super::{PolicyStores, serialized};
 use crate::checkpoint::Checkpoint;
 use crate::invalid::Invalid;
 use crate::policy::baselines;
 use crate::policy::{Identity, ObservationKind, Policy};
-use crate::service::{App, Error, jobs};
+use crate::service::{App, Error, checkpoints};
 use crate::serving::{LoadedPolicy, PolicyDetails, PolicyInfo, PolicyKind, PolicyRef, PolicySpec, VersionSelector, check_name};
 use crate::store::{NewPolicyVersion, PolicyVersion, Store};
 
 /// The checkpoint to publish.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub enum CheckpointSource {
-    /// A checkpoint as safetensors.
-    Bytes(Vec<u8>),
+    /// A checkpoint as safetensors, and the permit to hold it in memory.
+    Bytes(Vec<u8>, UploadPermit),
     /// The id of a job's checkpoint.
     Job(String),
 }
 
 /// A request to publish a checkpoint.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub struct PolicyUpload {
     /// Name of the policy; it may be new.
     pub name: String,
@@ -56,7 +57,7 @@ pub fn check_publishable(name: &str) -> Result<(), Invalid> {
 /// # Errors
 /// [`Error::Invalid`] for a name or bytes that cannot be published, [`Error::Internal`] when the database fails.
 pub async fn publish(app: &App, name: &str, bytes: Vec<u8>) -> Result<PolicyRef, Error> {
-    let (reference, _) = store_version(app, name, bytes, None, None).await?;
+    let (reference, _) = store_version(app, name, CheckpointBytes { bytes, _permit: None }, None, None).await?;
     Ok(reference)
 }
 
@@ -72,11 +73,11 @@ pub async fn upload(app: &App, upload: PolicyUpload) -> Result<(PolicyDetails, b
     if let Some(alias) = &alias {
         check_name("alias", alias)?;
     }
-    let bytes = match source {
-        CheckpointSource::Bytes(bytes) => bytes,
-        CheckpointSource::Job(id) => jobs::checkpoint(app, &id).await?.1,
+    let checkpoint = match source {
+        CheckpointSource::Bytes(bytes, permit) => CheckpointBytes { bytes, _permit: Some(permit) },
+        CheckpointSource::Job(id) => CheckpointBytes { bytes: checkpoints::get(app, &id).await?.1, _permit: None },
     };
-    let (reference, new) = store_version(app, &name, bytes, alias, by).await?;
+    let (reference, new) = store_version(app, &name, checkpoint, alias, by).await?;
     let spec = PolicySpec { name, version: VersionSelector::Version(reference.version) };
     Ok((app.registry.describe(&spec)?, new))
 }
@@ -84,12 +85,12 @@ pub async fn upload(app: &App, upload: PolicyUpload) -> Result<(PolicyDetails, b
 async fn store_version(
     app: &App,
     name: &str,
-    bytes: Vec<u8>,
+    checkpoint: CheckpointBytes,
     alias: Option<String>,
     by: Option<String>,
 ) -> Result<(PolicyRef, bool), Error> {
     check_publishable(name)?;
-    let parsed = ParsedCheckpoint::parse(bytes).await?;
+    let parsed = ParsedCheckpoint::parse(checkpoint).await?;
     let mut reference = PolicyRef { name: name.to_owned(), version: 0, digest: parsed.digest };
     let now = app.clock.now();
     serialized(app, async move |PolicyStores { store, registry }| {
@@ -104,7 +105,7 @@ async fn store_version(
         let new = NewPolicyVersion {
             name: &reference.name,
             digest: &reference.digest_hex(),
-            checkpoint: &parsed.bytes,
+            checkpoint: &parsed.source.bytes,
             now,
             alias: alias.as_deref(),
             by: by.as_deref(),
@@ -126,23 +127,30 @@ async fn store_version(
     .await
 }
 
+/// A checkpoint in memory, with the permit of its upload if it was uploaded.
+struct CheckpointBytes {
+    bytes: Vec<u8>,
+    _permit: Option<UploadPermit>,
+}
+
 /// A parsed checkpoint and its policy.
 struct ParsedCheckpoint {
     checkpoint: Checkpoint,
     policy: Arc<dyn Policy>,
-    bytes: Vec<u8>,
+    source: CheckpointBytes,
     digest: [u8; 32],
 }
 
 impl ParsedCheckpoint {
     /// Parses a checkpoint on a thread that does not serve connections.
-    async fn parse(bytes: Vec<u8>) -> Result<Self, Error> {
+    async fn parse(source: CheckpointBytes) -> Result<Self, Error> {
         let parsed = tokio::task::spawn_blocking(move || {
+            let bytes = &source.bytes;
             let size = bytes.len();
             let refused = |e| Invalid::new("checkpoint", format!("{size} bytes"), format!("a checkpoint of Qedgix ({e})"));
-            let checkpoint = Checkpoint::from_bytes(&bytes).map_err(refused)?;
-            let (policy, digest) = (Arc::new(checkpoint.policy()), Sha256::digest(&bytes).into());
-            Ok(Self { checkpoint, policy, bytes, digest })
+            let checkpoint = Checkpoint::from_bytes(bytes).map_err(refused)?;
+            let (policy, digest) = (Arc::new(checkpoint.policy()), Sha256::digest(bytes).into());
+            Ok(Self { checkpoint, policy, source, digest })
         });
         parsed.await.map_err(Error::internal)?
     }
@@ -205,6 +213,6 @@ impl StoredVersion {
     pub(super) async fn load(self) -> Result<LoadedPolicy, Error> {
         let created_at = self.version.created_at;
         let (reference, bytes) = self.checkpoint()?;
-        Ok(ParsedCheckpoint::parse(bytes).await?.into_policy(reference, created_at))
+        Ok(ParsedCheckpoint::parse(CheckpointBytes { bytes, _permit: None }).await?.into_policy(reference, created_at))
     }
 }

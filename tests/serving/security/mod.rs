@@ -2,6 +2,7 @@
 
 mod access;
 mod binary;
+mod clocks;
 mod connections;
 mod keys;
 mod rates;

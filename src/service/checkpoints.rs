@@ -1,0 +1,15 @@
+//! Checkpoints of jobs, by their own ids.
+
+use uuid::Uuid;
+
+use super::{App, Error};
+use crate::store::Checkpoint;
+
+/// The checkpoint `id` with its bytes.
+///
+/// # Errors
+/// [`Error::NotFound`].
+pub async fn get(app: &App, id: &str) -> Result<(Checkpoint, Vec<u8>), Error> {
+    let missing = || Error::not_found("checkpoint", id);
+    app.store.checkpoint(Uuid::try_parse(id).map_err(|_| missing())?).await?.ok_or_else(missing)
+}
