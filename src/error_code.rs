@@ -71,6 +71,8 @@ error_codes! {
     TooLarge = "too_large",
     /// The API key is missing, unknown, revoked or expired.
     Unauthenticated = "unauthenticated",
+    /// The server is not ready: the database does not answer, or no policy is loaded.
+    Unavailable = "unavailable",
     /// The body has a media type that the server does not read.
     UnsupportedMediaType = "unsupported_media_type",
     /// The resource is in a state that does not allow the operation.

@@ -34,7 +34,7 @@ fn statuses(error: &Error) -> (Code, StatusCode) {
         Error::TooLarge { .. } => (Code::ResourceExhausted, StatusCode::PAYLOAD_TOO_LARGE),
         Error::MediaType(_) => (Code::InvalidArgument, StatusCode::UNSUPPORTED_MEDIA_TYPE),
         Error::Deadline(_) => (Code::DeadlineExceeded, StatusCode::GATEWAY_TIMEOUT),
-        Error::Draining => (Code::Unavailable, StatusCode::SERVICE_UNAVAILABLE),
+        Error::Draining | Error::Unavailable(_) => (Code::Unavailable, StatusCode::SERVICE_UNAVAILABLE),
         Error::Unauthenticated(_) => (Code::Unauthenticated, StatusCode::UNAUTHORIZED),
         Error::PermissionDenied(_) => (Code::PermissionDenied, StatusCode::FORBIDDEN),
         Error::Internal(_) => (Code::Internal, StatusCode::INTERNAL_SERVER_ERROR),
@@ -45,7 +45,7 @@ fn statuses(error: &Error) -> (Code, StatusCode) {
 pub fn retry_after_seconds(error: &Error) -> Option<u64> {
     match error {
         Error::Busy { retry_after, .. } => Some(retry_after.as_secs_f64().ceil().max(1.0) as u64),
-        Error::Draining => Some(1),
+        Error::Draining | Error::Unavailable(_) => Some(1),
         _ => None,
     }
 }

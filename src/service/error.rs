@@ -60,6 +60,9 @@ pub enum Error {
     /// The server is shutting down.
     #[error("the server is shutting down; retry later or on another server")]
     Draining,
+    /// The server is not ready: the database does not answer, or no policy is loaded.
+    #[error("{0}")]
+    Unavailable(&'static str),
     /// The API key is missing, unknown, revoked or expired.
     #[error("{0}")]
     Unauthenticated(&'static str),
@@ -84,6 +87,7 @@ impl Error {
             Self::MediaType(_) => ErrorCode::UnsupportedMediaType,
             Self::Deadline(_) => ErrorCode::DeadlineExceeded,
             Self::Draining => ErrorCode::Draining,
+            Self::Unavailable(_) => ErrorCode::Unavailable,
             Self::Unauthenticated(_) => ErrorCode::Unauthenticated,
             Self::PermissionDenied(_) => ErrorCode::PermissionDenied,
             Self::Internal(_) => ErrorCode::Internal,

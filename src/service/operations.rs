@@ -38,24 +38,28 @@ pub async fn server_health_changed(app: &App) {
     }
 }
 
-async fn ping_database(app: &App) -> Result<(), Error> {
+/// Whether the database answers, or why not.
+async fn ping_database(app: &App) -> Result<(), String> {
     match tokio::time::timeout(DATABASE_TIMEOUT, app.store.ping()).await {
-        Ok(result) => Ok(result?),
-        Err(_) => Err(Error::internal("the database does not answer")),
+        Ok(result) => result.map_err(|e| e.to_string()),
+        Err(_) => Err(format!("no answer within {} s", DATABASE_TIMEOUT.as_secs())),
     }
 }
 
 impl App {
-    /// Checks that the server is ready: it is not draining, there is a policy, and the database answers.
+    /// Checks that the server is ready: it is not draining, a policy is loaded, and the database answers.
     ///
     /// # Errors
-    /// [`Error::Draining`], or [`Error::Internal`] for the others.
+    /// [`Error::Draining`], or [`Error::Unavailable`] with what is missing.
     pub async fn ready(&self) -> Result<(), Error> {
         self.admit()?;
         if self.registry.is_empty() {
-            return Err(Error::internal("no policy is loaded"));
+            return Err(Error::Unavailable("no policy is loaded"));
         }
-        ping_database(self).await
+        ping_database(self).await.map_err(|reason| {
+            tracing::warn!(reason, "the database does not answer");
+            Error::Unavailable("the database does not answer")
+        })
     }
 }
 

@@ -51,12 +51,12 @@ pub struct PublishedPolicy {
 }
 
 impl Store {
-    /// Checks that the database answers.
+    /// Checks that the database answers. The query reads the schema, so a damaged file is noticed.
     ///
     /// # Errors
     /// [`Error`] when the database fails.
     pub async fn ping(&self) -> Result<(), Error> {
-        sqlx::query("SELECT 1").execute(&self.read).await?;
+        sqlx::query("SELECT 1 FROM sqlite_schema LIMIT 1").execute(&self.read).await?;
         Ok(())
     }
 

@@ -69,6 +69,34 @@ async fn health_watches_report_draining_and_do_not_delay_it() {
 }
 
 #[tokio::test]
+async fn server_with_a_damaged_database_is_not_ready() {
+    let server = Server::start().await;
+    let ready = async || {
+        let answer = reqwest::get(server.url("/readyz")).await.unwrap();
+        let (status, retry) = (answer.status().as_u16(), answer.headers().contains_key("retry-after"));
+        let problem: serde_json::Value = answer.json().await.unwrap_or_default();
+        (status, retry, problem["code"].as_str().unwrap_or_default().to_owned())
+    };
+    assert_eq!(ready().await.0, 200);
+    let file = server.dir.path().join(qedgix::store::FILE);
+    let mut database = SqliteConnection::connect_with(&SqliteConnectOptions::new().filename(file)).await.unwrap();
+    for statement in [
+        "PRAGMA writable_schema = ON",
+        "UPDATE sqlite_schema SET sql = 'CREATE TABLE damaged (' WHERE name = 'policies'",
+        "PRAGMA schema_version = 1000",
+    ] {
+        sqlx::query(statement).execute(&mut database).await.unwrap();
+    }
+    assert_eq!(ready().await, (503, true, "unavailable".into()));
+    let probe = reqwest::get(server.url("/v2/health/ready")).await.unwrap();
+    assert_eq!(probe.status(), 503);
+    let mut health = HealthClient::new(server.channel().await);
+    let mut states = health.watch(ask("")).await.unwrap().into_inner();
+    while next(&mut states).await != Some(ServingStatus::NotServing) {}
+    assert_eq!(reqwest::get(server.url("/livez")).await.unwrap().status(), 200);
+}
+
+#[tokio::test]
 async fn the_job_service_is_not_serving_while_its_queue_is_unreadable() {
     let server = Server::start().await;
     let mut health = HealthClient::new(server.channel().await);

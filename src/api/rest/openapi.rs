@@ -215,7 +215,7 @@ problems! {
     Unprocessable = 422: "JSON that does not fit the schema; `detail` says where.";
     TooMany = 429 with "retry-after": "Too much at once; try again later.";
     Fault = 500: "A fault of the server.";
-    Draining = 503 with "retry-after": "The server is shutting down.";
+    Draining = 503 with "retry-after": "The server is shutting down or not ready; retry later.";
 }
 
 /// What can be wrong with a JSON body.
