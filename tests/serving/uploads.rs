@@ -17,7 +17,7 @@ async fn permits_are_held_until_checkpoints_are_published() {
         Client::new().post(url).header("content-type", "application/octet-stream").body(body.clone())
     };
     // Publishing waits for its turn, so the uploads are read and not published.
-    let turn = server.app.registry.turn().await;
+    let guard = server.app.registry.lock_changes().await;
     let mut uploads = Vec::new();
     for i in 0..4 {
         uploads.push(tokio::spawn(upload(&format!("policy-{i}")).send()));
@@ -36,7 +36,7 @@ async fn permits_are_held_until_checkpoints_are_published() {
     // A caller that disconnects leaves its checkpoint in memory, and so its permit.
     uploads.pop().unwrap().abort();
     assert_eq!(upload("one-more").send().await.unwrap().status(), StatusCode::TOO_MANY_REQUESTS);
-    drop(turn);
+    drop(guard);
     for answer in uploads {
         assert_eq!(answer.await.unwrap().unwrap().status(), StatusCode::CREATED);
     }
