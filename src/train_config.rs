@@ -4,7 +4,6 @@
 
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use serde_json::{Map, Value};
-use utoipa::ToSchema;
 
 use crate::env::EnvConfig;
 use crate::invalid::{Invalid, expectation, in_range};
@@ -12,7 +11,7 @@ use crate::policy::mixer::MixerKind;
 use crate::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, ObservationKind};
 
 /// The algorithms of the paper, and common baselines.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Algorithm {
     /// GRU agents, monotonic mixing.
@@ -31,7 +30,7 @@ pub enum Algorithm {
 }
 
 /// Presets: named configurations that fields can override (docs/model.md, "Presets").
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Preset {
     /// As in the paper.
@@ -44,7 +43,7 @@ pub enum Preset {
 }
 
 /// The fields of learning. Environment steps are slots, counted over all episodes.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[allow(clippy::struct_excessive_bools, reason = "independent switches of a document")]
 pub struct Training {
@@ -55,7 +54,6 @@ pub struct Training {
     /// Aggregation of `edgeconv`.
     pub aggregation: Aggregation,
     /// Graph layers.
-    #[schema(minimum = 1, maximum = 8)]
     pub layers: usize,
     /// Whether a UAV knows its own position.
     pub self_position: bool,
@@ -64,7 +62,6 @@ pub struct Training {
     /// Without a graph network: number of links over which a UAV observes. 1: its own detections; L + 1: what L graph layers
     /// bring.
     #[serde(default = "one")]
-    #[schema(minimum = 1, maximum = 9)]
     pub hops: usize,
     /// Whether relative positions are divided by the detection range in flat observations, and own positions scaled to [-1, 1].
     #[serde(default)]
@@ -73,57 +70,41 @@ pub struct Training {
     pub mixer: MixerKind,
     /// Factor of the initial weights of the hypernetworks' last layers.
     #[serde(default = "unit")]
-    #[schema(minimum = 0.0, maximum = 10.0)]
     pub hyper_init: f64,
     /// Environment steps to train for.
-    #[schema(minimum = 1, maximum = 1e12)]
     pub steps: u64,
     /// Learning rate of Adam at the start.
-    #[schema(minimum = 1e-12, maximum = 1.0)]
     pub learning_rate: f64,
     /// Share of the learning rate that is left at the end; it falls linearly over `steps`. 1: the rate is constant.
     #[serde(default = "unit")]
-    #[schema(minimum = 0.0, maximum = 1.0)]
     pub learning_rate_decay: f64,
     /// Discount factor.
-    #[schema(minimum = 0.0, maximum = 1.0)]
     pub gamma: f64,
     /// lambda of TD(lambda).
-    #[schema(minimum = 0.0, maximum = 1.0)]
     pub lambda: f64,
     /// Global L2 norm that gradients are clipped to.
-    #[schema(minimum = 1e-9, maximum = 1e9)]
     pub clip: f64,
     /// Final epsilon.
-    #[schema(minimum = 0.0, maximum = 1.0)]
     pub epsilon_end: f64,
     /// Environment steps over which epsilon falls linearly from 1 to `epsilon_end`.
-    #[schema(minimum = 1, maximum = 1e12)]
     pub epsilon_anneal: u64,
     /// Episodes per update.
-    #[schema(minimum = 1, maximum = 4096)]
     pub batch: usize,
     /// Updates per iteration; an iteration collects `envs` episodes.
-    #[schema(minimum = 1, maximum = 1024)]
     pub updates_per_iteration: usize,
     /// Episodes collected per iteration.
-    #[schema(minimum = 1, maximum = 4096)]
     pub envs: usize,
     /// Capacity of replay, in episodes.
-    #[schema(minimum = 1, maximum = 1_000_000)]
     pub buffer: usize,
     /// Episodes between copies of the online networks to the target networks.
-    #[schema(minimum = 1, maximum = 1e9)]
     pub target_every: u64,
     /// Share by which the target networks move to the online networks after each update. 0: they are copied every
     /// `target_every` episodes.
     #[serde(default)]
-    #[schema(minimum = 0.0, maximum = 1.0)]
     pub target_tau: f64,
     /// The weights that are evaluated and published are an exponential moving average over about this many updates. 0 or 1: the
     /// online weights.
     #[serde(default)]
-    #[schema(minimum = 0, maximum = 1e9)]
     pub average: u64,
     /// Whether the reward of a slot is the AoI collected in it instead of minus the AoI of all users. The optimal policies are the
     /// same (potential-based shaping).
@@ -133,10 +114,8 @@ pub struct Training {
     #[serde(default)]
     pub augment: bool,
     /// Environment steps between evaluations.
-    #[schema(minimum = 1, maximum = 1e12)]
     pub eval_every: u64,
     /// Episodes per evaluation.
-    #[schema(minimum = 1, maximum = 4096)]
     pub eval_episodes: usize,
 }
 

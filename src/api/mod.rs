@@ -10,3 +10,10 @@ mod oip;
 pub mod rest;
 
 pub use errors::{Problem, retry_after_seconds};
+
+use crate::service::Error;
+
+/// Runs `work` here, or, if it is `large`, on a thread of its own: threads of connections serve many callers.
+async fn offload<T: Send + 'static>(large: bool, work: impl FnOnce() -> T + Send + 'static) -> Result<T, Error> {
+    if large { tokio::task::spawn_blocking(work).await.map_err(Error::internal) } else { Ok(work()) }
+}

@@ -1,14 +1,12 @@
 //! Configuration of the environment: fields, units, defaults and limits (docs/model.md, "Environment").
 
 use serde::{Deserialize, Serialize};
-use utoipa::ToSchema;
 
 use super::point::Point;
-use super::schema::Weight;
 use crate::invalid::{Invalid, in_range};
 
 /// Rule at the border of the unit square.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Boundary {
     /// Each coordinate is clamped to [0, 1].
@@ -43,44 +41,34 @@ pub enum Layout {
 }
 
 /// Everything that determines an environment except the episode's seed. Lengths are in units of the square's side.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-#[schema(as = Environment, default)]
 pub struct EnvConfig {
     /// M, the number of UAVs.
-    #[schema(minimum = 1, maximum = 4096)]
     pub uavs: usize,
     /// N, the number of users.
-    #[schema(minimum = 1, maximum = 65536)]
     pub users: usize,
     /// K, slots per episode.
-    #[schema(minimum = 1, maximum = 10000)]
     pub slots: usize,
     /// v, distance flown per slot.
-    #[schema(minimum = 0, maximum = 1)]
     pub speed: f64,
     /// t, range within which a user's data is collected.
-    #[schema(minimum = 0, maximum = 2)]
     pub transmission_range: f64,
     /// d, range within which nodes detect each other; at least t.
-    #[schema(minimum = 1e-6, maximum = 2)]
     pub detection_range: f64,
     /// Adds a ninth action that stays in place.
     pub hover: bool,
     /// Rule at the border.
     pub boundary: Boundary,
     /// Factor of the reward -`reward_scale` * mean AoI; absent: 1/K.
-    #[schema(minimum = 1e-9, maximum = 1e9)]
     pub reward_scale: Option<f64>,
     /// UAV positions in slot 0.
     pub start: Start,
     /// User positions in slot 0.
     pub layout: Layout,
     /// Weight of each user in the reward and in the mean AoI, scaled to mean 1. Absent: equal weights.
-    #[schema(value_type = Option<Vec<Weight>>)]
     pub weights: Option<Vec<f64>>,
     /// Distance that a user moves per slot, in a direction that changes slightly in each slot. 0: users do not move.
-    #[schema(minimum = 0, maximum = 1)]
     pub user_speed: f64,
 }
 

@@ -6,7 +6,6 @@ mod config;
 mod episode;
 mod metrics;
 mod point;
-mod schema;
 mod walk;
 
 pub use batch::{BatchEnv, StepError};

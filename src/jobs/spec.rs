@@ -1,86 +1,101 @@
-//! Parses job requests from JSON. Both transports use it, so they accept the same requests.
+//! What a caller may request of a job. Both transports and the command line come here, so that they accept the same.
 
 use std::collections::BTreeMap;
 
-use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 
-use crate::invalid::{Invalid, expectation, in_range};
+use crate::invalid::{Invalid, in_range};
 use crate::store::{JobKind, JobSpec};
-use crate::train_config::{Algorithm, EXACT, Preset, TrainConfig, integral};
+use crate::train_config::{Algorithm, Preset, TrainConfig, integral};
 
-/// The fields of a job request.
-pub const FIELDS: [&str; 10] =
-    ["kind", "algorithm", "preset", "environment", "training", "threads", "priority", "seed", "name", "labels"];
-
-/// A checked job request.
-#[derive(Clone, Debug)]
+/// A job as it is submitted; what is absent has a default.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct JobRequest {
-    /// The specification, with all defaults filled in.
-    pub spec: JobSpec,
-    /// SHA-256 of the request in canonical form, by which idempotency recognises a repeated request.
-    pub digest: [u8; 32],
+    /// What the job does; default: train.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub kind: Option<JobKind>,
+    /// Name of the job and of the policy that it publishes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
+    /// Labels for people.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub labels: Option<BTreeMap<String, String>>,
+    /// CPU cores; default: 1.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub threads: Option<usize>,
+    /// Higher runs first; default: 0.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub priority: Option<i64>,
+    /// Algorithm.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub algorithm: Option<Algorithm>,
+    /// Preset that the configuration starts from.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub preset: Option<Preset>,
+    /// Fields of the environment that replace those of the preset.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub environment: Option<Map<String, Value>>,
+    /// Fields of the training configuration that replace those of the preset.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub training: Option<Map<String, Value>>,
+    /// Seed of every random stream; default: 1.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub seed: Option<u64>,
 }
 
-/// Parses a job request. Numbers with integral values are accepted as integers in any notation, because a protobuf `Struct`
-/// has no integers.
-///
-/// # Errors
-/// [`Invalid`] with the first field that is unknown, has the wrong type, or is out of range.
-pub fn parse(mut document: Value, cpu_budget: usize) -> Result<JobRequest, Invalid> {
-    integral(&mut document);
-    // Canonical, because objects are ordered by key.
-    let digest = Sha256::digest(document.to_string()).into();
-    let Value::Object(mut fields) = document else {
-        return Err(Invalid::schema("job", type_name(&document), "an object"));
-    };
-    if let Some(unknown) = fields.keys().find(|key| !FIELDS.contains(&key.as_str())) {
-        return Err(Invalid::unknown_field(unknown, format!("one of {}", FIELDS.join(", "))));
+impl JobRequest {
+    /// Reads a document. Whole numbers count as integers however they are written, because a `google.protobuf.Struct` has no
+    /// integers.
+    ///
+    /// # Errors
+    /// The first field that is unknown or of the wrong type.
+    pub fn from_json(mut document: Value) -> Result<Self, Invalid> {
+        integral(&mut document);
+        if !document.is_object() {
+            return Err(Invalid::schema("job", document, "an object"));
+        }
+        serde_path_to_error::deserialize(document).map_err(|e| Invalid::from_parser(&e.path().to_string(), e.inner()))
     }
-    let kind = take(&mut fields, "kind", JobKind::Train)?;
-    if kind != JobKind::Train {
-        return Err(Invalid::new("kind", kind, "train, the only kind that this version supports"));
-    }
-    let algorithm = take(&mut fields, "algorithm", Algorithm::default())?;
-    let preset = take(&mut fields, "preset", Preset::default())?;
-    let environment: Map<String, Value> = take(&mut fields, "environment", Map::new())?;
-    let training: Map<String, Value> = take(&mut fields, "training", Map::new())?;
-    let threads: usize = take(&mut fields, "threads", 1)?;
-    let priority: i64 = take(&mut fields, "priority", 0)?;
-    let seed: u64 = take(&mut fields, "seed", 1)?;
-    let name: Option<String> = take(&mut fields, "name", None)?;
-    let labels: BTreeMap<String, String> = take(&mut fields, "labels", BTreeMap::new())?;
-    if !(1..=cpu_budget).contains(&threads) {
-        let expected = format!("a number from 1 to {cpu_budget}, the server's CPU budget");
-        return Err(Invalid::new("threads", threads, expected));
-    }
-    in_range("priority", priority, -100..=100)?;
-    in_range("seed", seed, 0..=EXACT)?;
-    if let Some(name) = &name {
-        check_name("name", name)?;
-    }
-    check_labels(&labels)?;
-    let config = TrainConfig::resolve(algorithm, preset, &environment, &training, seed)?;
-    Ok(JobRequest { spec: JobSpec { kind, name, labels, threads, priority, config }, digest })
-}
 
-/// Takes a field, or its default if it is absent or null.
-fn take<T: DeserializeOwned>(fields: &mut Map<String, Value>, name: &str, default: T) -> Result<T, Invalid> {
-    match fields.remove(name) {
-        None | Some(Value::Null) => Ok(default),
-        Some(value) => T::deserialize(&value).map_err(|e| Invalid::schema(name, &value, expectation(&e))),
+    /// SHA-256 of the request in canonical form, by which the same request is recognised.
+    pub fn digest(&self) -> [u8; 32] {
+        let mut document = serde_json::to_value(self).expect("a request is plain data");
+        integral(&mut document);
+        // Objects are ordered by key, so this is canonical.
+        Sha256::digest(document.to_string()).into()
     }
-}
 
-fn type_name(value: &Value) -> &'static str {
-    match value {
-        Value::Null => "null",
-        Value::Bool(_) => "a boolean",
-        Value::Number(_) => "a number",
-        Value::String(_) => "a string",
-        Value::Array(_) => "an array",
-        Value::Object(_) => "an object",
+    /// The specification with every default filled in.
+    ///
+    /// # Errors
+    /// The first field that is out of range, or the first unknown or mistyped field of `environment` and `training`.
+    pub fn resolve(self, cpu_budget: usize) -> Result<JobSpec, Invalid> {
+        let kind = self.kind.unwrap_or(JobKind::Train);
+        if kind != JobKind::Train {
+            return Err(Invalid::new("kind", kind, "train, the only kind that this version supports"));
+        }
+        let (threads, priority) = (self.threads.unwrap_or(1), self.priority.unwrap_or(0));
+        if !(1..=cpu_budget).contains(&threads) {
+            let expected = format!("a number from 1 to {cpu_budget}, the server's CPU budget");
+            return Err(Invalid::new("threads", threads, expected));
+        }
+        in_range("priority", priority, -100..=100)?;
+        if let Some(name) = &self.name {
+            check_name("name", name)?;
+        }
+        let labels = self.labels.unwrap_or_default();
+        check_labels(&labels)?;
+        let [environment, training] = [self.environment, self.training].map(|section| {
+            let mut fields = section.unwrap_or_default();
+            fields.values_mut().for_each(integral);
+            fields
+        });
+        let (algorithm, preset) = (self.algorithm.unwrap_or_default(), self.preset.unwrap_or_default());
+        let config = TrainConfig::resolve(algorithm, preset, &environment, &training, self.seed.unwrap_or(1))?;
+        Ok(JobSpec { kind, name: self.name, labels, threads, priority, config })
     }
 }
 
@@ -112,13 +127,13 @@ mod tests {
 
     use super::*;
 
-    fn parse_error(document: Value) -> Invalid {
-        parse(document, 2).expect_err("an invalid request")
+    fn resolve(document: Value) -> Result<JobSpec, Invalid> {
+        JobRequest::from_json(document)?.resolve(2)
     }
 
     #[test]
     fn defaults_are_filled_in() {
-        let spec = parse(json!({}), 2).unwrap().spec;
+        let spec = resolve(json!({})).unwrap();
         assert_eq!((spec.kind, spec.threads, spec.priority), (JobKind::Train, 1, 0));
         assert_eq!(spec.config.seed, 1);
         assert_eq!(spec.config.environment.uavs, 3);
@@ -142,32 +157,38 @@ mod tests {
             (json!({"threads": -1}), "threads", true),
             (json!({"priority": 101}), "priority", false),
             (json!({"seed": 1.5}), "seed", true),
-            (json!({"seed": 9_007_199_254_740_992_u64}), "seed", false),
+            (json!({"seed": -1}), "seed", true),
             (json!({"name": ""}), "name", false),
             (json!({"name": "a:b"}), "name", false),
             (json!({"name": "x".repeat(64)}), "name", false),
-            (json!({"labels": {"a": 1}}), "labels", true),
+            (json!({"labels": {"a": 1}}), "labels.a", true),
             (json!({"labels": {"a b": "c"}}), "labels", false),
             (json!({"labels": {"a": "\n"}}), "labels.a", false),
         ];
         for (document, field, schema) in cases {
-            let e = parse_error(document.clone());
+            let e = resolve(document.clone()).expect_err("must be refused");
             assert_eq!((e.field.as_str(), e.is_schema()), (field, schema), "{document}: {e}");
         }
     }
 
     #[test]
-    fn digest_does_not_depend_on_notation() {
-        let digest = |text: &str| parse(serde_json::from_str(text).unwrap(), 2).unwrap().digest;
-        assert_eq!(digest(r#"{"seed": 2, "threads": 1}"#), digest(r#"{"threads":1.0,"seed":2.0}"#));
+    fn the_same_body_has_the_same_digest_however_it_is_written() {
+        let digest = |text: &str| JobRequest::from_json(serde_json::from_str(text).unwrap()).unwrap().digest();
+        assert_eq!(digest(r#"{"seed": 2, "threads": 1}"#), digest(r#"{"threads":1.0,"seed":2.0, "name": null}"#));
         assert_ne!(digest(r#"{"seed": 2}"#), digest(r#"{"seed": 3}"#));
     }
 
     #[test]
-    fn configuration_is_stored_exactly_as_json() {
-        // The digits of these numbers exceed 2^53, so a fast float parser may round twice.
+    fn seeds_are_exact() {
+        let config = resolve(json!({"seed": u64::MAX})).unwrap().config;
+        assert_eq!(serde_json::to_value(config).unwrap()["seed"], u64::MAX);
+    }
+
+    #[test]
+    fn a_configuration_survives_json_to_the_bit() {
+        // Numbers whose shortest decimal form has more than 2^53 units: the ones that hasty parsers round twice.
         let text = r#"{"environment": {"slots": 11, "speed": 0.09232400000000001}, "training": {"gamma": 0.9232400000000001}}"#;
-        let config = parse(serde_json::from_str(text).unwrap(), 2).unwrap().spec.config;
+        let config = resolve(serde_json::from_str(text).unwrap()).unwrap().config;
         assert_eq!(config.training.gamma, 0.923_240_000_000_000_1);
         assert_eq!(config.environment.reward_scale, Some(1.0 / 11.0));
         let again: TrainConfig = serde_json::from_str(&serde_json::to_string(&config).unwrap()).unwrap();

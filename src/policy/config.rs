@@ -1,7 +1,6 @@
 //! Configuration of the agent's architecture (docs/model.md, "Observations" and "Agents").
 
 use serde::{Deserialize, Serialize};
-use utoipa::ToSchema;
 
 /// The graph layer of an agent (docs/model.md, "Agents").
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -18,7 +17,7 @@ pub enum Gnn {
 }
 
 /// How messages are aggregated over neighbours.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Aggregation {
     /// The mean over the neighbours.
@@ -28,9 +27,8 @@ pub enum Aggregation {
 }
 
 /// Form of a node's observation.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-#[schema(as = Observation)]
 pub enum ObservationKind {
     /// One fixed place per entity, width 2M + 3N (docs/model.md, "Flat observation"). Ties a checkpoint to one (M, N).
     Flat,
@@ -39,7 +37,7 @@ pub enum ObservationKind {
 }
 
 /// Distinguishes UAVs with equal observations (docs/model.md, "Identity").
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Identity {
     /// One-hot index, M wide.

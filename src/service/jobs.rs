@@ -1,40 +1,40 @@
 //! The use cases of jobs: submit, get, list, cancel, pause, resume, delete, and read metrics, checkpoints and logs.
 
-use serde_json::Value;
 use uuid::Uuid;
 
 use super::paging::{self, number};
 use super::{App, Error, Page, PageRequest, policies};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
-use crate::jobs::spec;
+use crate::jobs::spec::JobRequest;
 use crate::store::{
     ActionResult, Attempt, Checkpoint, Job, JobAction, JobId, JobState, JobSummary, MetricCursor, MetricRow, NewJob,
     PendingAction, SubmitResult, is_metric_name,
 };
 
-/// Queues a job and returns it, and whether it is new: a repeated idempotency `key` with the same document returns the
-/// existing job. The job is on the disk when this returns.
+/// Puts a job into the queue and returns it and whether it is new: the same `key` with the same request returns the existing job.
+/// A returned job is on the disk.
 ///
 /// # Errors
-/// [`Error::Invalid`] for an invalid document or key, [`Error::Conflict`] when the key came with another document,
+/// [`Error::Invalid`]: a field of the request, or the key. [`Error::Conflict`]: the key was used with another request.
 /// [`Error::Draining`].
-pub async fn submit(app: &App, document: Value, key: Option<String>) -> Result<(Job, bool), Error> {
+pub async fn submit(app: &App, request: JobRequest, key: Option<String>) -> Result<(Job, bool), Error> {
     if let Some(key) = &key {
         let printable = key.bytes().all(|b| (b' '..=b'~').contains(&b));
         if key.is_empty() || key.len() > 255 || !printable {
             return Err(Invalid::new("idempotency_key", format!("{key:?}"), "1 to 255 printable ASCII characters").into());
         }
     }
-    let request = spec::parse(document, app.scheduler.config().cpu_budget)?;
-    if let Some(name) = &request.spec.name {
+    let digest = request.digest();
+    let spec = request.resolve(app.scheduler.config().cpu_budget)?;
+    if let Some(name) = &spec.name {
         // Reported now instead of after training.
         policies::check_publishable(name)?;
     }
     app.admit()?;
     let id = JobId(Uuid::now_v7());
-    let idempotency = key.map(|key| (key, request.digest));
-    let new = NewJob { id, spec: request.spec, now: app.clock.now(), idempotency };
+    let idempotency = key.map(|key| (key, digest));
+    let new = NewJob { id, spec, now: app.clock.now(), idempotency };
     match app.store.submit_job(new).await? {
         SubmitResult::Created(job) => {
             tracing::info!(job = %job.id, algorithm = ?job.spec.config.algorithm, threads = job.spec.threads, "job submitted");

@@ -7,6 +7,8 @@ mod engine;
 mod environments;
 mod error;
 mod fleet;
+pub(crate) mod ids;
+pub(crate) mod nodes;
 mod observation;
 mod recurrent_state;
 mod reference;
@@ -21,6 +23,7 @@ pub use environments::{
 };
 pub use error::Error;
 pub use fleet::Fleet;
+pub use nodes::{Node, NodeDetection};
 pub use observation::{Graph, GraphForm, MAX_DETECTIONS, MAX_NODES, Observation, ReportedDetection, Scene, SceneOrGraph};
 pub use recurrent_state::RecurrentState;
 pub use reference::{PolicyRef, PolicySpec, VersionSelector, check_name};

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use prost_types::value::Kind;
 use qedgix::api::convert::structs::to_struct;
 use qedgix::wire::v1;
 use reqwest::{Method, StatusCode};
@@ -208,6 +209,25 @@ async fn lists_are_bounded_in_bytes() {
     );
     let ids: Vec<String> = first.jobs.into_iter().chain(next.jobs).map(|job| job.id).collect();
     assert_eq!(ids, expected);
+}
+
+#[tokio::test]
+async fn seeds_are_exact_in_rest_and_refused_where_a_struct_rounds_them() {
+    let (_dir, server) = server().await;
+    let id = server.submit(&with(&json!({"seed": u64::MAX}))).await;
+    assert_eq!(server.get(&format!("/v1/jobs/{id}")).await["seed"], u64::MAX);
+    assert_eq!(server.get("/v1/jobs").await["jobs"][0]["seed"], u64::MAX);
+    let mut grpc = server.jobs().await;
+    let job = grpc.get_job(v1::GetJobRequest { id }).await.unwrap().into_inner();
+    let spec = job.spec.unwrap();
+    assert_eq!(spec.fields["seed"], prost_types::Value { kind: Some(Kind::StringValue(u64::MAX.to_string())) });
+
+    let mut spec = to_struct(&tiny()).unwrap();
+    let seed = Kind::NumberValue(9_007_199_254_740_992.0);
+    spec.fields.insert("seed".into(), prost_types::Value { kind: Some(seed) });
+    let status = grpc.submit_job(v1::SubmitJobRequest { spec: Some(spec), ..Default::default() }).await.unwrap_err();
+    assert_eq!(status.code(), Code::InvalidArgument);
+    assert!(status.message().starts_with("spec.seed: "), "{status}");
 }
 
 #[tokio::test]

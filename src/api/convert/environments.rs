@@ -2,35 +2,37 @@
 
 use serde_json::Value;
 
-use super::name;
 use super::response::{duration, timestamp};
 use super::structs::{from_struct, to_struct};
 use crate::env::EpisodeMetrics;
 use crate::invalid::Invalid;
-use crate::policy::Slot;
-use crate::service::{Error, environments::Create};
-use crate::serving::{CopyState, EnvironmentInfo, EnvironmentReset, EnvironmentState, EnvironmentStep, FinishedEpisode, Scene};
+use crate::service::environments::Create;
+use crate::serving::{CopyState, EnvironmentInfo, EnvironmentReset, EnvironmentState, EnvironmentStep, FinishedEpisode, Fleet};
 use crate::wire::v1;
 
-/// What `CreateEnvironment` asks for.
+/// The environment that a message of `CreateEnvironment` describes.
 ///
 /// # Errors
-/// A name that cannot be used, a number that is not finite.
+/// A name that is not valid, or a number that JSON or a `Struct` cannot hold.
 pub fn create(request: v1::CreateEnvironmentRequest) -> Result<Create, Invalid> {
     let v1::CreateEnvironmentRequest { environment, seed, count, auto_reset, environment_id } = request;
     let environment = from_struct("environment", environment.unwrap_or_default())?;
-    create_from(environment_id, environment, seed, count, auto_reset)
+    create_environment(environment_id, environment, seed, count, auto_reset)
 }
 
-/// The same with the configuration as JSON.
+/// The environment to create, for both transports; an empty `id` lets the server choose one.
 ///
 /// # Errors
-/// A name that cannot be used.
-pub fn create_from(id: String, environment: Value, seed: u64, count: Option<u32>, auto_reset: bool) -> Result<Create, Invalid> {
+/// A name that is not valid.
+pub fn create_environment(
+    id: String,
+    environment: Value,
+    seed: u64,
+    count: Option<u32>,
+    auto_reset: bool,
+) -> Result<Create, Invalid> {
     let id = Some(id).filter(|id| !id.is_empty());
-    if let Some(id) = &id {
-        name("environment_id", id)?;
-    }
+    id.as_deref().map_or(Ok(()), |id| Fleet::check_id("environment_id", id))?;
     Ok(Create { id, environment, seed, count: count.unwrap_or(1) as usize, auto_reset })
 }
 
@@ -67,21 +69,15 @@ impl From<EnvironmentInfo> for v1::Environment {
     }
 }
 
-/// The answer of environment `id`. A large one takes a few milliseconds, so it is put together where that blocks nobody.
-///
-/// # Errors
-/// The process is ending.
-pub async fn state(id: String, state: EnvironmentState) -> Result<v1::EnvironmentState, Error> {
-    /// Nodes and detections of what is written down in place.
-    const SMALL: usize = 2048;
-    let size: usize = state.copies.iter().map(|copy| copy.observation.size()).sum();
-    if size <= SMALL {
-        return Ok(write(id, state));
-    }
-    tokio::task::spawn_blocking(move || write(id, state)).await.map_err(Error::internal)
+/// Whether the response with this state takes so long to write that it should not occupy a thread of connections.
+pub fn is_large(state: &EnvironmentState) -> bool {
+    /// Nodes and detections.
+    const LARGE: usize = 2048;
+    state.copies.iter().map(|copy| copy.observation.size()).sum::<usize>() > LARGE
 }
 
-fn write(id: String, state: EnvironmentState) -> v1::EnvironmentState {
+/// The response of environment `id`.
+pub fn environment_state(id: String, state: EnvironmentState) -> v1::EnvironmentState {
     let EnvironmentState { step, episode, slot, copies } = state;
     let copies = copies.into_iter().map(Into::into).collect();
     v1::EnvironmentState { environment_id: id, step, episode, slot: slot as u32, copies }
@@ -91,26 +87,16 @@ impl From<CopyState> for v1::CopyState {
     fn from(copy: CopyState) -> Self {
         let CopyState { observation, seed, reward, finished } = copy;
         let truncated = finished.is_some();
-        Self {
-            graph: observation.graph.as_ref().map(graph),
-            scene: Some(scene(&observation.scene)),
-            reward,
-            truncated,
-            seed,
-            finished: finished.map(Into::into),
-        }
+        let (scene, graph) = (Some((&observation.scene).into()), observation.graph.as_ref().map(Into::into));
+        Self { scene, graph, reward, truncated, seed, finished: finished.map(Into::into) }
     }
 }
 
 impl From<FinishedEpisode> for v1::FinishedEpisode {
     fn from(finished: FinishedEpisode) -> Self {
         let FinishedEpisode { seed, metrics, observation } = finished;
-        Self {
-            seed,
-            metrics: Some(metrics.into()),
-            graph: observation.as_ref().and_then(|last| last.graph.as_ref()).map(graph),
-            scene: observation.as_ref().map(|last| scene(&last.scene)),
-        }
+        let graph = observation.as_ref().and_then(|last| last.graph.as_ref()).map(Into::into);
+        Self { seed, metrics: Some(metrics.into()), scene: observation.as_ref().map(|last| (&last.scene).into()), graph }
     }
 }
 
@@ -119,43 +105,4 @@ impl From<EpisodeMetrics> for v1::EpisodeMetrics {
         let EpisodeMetrics { mean_aoi, peak_aoi, p95_aoi, coverage, fairness } = metrics;
         Self { mean_aoi, peak_aoi, p95_aoi, coverage, fairness }
     }
-}
-
-fn uav_id(i: usize) -> String {
-    format!("uav-{i}")
-}
-
-fn user_id(j: usize) -> String {
-    format!("user-{j}")
-}
-
-fn scene(scene: &Scene) -> v1::Scene {
-    let uavs = scene.uavs.iter().enumerate();
-    let users = scene.users.iter().zip(&scene.aoi).enumerate();
-    v1::Scene {
-        uavs: uavs.map(|(i, &[x, y])| v1::SceneUav { id: uav_id(i), x, y }).collect(),
-        users: users.map(|(j, (&[x, y], &aoi))| v1::SceneUser { id: user_id(j), x, y, aoi: f64::from(aoi) }).collect(),
-    }
-}
-
-fn graph(slot: &Slot) -> v1::Graph {
-    let uavs = slot.uavs();
-    let id = |node: usize| node.checked_sub(uavs).map_or_else(|| uav_id(node), user_id);
-    let aoi = |node: usize| node.checked_sub(uavs).map(|user| f64::from(slot.aoi()[user]));
-    let node = |node: usize| {
-        let detections = slot.detections(node).iter().map(|seen| {
-            let target = seen.target as usize;
-            let [rel_x, rel_y] = seen.rel.map(f64::from);
-            v1::Detection { target_id: id(target), rel_x, rel_y, aoi: aoi(target) }
-        });
-        let position = slot.uav_positions().and_then(|positions| positions.get(node));
-        v1::Node {
-            id: id(node),
-            kind: if node < uavs { v1::NodeKind::Uav } else { v1::NodeKind::User }.into(),
-            detections: detections.collect(),
-            position: position.map(|&[x, y]| v1::Position { x, y }),
-            aoi: aoi(node),
-        }
-    };
-    v1::Graph { nodes: (0..uavs + slot.users()).map(node).collect() }
 }

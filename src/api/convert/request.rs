@@ -1,49 +1,81 @@
-//! Requests of `PolicyService`.
+//! Requests of `PolicyService`; the checks are the same for REST.
 
-use super::name;
+use bytes::Bytes;
+
 use crate::invalid::Invalid;
 use crate::service::act;
-use crate::serving::{Observation, PolicySpec, SessionOptions};
+use crate::serving::{Fleet, Observation, PolicySpec, SessionOptions};
 use crate::wire::v1;
+
+/// A request of one slot but for its observation, not checked yet.
+#[derive(Debug)]
+pub struct ActFields {
+    /// Empty: the policy of the session.
+    pub policy: String,
+    /// The session that keeps the memory.
+    pub session_id: Option<String>,
+    /// The memory, where there is no session.
+    pub recurrent_state: Bytes,
+    /// The step, if the caller sends it.
+    pub step: Option<u64>,
+    /// The run, if the caller names it.
+    pub run_id: Option<String>,
+    /// The seed, if the caller sets it.
+    pub seed: Option<u64>,
+}
+
+impl ActFields {
+    /// The checked request.
+    ///
+    /// # Errors
+    /// A name that is not valid, or no observation.
+    pub fn request(self, observation: Option<Observation>) -> Result<act::Request, Invalid> {
+        let Self { policy, session_id, recurrent_state, step, run_id, seed } = self;
+        let policy = if policy.is_empty() { None } else { Some(policy.parse()?) };
+        check_ids(session_id.as_deref(), run_id.as_deref())?;
+        let memory = session_id.map_or(act::Memory::RecurrentState(recurrent_state), act::Memory::Session);
+        let observation = observation.ok_or_else(|| Invalid::missing("observation", "a graph or a scene"))?;
+        Ok(act::Request { policy, observation, memory, step, run_id, seed })
+    }
+}
+
+fn check_ids(session_id: Option<&str>, run_id: Option<&str>) -> Result<(), Invalid> {
+    session_id.map_or(Ok(()), |id| Fleet::check_id("session_id", id))?;
+    run_id.map_or(Ok(()), |id| Fleet::check_id("run_id", id))
+}
 
 impl TryFrom<v1::ActRequest> for act::Request {
     type Error = Invalid;
 
     fn try_from(request: v1::ActRequest) -> Result<Self, Invalid> {
         use v1::act_request::{Memory, Observation as Sent};
-        let policy = if request.policy.is_empty() { None } else { Some(request.policy.parse()?) };
-        let memory = match request.memory {
-            Some(Memory::SessionId(id)) => {
-                name("session_id", &id)?;
-                act::Memory::Session(id)
-            }
-            Some(Memory::RecurrentState(state)) => act::Memory::RecurrentState(state),
-            None => act::Memory::RecurrentState(bytes::Bytes::new()),
+        let v1::ActRequest { policy, observation, memory, step, run_id, seed, .. } = request;
+        let (session_id, recurrent_state) = match memory {
+            Some(Memory::SessionId(id)) => (Some(id), Bytes::new()),
+            Some(Memory::RecurrentState(state)) => (None, state),
+            None => (None, Bytes::new()),
         };
-        if let Some(run_id) = &request.run_id {
-            name("run_id", run_id)?;
-        }
-        let observation = match request.observation {
-            Some(Sent::Graph(graph)) => Observation::try_from(graph)?,
-            Some(Sent::Scene(scene)) => Observation::try_from(scene)?,
-            None => return Err(Invalid::missing("observation", "a graph or a scene")),
+        let observation = match observation {
+            Some(Sent::Graph(graph)) => Some(graph.try_into()?),
+            Some(Sent::Scene(scene)) => Some(scene.try_into()?),
+            None => None,
         };
-        Ok(Self { policy, observation, memory, step: request.step, run_id: request.run_id, seed: request.seed })
+        ActFields { policy, session_id, recurrent_state, step, run_id, seed }.request(observation)
     }
 }
 
-/// What `OpenSession` asks for.
+/// The policy and the options of a session to open; an empty `session_id` lets the server choose one.
 ///
 /// # Errors
-/// A field that cannot be used.
-pub fn open_session(request: v1::OpenSessionRequest) -> Result<(PolicySpec, SessionOptions), Invalid> {
-    let policy = request.policy.parse()?;
-    let id = Some(request.session_id).filter(|id| !id.is_empty());
-    if let Some(id) = &id {
-        name("session_id", id)?;
-    }
-    if let Some(run_id) = &request.run_id {
-        name("run_id", run_id)?;
-    }
-    Ok((policy, SessionOptions { id, run_id: request.run_id, seed: request.seed }))
+/// A name that is not valid.
+pub fn open_session(
+    policy: &str,
+    session_id: String,
+    run_id: Option<String>,
+    seed: Option<u64>,
+) -> Result<(PolicySpec, SessionOptions), Invalid> {
+    let policy = policy.parse()?;
+    let id = Some(session_id).filter(|id| !id.is_empty());
+    check_ids(id.as_deref(), run_id.as_deref())?;
+    Ok((policy, SessionOptions { id, run_id, seed }))
 }

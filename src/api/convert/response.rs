@@ -1,45 +1,59 @@
-//! Answers of `PolicyService`.
+//! Responses of `PolicyService`.
 
 use std::time::Duration;
 
 use jiff::Timestamp;
 
 use super::structs::to_struct;
+use crate::env::EnvConfig;
 use crate::policy::RequiredInput;
 use crate::service::act;
 use crate::serving::{Decision, PolicyDetails, PolicyKind, PolicyRef, SessionInfo};
 use crate::wire::v1;
 
-/// Degrees between two headings.
-const DEGREES: f64 = 45.0;
-/// Headings of the compass; the ninth action hovers.
-const COMPASS: u8 = 8;
+/// The action of one UAV.
+#[derive(Debug)]
+pub struct Action {
+    /// Id of the UAV.
+    pub uav_id: String,
+    /// Heading index.
+    pub heading: u8,
+    /// Value of each heading; empty where not requested, or where the policy has none.
+    pub q_values: Vec<f32>,
+}
 
 /// The direction of a heading, in degrees counter-clockwise from +x; none when hovering.
 pub fn degrees(heading: u8) -> Option<f64> {
-    (heading < COMPASS).then(|| DEGREES * f64::from(heading))
+    /// Headings of the compass; the ninth hovers.
+    const COMPASS: u8 = EnvConfig::COMPASS as u8;
+    (heading < COMPASS).then(|| 360.0 / f64::from(COMPASS) * f64::from(heading))
 }
 
-/// The answer, with Q-values if `values` were asked for and the policy has them.
-pub fn act_response(answer: act::Response, values: bool) -> v1::ActResponse {
-    let act::Response { policy, uavs, order, decision, recurrent_state } = answer;
-    let Decision { step, headings, q_values, timings } = decision;
-    let actions = policy.policy.actions();
-    let mut ids = uavs;
-    let actions = order
-        .iter()
-        .map(|&uav| {
-            let uav = uav as usize;
-            let heading = headings[uav];
-            let q = q_values.get(uav * actions..(uav + 1) * actions).unwrap_or_default();
-            v1::Action {
-                uav_id: std::mem::take(&mut ids[uav]),
-                heading_index: u32::from(heading),
-                heading_deg: degrees(heading),
-                q_values: if values && q.iter().all(|q| q.is_finite()) { q.to_vec() } else { Vec::new() },
-            }
-        })
-        .collect();
+/// Takes the actions of all UAVs out of `response`, in the order of the request.
+pub fn actions(response: &mut act::Response, q_values: bool) -> impl Iterator<Item = Action> {
+    let width = response.policy.policy.actions();
+    let act::Response { order, uavs, decision: Decision { headings, q_values: values, .. }, .. } = response;
+    order.iter().map(move |&uav| {
+        let uav = uav as usize;
+        let q = values.get(uav * width..(uav + 1) * width).unwrap_or_default();
+        Action {
+            uav_id: std::mem::take(&mut uavs[uav]),
+            heading: headings[uav],
+            q_values: if q_values && q.iter().all(|q| q.is_finite()) { q.to_vec() } else { Vec::new() },
+        }
+    })
+}
+
+/// The response, with Q-values if `q_values` were requested and the policy has them.
+pub fn act_response(mut response: act::Response, q_values: bool) -> v1::ActResponse {
+    let action = |action: Action| v1::Action {
+        heading_index: action.heading.into(),
+        heading_deg: degrees(action.heading),
+        uav_id: action.uav_id,
+        q_values: action.q_values,
+    };
+    let actions = actions(&mut response, q_values).map(action).collect();
+    let act::Response { policy, decision: Decision { step, timings, .. }, recurrent_state, .. } = response;
     v1::ActResponse {
         actions,
         policy: Some((&policy.reference).into()),

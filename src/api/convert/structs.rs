@@ -1,10 +1,12 @@
-//! `google.protobuf.Struct` and JSON. A `Struct` has no integers: every number is a double.
+//! `google.protobuf.Struct` and JSON. A `Struct` has no integers: every number is a double. Integers that a double may not hold
+//! exactly are refused in requests, and sent as strings of digits, as JSON of protobuf writes 64-bit integers.
 
 use prost_types::value::Kind;
 use prost_types::{ListValue, Struct};
 use serde_json::{Map, Number, Value};
 
 use crate::invalid::Invalid;
+use crate::train_config::EXACT;
 
 /// A JSON object as a `Struct`; `None` for anything else.
 pub fn to_struct(value: &Value) -> Option<Struct> {
@@ -16,6 +18,7 @@ fn to_proto(value: &Value) -> prost_types::Value {
     let kind = match value {
         Value::Null => Kind::NullValue(0),
         Value::Bool(b) => Kind::BoolValue(*b),
+        Value::Number(n) if n.as_u64().is_some_and(|n| n > EXACT) => Kind::StringValue(n.to_string()),
         Value::Number(n) => Kind::NumberValue(n.as_f64().unwrap_or(f64::NAN)),
         Value::String(s) => Kind::StringValue(s.clone()),
         Value::Array(values) => Kind::ListValue(ListValue { values: values.iter().map(to_proto).collect() }),
@@ -27,7 +30,7 @@ fn to_proto(value: &Value) -> prost_types::Value {
 /// A `Struct` as a JSON object.
 ///
 /// # Errors
-/// A number that is not finite, which JSON cannot say.
+/// A number that is not finite, or an integer beyond [`EXACT`].
 pub fn from_struct(field: &str, document: Struct) -> Result<Value, Invalid> {
     let fields: Result<Map<_, _>, Invalid> = document
         .fields
@@ -44,6 +47,11 @@ fn from_proto(field: &str, value: prost_types::Value) -> Result<Value, Invalid> 
     Ok(match value.kind {
         None | Some(Kind::NullValue(_)) => Value::Null,
         Some(Kind::BoolValue(b)) => Value::Bool(b),
+        Some(Kind::NumberValue(x)) if x.fract() == 0.0 && x.abs() > EXACT as f64 => {
+            let expected =
+                format!("a number up to {EXACT}, which a google.protobuf.Struct holds exactly; REST accepts larger integers");
+            return Err(Invalid::new(field, x, expected));
+        }
         Some(Kind::NumberValue(x)) => {
             Value::Number(Number::from_f64(x).ok_or_else(|| Invalid::new(field, x, "a finite number"))?)
         }

@@ -4,8 +4,10 @@ use std::sync::Arc;
 
 use tonic::{Request, Response, Status};
 
-use crate::api::convert::environments::{create, state};
+use crate::api::convert::environments::{create, environment_state, is_large};
+use crate::api::offload;
 use crate::service::{App, Error, environments};
+use crate::serving::EnvironmentState;
 use crate::wire::v1;
 use crate::wire::v1::environment_service_server::{EnvironmentService, EnvironmentServiceServer};
 
@@ -18,6 +20,10 @@ struct Service(Arc<App>);
 
 type Answer<T> = Result<Response<T>, Status>;
 
+async fn respond(id: String, state: EnvironmentState) -> Answer<v1::EnvironmentState> {
+    Ok(Response::new(offload(is_large(&state), || environment_state(id, state)).await?))
+}
+
 #[tonic::async_trait]
 impl EnvironmentService for Service {
     async fn create_environment(&self, request: Request<v1::CreateEnvironmentRequest>) -> Answer<v1::Environment> {
@@ -28,15 +34,15 @@ impl EnvironmentService for Service {
     async fn reset(&self, request: Request<v1::ResetRequest>) -> Answer<v1::EnvironmentState> {
         let mut request = request.into_inner();
         let id = std::mem::take(&mut request.environment_id);
-        let reset = environments::reset(&self.0, &id, request.into()).await?;
-        Ok(Response::new(state(id, reset).await?))
+        let state = environments::reset(&self.0, &id, request.into()).await?;
+        respond(id, state).await
     }
 
     async fn step(&self, request: Request<v1::StepRequest>) -> Answer<v1::EnvironmentState> {
         let mut request = request.into_inner();
         let id = std::mem::take(&mut request.environment_id);
-        let flown = environments::step(&self.0, &id, request.into()).await?;
-        Ok(Response::new(state(id, flown).await?))
+        let state = environments::step(&self.0, &id, request.into()).await?;
+        respond(id, state).await
     }
 
     async fn get_environment(&self, request: Request<v1::GetEnvironmentRequest>) -> Answer<v1::Environment> {

@@ -10,6 +10,7 @@ use crate::api::auth::StreamCaller;
 use crate::api::convert::jobs::state_filter;
 use crate::api::convert::structs::from_struct;
 use crate::api::errors::stream_status;
+use crate::jobs::spec::JobRequest;
 use crate::service::{App, Error, PageRequest, events, jobs};
 use crate::store::JobAction;
 use crate::wire::v1;
@@ -40,8 +41,9 @@ impl JobService for Service {
     async fn submit_job(&self, request: Request<v1::SubmitJobRequest>) -> Answer<v1::Job> {
         let v1::SubmitJobRequest { spec, idempotency_key } = request.into_inner();
         let document = from_struct("spec", spec.unwrap_or_default()).map_err(Error::from)?;
+        let job = JobRequest::from_json(document).map_err(Error::from)?;
         let key = given(&idempotency_key).map(str::to_owned);
-        let (job, _) = jobs::submit(&self.0, document, key).await?;
+        let (job, _) = jobs::submit(&self.0, job, key).await?;
         Ok(Response::new(job.into()))
     }
 

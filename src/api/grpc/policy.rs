@@ -11,6 +11,7 @@ use super::{deadline, stream};
 use crate::api::auth::StreamCaller;
 use crate::api::convert::{request::open_session, response::act_response};
 use crate::api::errors::act_error;
+use crate::api::offload;
 use crate::invalid::in_range;
 use crate::service::{App, Error, PageRequest, act, policies, sessions};
 use crate::serving::PolicySpec;
@@ -32,11 +33,7 @@ struct Handlers(Arc<App>);
 /// Answers one slot, however it came.
 async fn answer(app: &App, request: v1::ActRequest, deadline: Option<Instant>) -> Result<v1::ActResponse, Error> {
     let values = request.return_q_values;
-    let request = if nodes(&request) < act::INLINE_NODES {
-        act::Request::try_from(request)?
-    } else {
-        tokio::task::spawn_blocking(|| act::Request::try_from(request)).await.map_err(Error::internal)??
-    };
+    let request = offload(nodes(&request) >= act::INLINE_NODES, || act::Request::try_from(request)).await??;
     Ok(act_response(act::act(app, request, deadline).await?, values))
 }
 
@@ -94,7 +91,8 @@ impl PolicyService for Handlers {
     }
 
     async fn open_session(&self, request: Request<v1::OpenSessionRequest>) -> Result<Response<v1::Session>, Status> {
-        let (policy, how) = open_session(request.into_inner()).map_err(Error::from)?;
+        let v1::OpenSessionRequest { policy, session_id, run_id, seed } = request.into_inner();
+        let (policy, how) = open_session(&policy, session_id, run_id, seed).map_err(Error::from)?;
         Ok(Response::new(sessions::open(&self.0, &policy, how).await?.into()))
     }
 

@@ -1,4 +1,4 @@
-//! `/v1/jobs/{id}/events`: what happens to a job, as server-sent events.
+//! `/v1/jobs/{id}/events`: the events of a job, as server-sent events.
 
 use std::convert::Infallible;
 use std::future::ready;
@@ -9,19 +9,20 @@ use axum::http::{Extensions, HeaderMap, HeaderName, HeaderValue, StatusCode};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use futures::{StreamExt, TryStreamExt};
-use serde::Deserialize;
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::extract::{Path, Query};
+use super::jobs::{JobPath, MetricRow};
 use super::openapi::{BadRequest, Draining, NotFound};
 use crate::api::auth::StreamCaller;
-use crate::api::convert::events::EventView;
 use crate::api::errors::log_internal;
 use crate::invalid::Invalid;
 use crate::service::{App, Error, events};
-use crate::store::JobEvent;
+use crate::store::{JobEvent, JobEventKind, JobState};
 
 /// The route.
 pub(super) fn router() -> OpenApiRouter<Arc<App>> {
@@ -32,61 +33,96 @@ pub(super) fn router() -> OpenApiRouter<Arc<App>> {
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 struct FollowQuery {
-    /// Events behind this one; 0: from the first.
+    /// Only events after this one; 0: from the first event.
     #[serde(default)]
     after: u64,
 }
 
 /// One event of the stream.
 #[derive(ToSchema)]
-#[schema(as = ServerSentEvent)]
-#[expect(dead_code, reason = "written by axum; this is its documentation")]
-struct Sent {
+struct ServerSentEvent {
     #[schema(pattern = "^[0-9]+$")]
     id: String,
-    event: Name,
-    /// JSON: `{state, attempt, reason, at}`, or `{metrics}` with rows as `listJobMetrics` has them.
+    event: EventName,
+    /// JSON: `{state, attempt, reason, at}`, or `{metrics}` with rows as in `listJobMetrics`.
     #[schema(content_media_type = "application/json")]
     data: String,
 }
 
-/// What an event is about.
 #[derive(ToSchema)]
-#[schema(as = EventName, rename_all = "lowercase")]
-#[expect(dead_code, reason = "written by axum; this is its documentation")]
-enum Name {
+#[schema(rename_all = "lowercase")]
+enum EventName {
     State,
     Metrics,
 }
 
-/// What browsers say when they come back.
+/// The data of an event.
+#[derive(Serialize)]
+#[serde(untagged)]
+enum EventData {
+    State {
+        state: JobState,
+        /// The newest attempt at that time; 0: none.
+        attempt: u32,
+        reason: Option<String>,
+        at: Timestamp,
+    },
+    Metrics {
+        metrics: Vec<MetricRow>,
+    },
+}
+
+impl TryFrom<JobEvent> for ServerSentEvent {
+    type Error = Error;
+
+    fn try_from(event: JobEvent) -> Result<Self, Error> {
+        let (name, data) = match event.kind {
+            JobEventKind::State { state, attempt, reason, at } => {
+                (EventName::State, EventData::State { state, attempt, reason, at })
+            }
+            JobEventKind::Metrics(rows) => {
+                (EventName::Metrics, EventData::Metrics { metrics: rows.into_iter().map(Into::into).collect() })
+            }
+        };
+        let data = serde_json::to_string(&data).map_err(Error::internal)?;
+        Ok(Self { id: event.id.to_string(), event: name, data })
+    }
+}
+
+impl From<ServerSentEvent> for Event {
+    fn from(event: ServerSentEvent) -> Self {
+        let name = match event.event {
+            EventName::State => "state",
+            EventName::Metrics => "metrics",
+        };
+        Self::default().id(event.id).event(name).data(event.data)
+    }
+}
+
+/// The header with which browsers resume a stream.
 const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
-/// Proxies are asked not to collect events before they pass them on.
+/// Tells proxies not to buffer events.
 const UNBUFFERED: (HeaderName, HeaderValue) = (HeaderName::from_static("x-accel-buffering"), HeaderValue::from_static("no"));
 
-/// Follow a job behind the last event that the caller has seen
+/// Follow a job: every change of its state and every metric, in order
 ///
-/// The stream ends when the job has, when the server drains, or on a fault; a caller that comes back for more than there will
-/// ever be is told so by 204, which ends its trying.
+/// The stream ends when the job has ended, when the server drains, or on a fault. A caller that has received the last event of an
+/// ended job gets 204, which tells browsers not to reconnect.
 #[utoipa::path(
-    get,
-    path = "/v1/jobs/{id}/events",
-    operation_id = "followJob",
-    tag = "jobs",
+    get, path = "/v1/jobs/{id}/events", operation_id = "followJob", tag = "jobs",
     params(
-        ("id" = Uuid, Path, description = "Id of the job."),
-        FollowQuery,
-        ("last-event-id" = Option<u64>, Header, description = "Instead of `after`: the last event that was seen.", nullable = false)
+        JobPath, FollowQuery,
+        ("last-event-id" = Option<u64>, Header, description = "In place of `after`: the last event received.", nullable = false)
     ),
     responses(
-        (status = 200, description = "Events as they happen.", body = Sent, content_type = "text/event-stream"),
-        (status = 204, description = "The job has ended, and its last event was seen."),
+        (status = 200, description = "Events as they happen.", content((ServerSentEvent = "text/event-stream"))),
+        (status = 204, description = "The job has ended, and the caller has received its last event."),
         BadRequest, NotFound, Draining
     )
 )]
 async fn follow(
     State(app): State<Arc<App>>,
-    Path(id): Path<String>,
+    Path(JobPath { id }): Path<JobPath>,
     Query(query): Query<FollowQuery>,
     headers: HeaderMap,
     extensions: Extensions,
@@ -103,16 +139,12 @@ async fn follow(
     if watch.has_ended() {
         return Ok(StatusCode::NO_CONTENT.into_response());
     }
-    // Why a stream ends before its job is told to who comes back.
+    // A caller that reconnects gets the error that ended its stream as the response.
     let (live, caller) = (app.clone(), StreamCaller::new(&extensions));
-    let shown = move |event| ready(caller.check(&live).and_then(|()| event_of(event)));
-    let events = watch.events().and_then(shown).inspect_err(log_internal);
-    let events = events.map(Result::ok).take_while(|event| ready(event.is_some())).filter_map(ready).map(Ok::<_, Infallible>);
+    let to_event = move |event| ready(caller.check(&live).and_then(|()| ServerSentEvent::try_from(event)));
+    let events = watch.events().and_then(to_event).inspect_err(log_internal);
+    let events = events.map(Result::ok).take_while(|event| ready(event.is_some())).filter_map(ready);
+    let events = events.map(|event| Ok::<_, Infallible>(Event::from(event)));
     let heartbeat = KeepAlive::new().interval(app.watchers.heartbeat());
     Ok(([UNBUFFERED], Sse::new(events).keep_alive(heartbeat)).into_response())
-}
-
-fn event_of(event: JobEvent) -> Result<Event, Error> {
-    let (id, view) = (event.id, EventView::from(event.kind));
-    Event::default().id(id.to_string()).event(view.name()).json_data(&view).map_err(Error::internal)
 }

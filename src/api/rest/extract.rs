@@ -1,4 +1,4 @@
-//! Bodies, paths and queries, with the errors of the one table.
+//! Extractors of bodies, paths and queries whose rejections are errors of the service.
 
 use axum::body::BodyDataStream;
 use axum::extract::{FromRequest, FromRequestParts, Request};
@@ -8,7 +8,8 @@ use bytes::Bytes;
 use futures::StreamExt;
 use serde::de::DeserializeOwned;
 
-use super::strict::Strict;
+use super::json::ObjectOnly;
+use crate::api::offload;
 use crate::invalid::Invalid;
 use crate::service::Error;
 
@@ -16,30 +17,34 @@ use crate::service::Error;
 #[derive(Clone, Copy, Debug)]
 pub struct MaxBody(pub usize);
 
-/// A body that is too large is read on for this many bytes and thrown away, so that a caller that is still sending gets
-/// the answer instead of a broken connection.
+/// This much of a body that is too large is read and discarded, so that a caller that is still sending gets the response instead
+/// of a broken connection.
 const DISCARDED: usize = 64 << 20;
 
 /// A body that is a JSON document of type `T`.
 #[derive(Debug)]
 pub struct Json<T>(pub T);
 
-impl<S: Sync, T: DeserializeOwned> FromRequest<S> for Json<T> {
+/// A larger body is parsed on a thread of its own.
+const LARGE_BODY: usize = 64 << 10;
+
+impl<S: Sync, T: DeserializeOwned + Send + 'static> FromRequest<S> for Json<T> {
     type Rejection = Error;
 
     async fn from_request(request: Request, _: &S) -> Result<Self, Error> {
         match media_type(request.headers()) {
-            // Who does not say what it is means what is expected.
+            // A missing content-type is treated as JSON.
             None => {}
             Some(kind) if kind == "application/json" => {}
             kind => return Err(unsupported(kind, "application/json")),
         }
         let limit = limit(&request);
-        parse(&read(request, limit).await?).map(Self)
+        let body = read(request, limit).await?;
+        offload(body.len() > LARGE_BODY, move || parse(&body).map(Self)).await?
     }
 }
 
-/// A body as it comes, whatever it says it is.
+/// A body as it is sent, of any content type.
 #[derive(Debug)]
 pub struct Raw(pub Bytes);
 
@@ -56,13 +61,13 @@ fn limit(request: &Request) -> usize {
     request.extensions().get().map_or(4 << 20, |&MaxBody(limit)| limit)
 }
 
-/// What a body says it is, in lower case and without parameters.
+/// The content type of a body, in lower case and without parameters.
 pub fn media_type(headers: &HeaderMap) -> Option<String> {
     let kind = headers.get(header::CONTENT_TYPE)?.to_str().unwrap_or("unreadable");
     Some(kind.split(';').next().unwrap_or_default().trim().to_ascii_lowercase())
 }
 
-/// A body is of another kind than `expected`.
+/// The error for a body of another content type than `expected`.
 pub fn unsupported(kind: Option<String>, expected: &str) -> Error {
     Error::MediaType(match kind {
         Some(kind) => Invalid::new("content-type", kind, expected),
@@ -73,7 +78,7 @@ pub fn unsupported(kind: Option<String>, expected: &str) -> Error {
 /// Reads a body of at most `limit` bytes.
 ///
 /// # Errors
-/// It is larger, or breaks off.
+/// [`Error::TooLarge`]; [`Error::Invalid`] where the body is incomplete.
 pub async fn read(request: Request, limit: usize) -> Result<Bytes, Error> {
     let too_large =
         || Error::TooLarge { message: format!("the body is larger than the limit of {limit} bytes"), limit: Some(limit as u64) };
@@ -101,10 +106,10 @@ fn announced_size(headers: &HeaderMap) -> u64 {
 }
 
 async fn discard(mut parts: BodyDataStream) {
-    let mut left = DISCARDED;
+    let mut remaining = DISCARDED;
     while let Some(Ok(part)) = parts.next().await {
-        match left.checked_sub(part.len()) {
-            Some(less) => left = less,
+        match remaining.checked_sub(part.len()) {
+            Some(rest) => remaining = rest,
             None => return,
         }
     }
@@ -116,7 +121,7 @@ async fn discard(mut parts: BodyDataStream) {
 /// [`Error::Invalid`] where the body is not JSON or does not match the schema of `T`.
 pub fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, Error> {
     let mut deserializer = serde_json::Deserializer::from_slice(body);
-    let document = serde_path_to_error::deserialize(Strict(&mut deserializer)).map_err(|e| {
+    let document = serde_path_to_error::deserialize(ObjectOnly(&mut deserializer)).map_err(|e| {
         let path = e.path().to_string();
         let e = e.into_inner();
         if e.is_data() {
@@ -129,7 +134,7 @@ pub fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, Error> {
     Ok(document)
 }
 
-/// The parts of a path.
+/// The parameters of a path.
 #[derive(Debug)]
 pub struct Path<T>(pub T);
 
@@ -157,6 +162,34 @@ impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for Query<T> {
         match read {
             Ok(query) => Ok(Self(query.0)),
             Err(e) => Err(Invalid::new("query", parts.uri.query().unwrap_or(""), e.body_text()).into()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::thread::{self, ThreadId};
+
+    use serde::{Deserialize, Deserializer, de::IgnoredAny};
+
+    use super::*;
+
+    /// The thread that parsed a body.
+    struct ParsedOn(ThreadId);
+
+    impl<'de> Deserialize<'de> for ParsedOn {
+        fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+            IgnoredAny::deserialize(deserializer)?;
+            Ok(Self(thread::current().id()))
+        }
+    }
+
+    #[tokio::test]
+    async fn large_bodies_are_parsed_on_another_thread_than_the_connection_s() {
+        for (bytes, large) in [(LARGE_BODY, false), (LARGE_BODY + 1, true)] {
+            let body = format!("{{{}}}", " ".repeat(bytes - 2));
+            let Json(ParsedOn(thread)) = Json::from_request(Request::new(body.into()), &()).await.unwrap();
+            assert_eq!(thread != thread::current().id(), large, "{bytes}");
         }
     }
 }

@@ -2,10 +2,12 @@
 //! also those of paths and methods; under `/v2` it is what that protocol wants.
 
 mod act;
+mod config_schemas;
 mod environments;
 mod events;
 pub mod extract;
 mod jobs;
+mod json;
 mod middleware;
 mod observation;
 mod openapi;
@@ -13,9 +15,7 @@ mod ops;
 mod policies;
 mod schemas;
 mod sessions;
-mod strict;
 mod v2;
-mod wording;
 
 use std::sync::Arc;
 

@@ -1,50 +1,62 @@
-//! Graphs and scenes as JSON, in both directions: what an environment shows is what `/v1/act` reads.
+//! Graphs and scenes, in both directions: `/v1/act` accepts what an environment returns.
 
 use serde::{Deserialize, Serialize};
+use serde_json::json;
 use utoipa::ToSchema;
+use utoipa::openapi::RefOr;
+use utoipa::openapi::schema::Schema;
 
-use super::schemas;
-use crate::wire::v1;
+use super::config_schemas::schema;
+use super::json::objects_only;
+use crate::api::convert::observation::{nodes, uavs, users};
+use crate::env::Point;
+use crate::invalid::Invalid;
+use crate::policy::Slot;
+use crate::serving::{self, Observation};
 
-/// What each node detects. Edges follow from detections, in both directions: what one side alone reports is mirrored; what both
-/// report has to agree.
+/// What each node detects. Edges follow from detections, in both directions: a detection that one side reports is mirrored; the
+/// reports of both sides have to agree.
 #[derive(Debug, Deserialize, Serialize, ToSchema)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, remote = "Self")]
 pub(super) struct Graph {
     #[schema(min_items = 1, max_items = 20000)]
     nodes: Vec<Node>,
 }
 
 #[derive(Debug, Deserialize, Serialize, ToSchema)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, remote = "Self")]
 struct Node {
-    /// Unique in the graph, the same for the same entity in every slot.
+    /// Unique in the graph, the same for the same node in every slot.
     #[schema(min_length = 1, max_length = 128)]
     id: String,
-    #[schema(value_type = schemas::NodeKind)]
-    kind: Kind,
-    /// What is within this node's detection range. For users it may be left out: it is then derived from the UAVs'.
+    #[schema(schema_with = node_kind)]
+    kind: NodeKind,
+    /// The nodes within this node's detection range. A user's may be left out: they are then derived from the UAVs' detections.
     #[serde(default)]
     detections: Vec<Detection>,
-    /// A UAV's own position, needed by policies that say so.
+    /// A UAV's own position, for policies that need it.
     #[serde(skip_serializing_if = "Option::is_none")]
     position: Option<Position>,
-    /// A user's own AoI, in slots; where left out, it is taken from who detects the user.
+    /// A user's own AoI, in slots; where left out, it is taken from the detections of the user.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0, maximum = 1e6)]
     aoi: Option<f64>,
 }
 
 #[derive(Clone, Copy, Debug, Deserialize, Serialize)]
-enum Kind {
+enum NodeKind {
     #[serde(rename = "NODE_KIND_UAV", alias = "uav")]
     Uav,
     #[serde(rename = "NODE_KIND_USER", alias = "user")]
     User,
 }
 
+fn node_kind() -> RefOr<Schema> {
+    schema(json!({"type": "string", "enum": ["NODE_KIND_UAV", "NODE_KIND_USER", "uav", "user"]}))
+}
+
 #[derive(Debug, Deserialize, Serialize, ToSchema)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, remote = "Self")]
 struct Detection {
     target_id: String,
     /// Target position minus own position, in units of the square's side.
@@ -58,7 +70,7 @@ struct Detection {
 
 /// A position in units of the square's side.
 #[derive(Debug, Deserialize, Serialize, ToSchema)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, remote = "Self")]
 struct Position {
     #[schema(minimum = -1e4, maximum = 1e4)]
     x: f64,
@@ -66,9 +78,9 @@ struct Position {
     y: f64,
 }
 
-/// Everything at absolute positions; the server derives who sees whom.
+/// Everything at absolute positions; the server derives the detections.
 #[derive(Debug, Deserialize, Serialize, ToSchema)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, remote = "Self")]
 pub(super) struct Scene {
     #[schema(min_items = 1, max_items = 20000)]
     uavs: Vec<Uav>,
@@ -78,7 +90,7 @@ pub(super) struct Scene {
 }
 
 #[derive(Debug, Deserialize, Serialize, ToSchema)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, remote = "Self")]
 struct Uav {
     #[schema(min_length = 1, max_length = 128)]
     id: String,
@@ -89,7 +101,7 @@ struct Uav {
 }
 
 #[derive(Debug, Deserialize, Serialize, ToSchema)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, remote = "Self")]
 struct User {
     #[schema(min_length = 1, max_length = 128)]
     id: String,
@@ -102,61 +114,72 @@ struct User {
     aoi: f64,
 }
 
-impl From<Graph> for v1::Graph {
-    fn from(graph: Graph) -> Self {
-        let nodes = graph.nodes.into_iter().map(|node| v1::Node {
+objects_only!(Serialize + Graph, Node, Detection, Position, Scene, Uav, User);
+
+impl Graph {
+    /// Number of nodes.
+    pub(super) fn len(&self) -> usize {
+        self.nodes.len()
+    }
+}
+
+impl TryFrom<Graph> for Observation {
+    type Error = Invalid;
+
+    fn try_from(graph: Graph) -> Result<Self, Invalid> {
+        let node = |node: Node| serving::Node {
             id: node.id,
-            kind: match node.kind {
-                Kind::Uav => v1::NodeKind::Uav.into(),
-                Kind::User => v1::NodeKind::User.into(),
-            },
-            detections: node.detections.into_iter().map(Into::into).collect(),
-            position: node.position.map(|p| v1::Position { x: p.x, y: p.y }),
+            is_uav: matches!(node.kind, NodeKind::Uav),
+            detections: node.detections.into_iter().map(|d| serving::NodeDetection {
+                target_id: d.target_id,
+                rel: [d.rel_x, d.rel_y],
+                aoi: d.aoi,
+            }),
+            position: node.position.map(|p| [p.x, p.y]),
+            aoi: node.aoi,
+        };
+        Self::from_nodes(graph.nodes.into_iter().map(node).collect())
+    }
+}
+
+impl From<&Slot> for Graph {
+    fn from(slot: &Slot) -> Self {
+        let detection = |d: serving::NodeDetection| {
+            let [rel_x, rel_y] = d.rel;
+            Detection { target_id: d.target_id, rel_x, rel_y, aoi: d.aoi }
+        };
+        let nodes = nodes(slot).map(|node| Node {
+            id: node.id,
+            kind: if node.is_uav { NodeKind::Uav } else { NodeKind::User },
+            detections: node.detections.map(detection).collect(),
+            position: node.position.map(|[x, y]| Position { x, y }),
             aoi: node.aoi,
         });
         Self { nodes: nodes.collect() }
     }
 }
 
-impl From<v1::Graph> for Graph {
-    fn from(graph: v1::Graph) -> Self {
-        let nodes = graph.nodes.into_iter().map(|node| Node {
-            kind: if node.kind() == v1::NodeKind::Uav { Kind::Uav } else { Kind::User },
-            id: node.id,
-            detections: node.detections.into_iter().map(Into::into).collect(),
-            position: node.position.map(|p| Position { x: p.x, y: p.y }),
-            aoi: node.aoi,
-        });
-        Self { nodes: nodes.collect() }
+impl Scene {
+    /// Number of UAVs and users.
+    pub(super) fn len(&self) -> usize {
+        self.uavs.len() + self.users.len()
     }
 }
 
-impl From<Detection> for v1::Detection {
-    fn from(d: Detection) -> Self {
-        Self { target_id: d.target_id, rel_x: d.rel_x, rel_y: d.rel_y, aoi: d.aoi }
+impl TryFrom<Scene> for Observation {
+    type Error = Invalid;
+
+    fn try_from(scene: Scene) -> Result<Self, Invalid> {
+        let uavs = scene.uavs.into_iter().map(|u| (u.id, [u.x, u.y]));
+        let users = scene.users.into_iter().map(|u| (u.id, [u.x, u.y], u.aoi));
+        Self::from_scene(uavs, users)
     }
 }
 
-impl From<v1::Detection> for Detection {
-    fn from(d: v1::Detection) -> Self {
-        Self { target_id: d.target_id, rel_x: d.rel_x, rel_y: d.rel_y, aoi: d.aoi }
-    }
-}
-
-impl From<Scene> for v1::Scene {
-    fn from(scene: Scene) -> Self {
-        Self {
-            uavs: scene.uavs.into_iter().map(|u| v1::SceneUav { id: u.id, x: u.x, y: u.y }).collect(),
-            users: scene.users.into_iter().map(|u| v1::SceneUser { id: u.id, x: u.x, y: u.y, aoi: u.aoi }).collect(),
-        }
-    }
-}
-
-impl From<v1::Scene> for Scene {
-    fn from(scene: v1::Scene) -> Self {
-        Self {
-            uavs: scene.uavs.into_iter().map(|u| Uav { id: u.id, x: u.x, y: u.y }).collect(),
-            users: scene.users.into_iter().map(|u| User { id: u.id, x: u.x, y: u.y, aoi: u.aoi }).collect(),
-        }
+impl From<&serving::Scene> for Scene {
+    fn from(scene: &serving::Scene) -> Self {
+        let uav = |(id, [x, y]): (String, Point)| Uav { id, x, y };
+        let user = |(id, [x, y], aoi): (String, Point, f64)| User { id, x, y, aoi };
+        Self { uavs: uavs(scene).map(uav).collect(), users: users(scene).map(user).collect() }
     }
 }

@@ -1,5 +1,5 @@
-//! The OpenAPI document: what handlers do not say about themselves. Paths, parameters and bodies are derived from the handlers
-//! and their types; this file owns what is common to all, and the answers that are problems.
+//! The OpenAPI document. Paths, parameters and bodies are derived from the handlers and their types; this file owns what is common
+//! to all operations, the responses that are problems, and the links between operations.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -19,17 +19,17 @@ use crate::policy::baselines;
 #[openapi(
     info(
         title = "Qedgix",
-        description = "Serves and trains policies that fly fleets of UAVs for fresh data (Age of Information).\n\n\
-            Every error is a problem of RFC 9457 with a stable `code`. Every answer has an `x-request-id`, the caller's own if \
-            the request had one. Unknown fields are errors, in bodies and in queries of `/v1`. The same use cases are served \
-            over gRPC by `qedgix.v1`. `/v2` speaks the Open Inference Protocol, which has a document of its own."
+        description = "Serves and trains policies that steer fleets of UAVs to keep data fresh (Age of Information).\n\n\
+            Every error is a problem of RFC 9457 with a stable `code`. Every response has an `x-request-id`, the one of the \
+            request if it has one. Unknown fields are errors, in bodies and queries of `/v1`. gRPC serves the same use cases as \
+            `qedgix.v1`. `/v2` serves the Open Inference Protocol, which has a document of its own."
     ),
     tags(
-        (name = "act", description = "One slot of one fleet: what is seen in, a heading per UAV out."),
+        (name = "act", description = "One slot of one fleet: an observation in, a heading per UAV out."),
         (name = "sessions", description = "Fleets whose memory the server keeps."),
-        (name = "policies", description = "Who decides: versions, aliases, checkpoints."),
+        (name = "policies", description = "Versions, aliases and checkpoints of policies."),
         (name = "environments", description = "Hosted environments for learners elsewhere."),
-        (name = "jobs", description = "Training, run later by worker processes."),
+        (name = "jobs", description = "Training jobs, run by worker processes."),
         (name = "operations", description = "Probes, metrics, this document."),
     ),
     components(schemas(Problem)),
@@ -45,14 +45,14 @@ pub(super) fn document() -> OpenApi {
     components.add_security_scheme("bearer", SecurityScheme::Http(bearer.build()));
     let key = ApiKeyValue::with_description("x-api-key", "The same API key, in a header of its own.");
     components.add_security_scheme("api_key", SecurityScheme::ApiKey(ApiKey::Header(key)));
-    // A server without keys asks nobody who they are.
+    // A server without API keys requires no authentication.
     let none = SecurityRequirement::default();
     let [bearer, key] = ["bearer", "api_key"].map(|scheme| SecurityRequirement::new::<_, [&str; 0], &str>(scheme, []));
     document.security = Some(vec![none, bearer, key]);
     document
 }
 
-/// The document as it is served, and a list of what it describes.
+/// The document as it is served, and the list of its operations.
 #[derive(Clone)]
 pub(super) struct Description {
     /// JSON.
@@ -62,7 +62,7 @@ pub(super) struct Description {
 }
 
 impl Description {
-    /// Of the document of all routes, on a server that gives jobs this many cores.
+    /// The description of all routes, on a server with this CPU budget for jobs.
     pub(super) fn new(document: &OpenApi, cpu_budget: usize) -> Self {
         let document = finished(document, cpu_budget);
         let paths = document["paths"].as_object().into_iter().flatten();
@@ -74,7 +74,7 @@ impl Description {
     }
 }
 
-/// The document with what holds for every operation, and the limits of this server.
+/// The document with the responses and links of every operation, and the limits of this server.
 fn finished(document: &OpenApi, cpu_budget: usize) -> Value {
     let mut document = serde_json::to_value(document).expect("the document is plain data");
     let everywhere = [Unauthorized::responses(), Forbidden::responses(), TooMany::responses(), Fault::responses()];
@@ -103,10 +103,10 @@ fn finished(document: &OpenApi, cpu_budget: usize) -> Value {
     document
 }
 
-/// What an operation's answer is good for: other operations, by their ids.
+/// Operations that take a value of another operation's response as a path parameter.
 struct Link {
     of: (&'static str, &'static str, &'static str),
-    /// What it is called in their paths, and where it is in the answer.
+    /// Name of the parameter, and place of the value in the response.
     parameter: (&'static str, &'static str),
     operations: &'static [&'static str],
 }
@@ -166,7 +166,7 @@ impl Link {
     }
 }
 
-/// The formats int32 and int64 are signed; what is not has its bounds instead.
+/// Formats int32 and int64 are signed; unsigned integers have bounds instead.
 fn integers(schema: &mut Value) {
     match schema {
         Value::Object(fields) => {
@@ -184,7 +184,7 @@ fn integers(schema: &mut Value) {
     }
 }
 
-/// Answers that are problems, each a type to be named among the responses of an operation, and all of them as components.
+/// Responses that are problems: each a type to list among the responses of an operation, and a component of the document.
 macro_rules! problems {
     ($($name:ident = $status:literal $(with $header:literal)? : $text:literal;)+) => {
         $(
@@ -205,20 +205,20 @@ macro_rules! problems {
 }
 
 problems! {
-    BadRequest = 400: "Malformed or inconsistent input; `field` says which, if it is one.";
-    Unauthorized = 401: "The server asks for an API key, and this is none.";
-    Forbidden = 403: "The API key does not allow this.";
-    NotFound = 404: "There is no such thing.";
-    Conflict = 409: "Not in a state for this, or it exists already and differs; `code` says what.";
-    TooLarge = 413: "The body is over the limit.";
-    UnsupportedMediaType = 415: "A body of this content type is not read here.";
-    Unprocessable = 422: "JSON that does not fit the schema; `detail` says where.";
-    TooMany = 429 with "retry-after": "Too much at once; try again later.";
-    Fault = 500: "A fault of the server.";
+    BadRequest = 400: "Malformed or inconsistent input; `field` names the field, if one is to blame.";
+    Unauthorized = 401: "The server requires an API key, and the request has none or an invalid one.";
+    Forbidden = 403: "The API key lacks the required scope.";
+    NotFound = 404: "The resource does not exist.";
+    Conflict = 409: "The state of the resource does not allow the operation, or it exists and differs; `code` tells which.";
+    TooLarge = 413: "The body is larger than the limit.";
+    UnsupportedMediaType = 415: "The content type of the body is not supported.";
+    Unprocessable = 422: "JSON that does not match the schema; `field` names the place.";
+    TooMany = 429 with "retry-after": "A limit is reached; retry later.";
+    Fault = 500: "An internal error of the server.";
     Draining = 503 with "retry-after": "The server is shutting down or not ready; retry later.";
 }
 
-/// What can be wrong with a JSON body.
+/// The problems of a JSON body.
 pub(super) struct BadBody;
 
 impl IntoResponses for BadBody {

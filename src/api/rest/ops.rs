@@ -1,4 +1,4 @@
-//! What operators ask: probes, metrics, where things are, and the description of it all.
+//! Operations: probes, metrics, the index of endpoints, the OpenAPI document and its viewer.
 
 use std::sync::Arc;
 
@@ -38,37 +38,28 @@ struct Index {
     endpoints: Arc<[String]>,
 }
 
-/// What this is and where things are
+/// Name, version and endpoints of the server
 #[utoipa::path(
-    get,
-    path = "/",
-    operation_id = "index",
-    tag = "operations",
+    get, path = "/", operation_id = "index", tag = "operations",
     responses((status = 200, description = "This.", body = Index))
 )]
 async fn index(Extension(description): Extension<Description>) -> Json<Index> {
     Json(Index { name: "qedgix", version: env!("CARGO_PKG_VERSION"), endpoints: description.operations })
 }
 
-/// Whether the process answers
+/// Whether the process is alive
 #[utoipa::path(
-    get,
-    path = "/livez",
-    operation_id = "live",
-    tag = "operations",
-    responses((status = 200, description = "It does.", body = String, content_type = "text/plain"))
+    get, path = "/livez", operation_id = "live", tag = "operations",
+    responses((status = 200, description = "It is.", body = String, content_type = "text/plain"))
 )]
 async fn live() -> &'static str {
     "ok\n"
 }
 
-/// Whether the server can do its work
+/// Whether the server is ready to serve
 #[utoipa::path(
-    get,
-    path = "/readyz",
-    operation_id = "ready",
-    tag = "operations",
-    responses((status = 200, description = "It can.", body = String, content_type = "text/plain"), Fault, Draining)
+    get, path = "/readyz", operation_id = "ready", tag = "operations",
+    responses((status = 200, description = "It is.", body = String, content_type = "text/plain"), Fault, Draining)
 )]
 async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Error> {
     app.ready().await?;
@@ -77,10 +68,7 @@ async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Error> {
 
 /// Metrics for Prometheus
 #[utoipa::path(
-    get,
-    path = "/metrics",
-    operation_id = "metrics",
-    tag = "operations",
+    get, path = "/metrics", operation_id = "metrics", tag = "operations",
     responses((status = 200, description = "Text, version 0.0.4.", body = String, content_type = "text/plain"))
 )]
 async fn metrics(State(app): State<Arc<App>>, Extension(render): Extension<fn() -> String>) -> impl IntoResponse {
@@ -105,17 +93,14 @@ async fn metrics(State(app): State<Arc<App>>, Extension(render): Extension<fn() 
 
 /// This document
 #[utoipa::path(
-    get,
-    path = "/openapi.json",
-    operation_id = "openapi",
-    tag = "operations",
+    get, path = "/openapi.json", operation_id = "openapi", tag = "operations",
     responses((status = 200, description = "OpenAPI 3.1.", body = Object))
 )]
 async fn openapi(Extension(description): Extension<Description>) -> impl IntoResponse {
     ([(header::CONTENT_TYPE, "application/json")], description.document)
 }
 
-/// The page that shows the document. Its parts are files of the viewer, which is built into the program.
+/// The page of the viewer, whose files are built into the program.
 const PAGE: &str = r#"<!doctype html>
 <html lang="en">
 <meta charset="utf-8">
@@ -130,28 +115,22 @@ const PAGE: &str = r#"<!doctype html>
 </html>
 "#;
 
-/// This document, to be browsed
+/// The viewer of this document
 #[utoipa::path(
-    get,
-    path = "/docs",
-    operation_id = "docs",
-    tag = "operations",
+    get, path = "/docs", operation_id = "docs", tag = "operations",
     responses((status = 200, description = "A page.", body = String, content_type = "text/html"))
 )]
 async fn docs() -> Html<&'static str> {
     Html(PAGE)
 }
 
-/// A file of the page
+/// A file of the viewer
 #[utoipa::path(
-    get,
-    path = "/docs/{file}",
-    operation_id = "docsFile",
-    tag = "operations",
+    get, path = "/docs/{file}", operation_id = "docsFile", tag = "operations",
     params(("file" = String, Path, description = "Name of the file.", example = "swagger-ui.css")),
     responses(
-        (status = 200, description = "Its content, of the type that its name says.", content(
-            (String = "text/css"), (String = "text/javascript"), (String = "text/html"), (inline(schemas::Bytes) = "image/png")
+        (status = 200, description = "The file.", content(
+            (String = "text/css"), (String = "text/javascript"), (String = "text/html"), (inline(schemas::Binary) = "image/png")
         )),
         BadRequest, NotFound, Fault
     )

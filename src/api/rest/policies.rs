@@ -1,4 +1,4 @@
-//! `/v1/policies`: which there are, checkpoints in and out, aliases, what is loaded.
+//! `/v1/policies`: policies, uploads and exports of checkpoints, aliases, loading and unloading.
 
 use std::sync::Arc;
 
@@ -8,30 +8,31 @@ use axum::response::IntoResponse;
 use axum::{Extension, Json};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 use utoipa::{IntoParams, ToSchema};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::extract::{self, MaxBody, Path, Query};
+use super::json;
 use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
 use super::schemas;
-use super::wording::Policy;
+use crate::policy::RequiredInput;
 use crate::service::keys::Caller;
 use crate::service::{App, Error, PageRequest, policies};
-use crate::serving::{PolicyDetails, PolicySpec};
+use crate::serving::{self, PolicyDetails};
 use crate::store::Promotion;
-use crate::wire::v1;
 
-type Shared = State<Arc<App>>;
+type AppState = State<Arc<App>>;
 
-/// Largest checkpoint that is taken, in bytes, unless bodies may be larger anyway.
-const LARGEST: usize = 64 << 20;
+/// Largest checkpoint that is accepted, in bytes, unless the limit of bodies is higher.
+const MAX_CHECKPOINT: usize = 64 << 20;
 
 /// The routes.
 pub(super) fn router() -> OpenApiRouter<Arc<App>> {
     OpenApiRouter::new()
         .routes(routes!(list))
-        .routes(routes!(one))
+        .routes(routes!(get))
         .routes(routes!(upload))
         .routes(routes!(export))
         .routes(routes!(load))
@@ -60,173 +61,248 @@ impl From<Paging> for PageRequest {
     }
 }
 
-/// A policy in a path.
-#[derive(IntoParams)]
+#[derive(Deserialize, IntoParams)]
 #[into_params(parameter_in = Path)]
-#[expect(dead_code, reason = "read as text; this is its documentation")]
-struct Spec {
+struct PolicyPath {
     /// NAME (its newest version), NAME@ALIAS or NAME:VERSION.
-    #[param(value_type = schemas::PolicySpec, inline, example = "qedgix")]
+    #[param(schema_with = schemas::policy_spec, example = "qedgix")]
     policy: String,
 }
 
-/// Versions in a path.
-#[derive(IntoParams)]
+#[derive(Deserialize, IntoParams)]
 #[into_params(parameter_in = Path)]
-#[expect(dead_code, reason = "read as text; this is its documentation")]
-struct Versions {
-    /// NAME for all its versions, or NAME:VERSION.
-    #[param(value_type = schemas::Versions, inline, example = "qedgix")]
+struct VersionsPath {
+    /// NAME (all its versions) or NAME:VERSION.
+    #[param(schema_with = schemas::name_or_version, example = "qedgix")]
     policy: String,
 }
 
-/// A policy's name in a path.
-#[derive(IntoParams)]
+#[derive(Deserialize, IntoParams)]
 #[into_params(parameter_in = Path)]
-#[expect(dead_code, reason = "read as text; this is its documentation")]
-struct Name {
+struct NamePath {
     /// NAME of the policy, without a version or alias.
-    #[param(value_type = schemas::Name, inline, example = "qedgix")]
+    #[param(schema_with = schemas::name, example = "qedgix")]
     name: String,
 }
 
-/// An alias in a path.
-#[derive(IntoParams)]
+#[derive(Deserialize, IntoParams)]
 #[into_params(parameter_in = Path)]
-#[expect(dead_code, reason = "read as text; this is its documentation")]
-struct AliasOf {
+struct AliasPath {
     /// NAME of the policy, without a version or alias.
-    #[param(value_type = schemas::Name, inline, example = "qedgix")]
+    #[param(schema_with = schemas::name, example = "qedgix")]
     name: String,
     /// The alias.
-    #[param(value_type = schemas::Name, inline, example = "live")]
+    #[param(schema_with = schemas::name, example = "live")]
     alias: String,
 }
 
+/// Exactly one version of one policy.
 #[derive(Debug, Serialize, ToSchema)]
-#[schema(as = PolicyPage)]
-struct Page {
+pub(super) struct PolicyRef {
+    name: String,
+    #[schema(minimum = 1)]
+    version: u64,
+    /// SHA-256 of the checkpoint.
+    #[schema(pattern = "^[0-9a-f]{64}$")]
+    digest: String,
+}
+
+impl From<&serving::PolicyRef> for PolicyRef {
+    fn from(policy: &serving::PolicyRef) -> Self {
+        Self { name: policy.name.clone(), version: policy.version, digest: policy.digest_hex() }
+    }
+}
+
+#[derive(Debug, Serialize, ToSchema)]
+struct Policy {
+    r#ref: PolicyRef,
+    kind: PolicyKind,
+    description: String,
+    /// The only number of UAVs that it serves; absent: any.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    uavs: Option<u32>,
+    /// The only number of users that it serves; absent: any.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    users: Option<u32>,
+    /// 8, or 9 with hovering.
+    #[schema(minimum = 8, maximum = 9)]
+    headings: usize,
+    needs: Needs,
+    /// In units of the square's side.
+    detection_range: f64,
+    /// Aliases that point to this version.
+    aliases: Vec<String>,
+    /// All versions of the policy.
+    versions: Vec<u64>,
+    /// Whether this version is loaded.
+    loaded: bool,
+    /// The versions that are loaded.
+    loaded_versions: Vec<u64>,
+    /// Resolved training configuration of a checkpoint.
+    #[serde(skip_serializing_if = "Value::is_null")]
+    #[schema(value_type = Object, required = false)]
+    config: Value,
+    /// Metrics of a checkpoint's evaluation.
+    #[serde(skip_serializing_if = "Value::is_null")]
+    #[schema(value_type = Object, required = false)]
+    metrics: Value,
+    created_at: Timestamp,
+}
+
+/// Where a policy comes from.
+#[derive(Debug, Serialize, ToSchema)]
+enum PolicyKind {
+    #[serde(rename = "POLICY_KIND_CHECKPOINT")]
+    Checkpoint,
+    #[serde(rename = "POLICY_KIND_BASELINE")]
+    Baseline,
+}
+
+/// What an observation has to contain: detections; UAVs' own positions, too; a scene.
+#[derive(Debug, Serialize, ToSchema)]
+enum Needs {
+    #[serde(rename = "NEEDS_DETECTIONS")]
+    Detections,
+    #[serde(rename = "NEEDS_OWN_POSITIONS")]
+    OwnPositions,
+    #[serde(rename = "NEEDS_FULL_SCENE")]
+    FullScene,
+}
+
+impl From<PolicyDetails> for Policy {
+    fn from(policy: PolicyDetails) -> Self {
+        let PolicyDetails { info, loaded, aliases, versions } = policy;
+        Self {
+            r#ref: (&info.reference).into(),
+            kind: match info.kind {
+                serving::PolicyKind::Checkpoint => PolicyKind::Checkpoint,
+                serving::PolicyKind::Baseline => PolicyKind::Baseline,
+            },
+            description: info.description.clone(),
+            uavs: info.uavs,
+            users: info.users,
+            headings: info.headings,
+            needs: match info.needs {
+                RequiredInput::Detections => Needs::Detections,
+                RequiredInput::OwnPositions => Needs::OwnPositions,
+                RequiredInput::FullScene => Needs::FullScene,
+            },
+            detection_range: info.detection_range,
+            aliases,
+            loaded,
+            loaded_versions: versions.iter().filter(|(_, loaded)| *loaded).map(|(version, _)| *version).collect(),
+            versions: versions.into_iter().map(|(version, _)| version).collect(),
+            config: info.config.clone(),
+            metrics: info.metrics.clone(),
+            created_at: info.created_at,
+        }
+    }
+}
+
+#[derive(Debug, Serialize, ToSchema)]
+struct PolicyPage {
     policies: Vec<Policy>,
     /// Empty on the last page.
     next_page_token: String,
 }
 
-/// Policies in order of names, each in its newest version
+/// List policies by name, each in its newest version
 #[utoipa::path(
-    get,
-    path = "/v1/policies",
-    operation_id = "listPolicies",
-    tag = "policies",
-    params(Paging),
-    responses((status = 200, description = "A page of them.", body = Page), BadRequest)
+    get, path = "/v1/policies", operation_id = "listPolicies", tag = "policies", params(Paging),
+    responses((status = 200, description = "A page of policies.", body = PolicyPage), BadRequest)
 )]
-async fn list(State(app): Shared, Query(paging): Query<Paging>) -> Result<Json<Page>, Error> {
-    let page = policies::list(&app, &paging.into())?.map(shown);
-    Ok(Json(Page { policies: page.items, next_page_token: page.next_token }))
+async fn list(State(app): AppState, Query(paging): Query<Paging>) -> Result<Json<PolicyPage>, Error> {
+    let page = policies::list(&app, &paging.into())?.map(Into::into);
+    Ok(Json(PolicyPage { policies: page.items, next_page_token: page.next_token }))
 }
 
-/// One policy version
+/// Get a policy version
 #[utoipa::path(
-    get,
-    path = "/v1/policies/{policy}",
-    operation_id = "getPolicy",
-    tag = "policies",
-    params(Spec),
-    responses((status = 200, description = "What is known of it.", body = Policy), BadRequest, NotFound)
+    get, path = "/v1/policies/{policy}", operation_id = "getPolicy", tag = "policies", params(PolicyPath),
+    responses((status = 200, description = "The version.", body = Policy), BadRequest, NotFound)
 )]
-async fn one(State(app): Shared, Path(policy): Path<String>) -> Result<Json<Policy>, Error> {
-    let spec: PolicySpec = policy.parse()?;
-    Ok(Json(shown(policies::get(&app, &spec)?)))
-}
-
-fn shown(described: PolicyDetails) -> Policy {
-    v1::Policy::from(described).into()
+async fn get(State(app): AppState, Path(PolicyPath { policy }): Path<PolicyPath>) -> Result<Json<Policy>, Error> {
+    Ok(Json(policies::get(&app, &policy.parse()?)?.into()))
 }
 
 #[derive(Debug, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 struct UploadQuery {
-    /// An alias that shall mean the version.
-    #[param(value_type = schemas::Name, inline, required = false)]
+    /// An alias to point to the version.
+    #[param(schema_with = schemas::name, required = false)]
     alias: Option<String>,
 }
 
 /// A checkpoint of a training job.
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
-#[schema(as = CheckpointOfJob)]
-struct OfJob {
-    /// Its id, as `GET /v1/jobs/{id}/checkpoints` tells it.
+struct CheckpointOfJob {
+    /// Its id, as `GET /v1/jobs/{id}/checkpoints` returns it.
     checkpoint_id: String,
 }
 
-/// Whose key moves something, for the history.
-fn by(caller: Option<Extension<Caller>>) -> Option<String> {
+/// The API key that moves an alias, for its history.
+fn key_id(caller: Option<Extension<Caller>>) -> Option<String> {
     caller.map(|Extension(caller)| caller.id().to_owned())
 }
 
 /// Publish a checkpoint as the next version of a policy
 ///
-/// Equal bytes under the same name are the version that they already are.
+/// Publishing identical bytes under the same name returns the existing version.
 #[utoipa::path(
-    post,
-    path = "/v1/policies/{name}/versions",
-    operation_id = "uploadPolicy",
-    tag = "policies",
-    params(Name, UploadQuery),
+    post, path = "/v1/policies/{name}/versions", operation_id = "uploadPolicy", tag = "policies", params(NamePath, UploadQuery),
     request_body(
-        description = "A checkpoint as safetensors, or one of a training job.",
-        content((inline(schemas::Bytes) = "application/octet-stream"), (OfJob = "application/json"))
+        description = "A checkpoint as safetensors, or the id of a checkpoint of a training job.",
+        content((inline(schemas::Binary) = "application/octet-stream"), (CheckpointOfJob = "application/json"))
     ),
     responses(
-        (status = 201, description = "A new version.", body = Policy, headers(("location", description = "Where it is."))),
-        (status = 200, description = "A version that was there.", body = Policy, headers(("location", description = "Where it is."))),
+        (status = 201, description = "A new version.", body = Policy, headers(("location", description = "Its path."))),
+        (status = 200, description = "The existing version.", body = Policy, headers(("location", description = "Its path."))),
         BadBody, NotFound, Conflict, Draining
     )
 )]
 async fn upload(
-    State(app): Shared,
-    Path(name): Path<String>,
+    State(app): AppState,
+    Path(NamePath { name }): Path<NamePath>,
     Query(UploadQuery { alias }): Query<UploadQuery>,
     Extension(MaxBody(limit)): Extension<MaxBody>,
     caller: Option<Extension<Caller>>,
     request: Request,
 ) -> Result<impl IntoResponse, Error> {
-    // Before a large body is read in vain.
+    // Checked before a large body is read in vain.
     policies::check_publishable(&name)?;
     let source = match extract::media_type(request.headers()) {
         Some(kind) if kind == "application/octet-stream" => {
             let permit = app.uploads.acquire()?;
-            policies::CheckpointSource::Bytes(extract::read(request, LARGEST.max(limit)).await?.into(), permit)
+            policies::CheckpointSource::Bytes(extract::read(request, MAX_CHECKPOINT.max(limit)).await?.into(), permit)
         }
         Some(kind) if kind == "application/json" => {
-            let OfJob { checkpoint_id } = extract::parse(&extract::read(request, limit).await?)?;
+            let CheckpointOfJob { checkpoint_id } = extract::parse(&extract::read(request, limit).await?)?;
             policies::CheckpointSource::Job(checkpoint_id)
         }
         kind => return Err(extract::unsupported(kind, "application/octet-stream, or application/json with a checkpoint_id")),
     };
-    let (described, new) = policies::upload(&app, policies::PolicyUpload { name, source, alias, by: by(caller) }).await?;
-    let location = [(header::LOCATION, format!("/v1/policies/{}", described.info.reference))];
-    Ok((if new { StatusCode::CREATED } else { StatusCode::OK }, location, Json(shown(described))))
+    let (published, new) = policies::upload(&app, policies::PolicyUpload { name, source, alias, by: key_id(caller) }).await?;
+    let location = [(header::LOCATION, format!("/v1/policies/{}", published.info.reference))];
+    Ok((if new { StatusCode::CREATED } else { StatusCode::OK }, location, Json(Policy::from(published))))
 }
 
-/// The checkpoint of a policy version, as safetensors
+/// Download the checkpoint of a policy version as safetensors
 #[utoipa::path(
-    get,
-    path = "/v1/policies/{policy}/export",
-    operation_id = "exportPolicy",
-    tag = "policies",
-    params(Spec),
+    get, path = "/v1/policies/{policy}/export", operation_id = "exportPolicy", tag = "policies", params(PolicyPath),
     responses(
         (
-            status = 200, description = "The bytes that were published.", body = inline(schemas::Bytes), content_type = "application/octet-stream",
-            headers(("etag", description = "SHA-256 of the bytes."), ("content-disposition", description = "A name for the file."))
+            status = 200, description = "The checkpoint as it was published.",
+            content((inline(schemas::Binary) = "application/octet-stream")),
+            headers(("etag", description = "SHA-256 of the bytes."), ("content-disposition", description = "Name of the file."))
         ),
         BadRequest, NotFound, Conflict
     )
 )]
-async fn export(State(app): Shared, Path(policy): Path<String>) -> Result<impl IntoResponse, Error> {
+async fn export(State(app): AppState, Path(PolicyPath { policy }): Path<PolicyPath>) -> Result<impl IntoResponse, Error> {
     let (reference, bytes) = policies::export(&app, &policy.parse()?).await?;
     let file = format!("{}-{}.safetensors", reference.name, reference.version);
     let headers = [
@@ -239,32 +315,24 @@ async fn export(State(app): Shared, Path(policy): Path<String>) -> Result<impl I
 
 /// Load all versions of a policy, or one
 #[utoipa::path(
-    post,
-    path = "/v1/policies/{policy}/load",
-    operation_id = "loadPolicy",
-    tag = "policies",
-    params(Versions),
-    responses((status = 200, description = "Loaded.", body = Policy), BadRequest, NotFound)
+    post, path = "/v1/policies/{policy}/load", operation_id = "loadPolicy", tag = "policies", params(VersionsPath),
+    responses((status = 200, description = "The loaded version.", body = Policy), BadRequest, NotFound)
 )]
-async fn load(State(app): Shared, Path(policy): Path<String>) -> Result<Json<Policy>, Error> {
+async fn load(State(app): AppState, Path(VersionsPath { policy }): Path<VersionsPath>) -> Result<Json<Policy>, Error> {
     policies::load_policy(&app, &policy).await?;
-    one(State(app), Path(policy)).await
+    Ok(Json(policies::get(&app, &policy.parse()?)?.into()))
 }
 
-/// Unload all versions of a policy, or one; sessions that fly them go on
+/// Unload all versions of a policy, or one; open sessions keep using them
 ///
-/// Whatever else means them is refused with `policy_unloaded` until they are loaded, restarts included.
+/// Other requests for an unloaded version are refused with `policy_unloaded` until it is loaded, also after a restart.
 #[utoipa::path(
-    post,
-    path = "/v1/policies/{policy}/unload",
-    operation_id = "unloadPolicy",
-    tag = "policies",
-    params(Versions),
-    responses((status = 200, description = "Unloaded.", body = Policy), BadRequest, NotFound)
+    post, path = "/v1/policies/{policy}/unload", operation_id = "unloadPolicy", tag = "policies", params(VersionsPath),
+    responses((status = 200, description = "The unloaded version.", body = Policy), BadRequest, NotFound)
 )]
-async fn unload(State(app): Shared, Path(policy): Path<String>) -> Result<Json<Policy>, Error> {
+async fn unload(State(app): AppState, Path(VersionsPath { policy }): Path<VersionsPath>) -> Result<Json<Policy>, Error> {
     policies::unload_policy(&app, &policy).await?;
-    one(State(app), Path(policy)).await
+    Ok(Json(policies::get(&app, &policy.parse()?)?.into()))
 }
 
 #[derive(Debug, Serialize, ToSchema)]
@@ -279,94 +347,83 @@ struct Aliases {
     aliases: Vec<Alias>,
 }
 
-/// Aliases of a policy
+/// List the aliases of a policy
 #[utoipa::path(
-    get,
-    path = "/v1/policies/{name}/aliases",
-    operation_id = "listAliases",
-    tag = "policies",
-    params(Name),
-    responses((status = 200, description = "All of them.", body = Aliases), BadRequest, NotFound)
+    get, path = "/v1/policies/{name}/aliases", operation_id = "listAliases", tag = "policies", params(NamePath),
+    responses((status = 200, description = "All aliases.", body = Aliases), BadRequest, NotFound)
 )]
-async fn aliases(State(app): Shared, Path(name): Path<String>) -> Result<Json<Aliases>, Error> {
-    let all = policies::aliases(&app, &name)?.into_iter();
-    Ok(Json(Aliases { aliases: all.map(|(alias, version)| Alias { alias, version }).collect() }))
+async fn aliases(State(app): AppState, Path(NamePath { name }): Path<NamePath>) -> Result<Json<Aliases>, Error> {
+    let aliases = policies::aliases(&app, &name)?.into_iter();
+    Ok(Json(Aliases { aliases: aliases.map(|(alias, version)| Alias { alias, version }).collect() }))
 }
 
-/// Which version an alias shall mean, and what it must mean now for that.
+/// The version that an alias is to point to.
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 #[schema(example = json!({"version": 1}))]
 struct SetAlias {
-    /// The version that it shall mean.
+    #[serde(deserialize_with = "json::integer")]
     version: u64,
-    /// What it must mean now for anything to happen: a version, or 0 for nothing.
+    /// Moves the alias only if it points to this version now; 0: only if it does not exist.
+    #[serde(default, deserialize_with = "json::optional_integer")]
     expected: Option<u64>,
 }
 
 #[derive(Debug, Serialize, ToSchema)]
-#[schema(as = MovedAlias)]
-struct Moved {
+struct MovedAlias {
     alias: String,
-    /// The version that it means.
+    /// The version that it points to.
     #[schema(minimum = 1)]
     version: u64,
-    /// What it meant before.
+    /// The version that it pointed to before; null: it is new.
     #[schema(required = true, minimum = 1)]
     previous: Option<u64>,
 }
 
-/// Let an alias mean a version, for all requests at once
+/// Point an alias to a version, for all requests at once
 #[utoipa::path(
-    put,
-    path = "/v1/policies/{name}/aliases/{alias}",
-    operation_id = "setAlias",
-    tag = "policies",
-    params(AliasOf),
+    put, path = "/v1/policies/{name}/aliases/{alias}", operation_id = "setAlias", tag = "policies", params(AliasPath),
     request_body = SetAlias,
     responses(
-        (status = 201, description = "It is new.", body = Moved),
-        (status = 200, description = "It has moved.", body = Moved),
+        (status = 201, description = "The alias is new.", body = MovedAlias),
+        (status = 200, description = "The alias has moved.", body = MovedAlias),
         BadBody, NotFound, Conflict
     )
 )]
 async fn set_alias(
-    State(app): Shared,
-    Path((name, alias)): Path<(String, String)>,
+    State(app): AppState,
+    Path(AliasPath { name, alias }): Path<AliasPath>,
     caller: Option<Extension<Caller>>,
     extract::Json(SetAlias { version, expected }): extract::Json<SetAlias>,
 ) -> Result<impl IntoResponse, Error> {
-    let target = policies::AliasChange { name, alias: alias.clone(), expected, by: by(caller) };
+    let target = policies::AliasChange { name, alias: alias.clone(), expected, by: key_id(caller) };
     let previous = policies::set_alias(&app, target, version).await?;
     let status = if previous.is_none() { StatusCode::CREATED } else { StatusCode::OK };
-    Ok((status, Json(Moved { alias, version, previous })))
+    Ok((status, Json(MovedAlias { alias, version, previous })))
 }
 
 #[derive(Debug, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
-struct Expected {
-    /// The version that it must mean now for anything to happen.
+struct DeleteAliasQuery {
+    /// Deletes the alias only if it points to this version now.
     #[param(nullable = false)]
     expected: Option<u64>,
 }
 
 /// Delete an alias
 #[utoipa::path(
-    delete,
-    path = "/v1/policies/{name}/aliases/{alias}",
-    operation_id = "deleteAlias",
-    tag = "policies",
-    params(AliasOf, Expected),
-    responses((status = 204, description = "It means nothing any more."), BadRequest, NotFound, Conflict)
+    delete, path = "/v1/policies/{name}/aliases/{alias}", operation_id = "deleteAlias", tag = "policies",
+    params(AliasPath, DeleteAliasQuery),
+    responses((status = 204, description = "The alias is deleted."), BadRequest, NotFound, Conflict)
 )]
 async fn delete_alias(
-    State(app): Shared,
-    Path((name, alias)): Path<(String, String)>,
-    Query(Expected { expected }): Query<Expected>,
+    State(app): AppState,
+    Path(AliasPath { name, alias }): Path<AliasPath>,
+    Query(DeleteAliasQuery { expected }): Query<DeleteAliasQuery>,
     caller: Option<Extension<Caller>>,
 ) -> Result<StatusCode, Error> {
-    policies::delete_alias(&app, policies::AliasChange { name, alias, expected, by: by(caller) }).await?;
+    policies::delete_alias(&app, policies::AliasChange { name, alias, expected, by: key_id(caller) }).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 
@@ -374,8 +431,8 @@ async fn delete_alias(
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 struct HistoryQuery {
-    /// Only this alias.
-    #[param(value_type = schemas::Name, inline, required = false)]
+    /// Only moves of this alias.
+    #[param(schema_with = schemas::name, required = false)]
     alias: Option<String>,
     /// At most this many moves; 0: 100.
     #[serde(default)]
@@ -383,28 +440,27 @@ struct HistoryQuery {
     page_size: u32,
     /// `next_page_token` of the previous page.
     #[serde(default)]
-    #[param(value_type = schemas::NumberToken, inline, required = false)]
+    #[param(schema_with = schemas::number_token, required = false)]
     page_token: String,
 }
 
 /// A move of an alias.
 #[derive(Debug, Serialize, ToSchema)]
-#[schema(as = AliasMove)]
-struct Move {
+struct AliasMove {
     alias: String,
-    /// What it means since then; null: nothing, it was deleted.
+    /// The version that it points to since then; null: it was deleted.
     #[schema(required = true, minimum = 1)]
     version: Option<u64>,
-    /// What it meant before; null: nothing, it was new.
+    /// The version that it pointed to before; null: it was new.
     #[schema(required = true, minimum = 1)]
     previous: Option<u64>,
     at: Timestamp,
-    /// Who moved it, where that is known.
+    /// Id of the API key that moved it, where known.
     #[schema(required = true)]
     by: Option<String>,
 }
 
-impl From<Promotion> for Move {
+impl From<Promotion> for AliasMove {
     fn from(promotion: Promotion) -> Self {
         let Promotion { id: _, alias, version, previous, at, by } = promotion;
         Self { alias, version, previous, at, by }
@@ -412,29 +468,25 @@ impl From<Promotion> for Move {
 }
 
 #[derive(Debug, Serialize, ToSchema)]
-#[schema(as = AliasHistory)]
-struct History {
-    history: Vec<Move>,
+struct AliasHistory {
+    history: Vec<AliasMove>,
     /// Empty on the last page.
     next_page_token: String,
 }
 
-/// Where the aliases of a policy have been, newest first
+/// List the moves of a policy's aliases, newest first
 #[utoipa::path(
-    get,
-    path = "/v1/policies/{name}/history",
-    operation_id = "listAliasMoves",
-    tag = "policies",
-    params(Name, HistoryQuery),
-    responses((status = 200, description = "A page of moves.", body = History), BadRequest, NotFound)
+    get, path = "/v1/policies/{name}/history", operation_id = "listAliasMoves", tag = "policies",
+    params(NamePath, HistoryQuery),
+    responses((status = 200, description = "A page of moves.", body = AliasHistory), BadRequest, NotFound)
 )]
 async fn history(
-    State(app): Shared,
-    Path(name): Path<String>,
+    State(app): AppState,
+    Path(NamePath { name }): Path<NamePath>,
     Query(query): Query<HistoryQuery>,
-) -> Result<Json<History>, Error> {
+) -> Result<Json<AliasHistory>, Error> {
     let HistoryQuery { alias, page_size, page_token } = query;
     let page = PageRequest { size: page_size, token: page_token };
     let page = policies::history(&app, &name, alias.as_deref(), &page).await?.map(Into::into);
-    Ok(Json(History { history: page.items, next_page_token: page.next_token }))
+    Ok(Json(AliasHistory { history: page.items, next_page_token: page.next_token }))
 }

@@ -1,85 +1,118 @@
-//! Schemas of texts that have a form of their own; the types are never made.
+//! Strings with a form of their own: their types, and schemas for `schema_with`.
 
-use std::borrow::Cow;
+use std::time::Duration;
 
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
+use bytes::Bytes;
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde_json::json;
 use utoipa::openapi::RefOr;
-use utoipa::openapi::schema::{KnownFormat, ObjectBuilder, Schema, SchemaFormat, Type};
+use utoipa::openapi::schema::Schema;
 use utoipa::{PartialSchema, ToSchema};
 
-/// A policy's name, or an alias's.
+use super::config_schemas::schema;
+
+/// Name of a policy or an alias.
 macro_rules! name {
     () => {
         "[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}"
     };
 }
 
-/// A version's number.
+/// Number of a version.
 macro_rules! version {
     () => {
         "[1-9][0-9]{0,18}"
     };
 }
 
-macro_rules! texts {
-    ($($(#[$doc:meta])* $name:ident = $pattern:expr;)+) => {$(
-        $(#[$doc])*
-        pub(super) enum $name {}
-
-        impl PartialSchema for $name {
-            fn schema() -> RefOr<Schema> {
-                ObjectBuilder::new().schema_type(Type::String).pattern(Some($pattern)).into()
-            }
-        }
-
-        impl ToSchema for $name {
-            fn name() -> Cow<'static, str> {
-                stringify!($name).into()
-            }
-        }
-    )+};
+fn string(pattern: &str) -> RefOr<Schema> {
+    schema(json!({"type": "string", "pattern": pattern}))
 }
 
-/// Bytes as they come.
-pub(super) enum Bytes {}
+/// NAME of a policy or an alias.
+pub(super) fn name() -> RefOr<Schema> {
+    string(concat!("^", name!(), "$"))
+}
 
-impl PartialSchema for Bytes {
+/// NAME or NAME:VERSION.
+pub(super) fn name_or_version() -> RefOr<Schema> {
+    string(concat!("^", name!(), "(:", version!(), ")?$"))
+}
+
+/// NAME, NAME@ALIAS or NAME:VERSION.
+pub(super) fn policy_spec() -> RefOr<Schema> {
+    string(concat!("^", name!(), "(@", name!(), "|:", version!(), ")?$"))
+}
+
+/// The same, or empty.
+pub(super) fn optional_policy_spec() -> RefOr<Schema> {
+    string(concat!("^(", name!(), "(@", name!(), "|:", version!(), ")?)?$"))
+}
+
+/// Token of a page that begins after a number.
+pub(super) fn number_token() -> RefOr<Schema> {
+    string("^[0-9]{0,18}$")
+}
+
+/// Token of a page that begins after a metric.
+pub(super) fn metric_token() -> RefOr<Schema> {
+    string("^([A-Za-z0-9_/.-]{1,63}@[0-9]{1,18})?$")
+}
+
+/// Bytes as the body of a request or a response.
+pub(super) struct Binary;
+
+impl PartialSchema for Binary {
     fn schema() -> RefOr<Schema> {
-        ObjectBuilder::new().schema_type(Type::String).format(Some(SchemaFormat::KnownFormat(KnownFormat::Binary))).into()
+        schema(json!({"type": "string", "format": "binary"}))
     }
 }
 
-impl ToSchema for Bytes {}
+impl ToSchema for Binary {}
 
-/// A heading's index.
-pub(super) enum Heading {}
+/// A duration in seconds with an `s`: `0.000021000s`.
+#[derive(Debug)]
+pub(super) struct Seconds(pub(super) Duration);
 
-impl PartialSchema for Heading {
-    fn schema() -> RefOr<Schema> {
-        ObjectBuilder::new().schema_type(Type::Integer).minimum(Some(0)).maximum(Some(8)).into()
+impl Serialize for Seconds {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(&format_args!("{}.{:09}s", self.0.as_secs(), self.0.subsec_nanos()))
     }
 }
 
-impl ToSchema for Heading {}
-
-texts! {
-    /// NAME of a policy or an alias.
-    Name = concat!("^", name!(), "$");
-    /// NAME or NAME:VERSION.
-    Versions = concat!("^", name!(), "(:", version!(), ")?$");
-    /// NAME, NAME@ALIAS or NAME:VERSION.
-    PolicySpec = concat!("^", name!(), "(@", name!(), "|:", version!(), ")?$");
-    /// The same, or nothing.
-    OptionalPolicySpec = concat!("^(", name!(), "(@", name!(), "|:", version!(), ")?)?$");
-    /// Where the next page begins: digits, or nothing for the first.
-    NumberToken = "^[0-9]{0,18}$";
-    /// The metric after which a page begins; empty for the first page.
-    MetricToken = "^([A-Za-z0-9_/.-]{1,63}@[0-9]{1,18})?$";
-    /// Seconds with an `s`: `0.000021000s`.
-    Seconds = "^[0-9]+\\.[0-9]{9}s$";
-    /// SHA-256 in hexadecimal.
-    Sha256 = "^[0-9a-f]{64}$";
-    /// Bytes in base64.
-    Base64Text = "^([A-Za-z0-9+/]{4})*([A-Za-z0-9+/][AQgw]==|[A-Za-z0-9+/]{2}[AEIMQUYcgkosw048]=)?$";
-    /// The kind of a node, in the words of the protocol or without its prefix.
-    NodeKind = "^(NODE_KIND_UAV|NODE_KIND_USER|uav|user)$";
+impl PartialSchema for Seconds {
+    fn schema() -> RefOr<Schema> {
+        string("^[0-9]+\\.[0-9]{9}s$")
+    }
 }
+
+impl ToSchema for Seconds {}
+
+/// Bytes in base64.
+#[derive(Debug)]
+pub(super) struct Base64(pub(super) Bytes);
+
+impl<'de> Deserialize<'de> for Base64 {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let text = String::deserialize(deserializer)?;
+        let bytes = BASE64_STANDARD.decode(text).map_err(|e| D::Error::custom(format!("not base64: {e}")))?;
+        Ok(Self(bytes.into()))
+    }
+}
+
+impl Serialize for Base64 {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(&BASE64_STANDARD.encode(&self.0))
+    }
+}
+
+impl PartialSchema for Base64 {
+    fn schema() -> RefOr<Schema> {
+        string("^([A-Za-z0-9+/]{4})*([A-Za-z0-9+/][AQgw]==|[A-Za-z0-9+/]{2}[AEIMQUYcgkosw048]=)?$")
+    }
+}
+
+impl ToSchema for Base64 {}

@@ -6,45 +6,79 @@ use axum::Json;
 use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::IntoResponse;
+use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
-use utoipa::ToSchema;
+use utoipa::{IntoParams, ToSchema};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::extract::{self, Path, Query};
+use super::json;
 use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
-use super::policies::Paging;
-use super::schemas;
-use super::wording::Session;
+use super::policies::{Paging, PolicyRef};
+use super::schemas::{self, Seconds};
 use crate::api::convert::request::open_session;
 use crate::service::{App, Error, sessions};
-use crate::wire::v1;
+use crate::serving::SessionInfo;
+
+type AppState = State<Arc<App>>;
 
 /// The routes.
 pub(super) fn router() -> OpenApiRouter<Arc<App>> {
-    OpenApiRouter::new().routes(routes!(open, list)).routes(routes!(one, close))
+    OpenApiRouter::new().routes(routes!(open, list)).routes(routes!(get, close))
+}
+
+#[derive(Deserialize, IntoParams)]
+#[into_params(parameter_in = Path)]
+struct SessionPath {
+    /// Name of the session.
+    #[param(example = "flight-1")]
+    id: String,
 }
 
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
-#[schema(as = OpenSessionRequest, example = json!({"policy": "qedgix", "session_id": "flight-1"}))]
-struct Open {
-    /// NAME, NAME@ALIAS or NAME:VERSION; the session stays with the version that this means now.
-    #[schema(value_type = schemas::PolicySpec)]
+#[schema(example = json!({"policy": "qedgix", "session_id": "flight-1"}))]
+struct OpenSessionRequest {
+    /// NAME, NAME@ALIAS or NAME:VERSION; the session keeps the version that this resolves to now.
+    #[schema(schema_with = schemas::policy_spec)]
     policy: String,
-    /// Chosen by the server when left empty.
+    /// Empty: the server chooses a name.
     #[serde(default)]
     #[schema(max_length = 128)]
     session_id: String,
     #[schema(min_length = 1, max_length = 128)]
     run_id: Option<String>,
-    /// Fixes what is random about the policy; when absent, `session_id` and `run_id` do.
+    /// Fixes what is random about the policy; derived from `session_id` and `run_id` when absent.
+    #[serde(default, deserialize_with = "json::optional_integer")]
     seed: Option<u64>,
 }
 
 #[derive(Debug, Serialize, ToSchema)]
-#[schema(as = SessionPage)]
-struct Page {
+struct Session {
+    session_id: String,
+    policy: PolicyRef,
+    /// Slots answered in the current run.
+    steps: u64,
+    opened_at: Timestamp,
+    /// Idle time after which the session expires.
+    ttl: Seconds,
+}
+
+impl From<SessionInfo> for Session {
+    fn from(session: SessionInfo) -> Self {
+        Self {
+            session_id: session.id,
+            policy: (&session.policy).into(),
+            steps: session.steps,
+            opened_at: session.opened_at,
+            ttl: Seconds(session.ttl),
+        }
+    }
+}
+
+#[derive(Debug, Serialize, ToSchema)]
+struct SessionPage {
     sessions: Vec<Session>,
     /// Empty on the last page.
     next_page_token: String,
@@ -52,59 +86,43 @@ struct Page {
 
 /// Open a session: the server keeps the fleet's memory and pins the policy version
 #[utoipa::path(
-    post,
-    path = "/v1/sessions",
-    operation_id = "openSession",
-    tag = "sessions",
-    request_body = Open,
-    responses(
-        (status = 201, description = "It is open.", body = Session),
-        BadBody, NotFound, Conflict, Draining
-    )
+    post, path = "/v1/sessions", operation_id = "openSession", tag = "sessions", request_body = OpenSessionRequest,
+    responses((status = 201, description = "The open session.", body = Session), BadBody, NotFound, Conflict, Draining)
 )]
-async fn open(State(app): State<Arc<App>>, extract::Json(open): extract::Json<Open>) -> Result<impl IntoResponse, Error> {
-    let Open { policy, session_id, run_id, seed } = open;
-    let (policy, how) = open_session(v1::OpenSessionRequest { policy, session_id, run_id, seed })?;
-    let session = Session::from(v1::Session::from(sessions::open(&app, &policy, how).await?));
+async fn open(
+    State(app): AppState,
+    extract::Json(request): extract::Json<OpenSessionRequest>,
+) -> Result<impl IntoResponse, Error> {
+    let OpenSessionRequest { policy, session_id, run_id, seed } = request;
+    let (policy, options) = open_session(&policy, session_id, run_id, seed)?;
+    let session = Session::from(sessions::open(&app, &policy, options).await?);
     Ok((StatusCode::CREATED, [(header::CACHE_CONTROL, "no-store")], Json(session)))
 }
 
-/// Open sessions, in the order of their names
+/// List open sessions by name
 #[utoipa::path(
-    get,
-    path = "/v1/sessions",
-    operation_id = "listSessions",
-    tag = "sessions",
-    params(Paging),
-    responses((status = 200, description = "A page of them.", body = Page), BadRequest)
+    get, path = "/v1/sessions", operation_id = "listSessions", tag = "sessions", params(Paging),
+    responses((status = 200, description = "A page of sessions.", body = SessionPage), BadRequest)
 )]
-async fn list(State(app): State<Arc<App>>, Query(paging): Query<Paging>) -> Result<Json<Page>, Error> {
-    let page = sessions::list(&app, &paging.into())?.map(|session| v1::Session::from(session).into());
-    Ok(Json(Page { sessions: page.items, next_page_token: page.next_token }))
+async fn list(State(app): AppState, Query(paging): Query<Paging>) -> Result<Json<SessionPage>, Error> {
+    let page = sessions::list(&app, &paging.into())?.map(Into::into);
+    Ok(Json(SessionPage { sessions: page.items, next_page_token: page.next_token }))
 }
 
-/// One session
+/// Get a session
 #[utoipa::path(
-    get,
-    path = "/v1/sessions/{id}",
-    operation_id = "getSession",
-    tag = "sessions",
-    params(("id" = String, Path, description = "Name of the session.", example = "flight-1")),
-    responses((status = 200, description = "It is open.", body = Session), BadRequest, NotFound, Conflict)
+    get, path = "/v1/sessions/{id}", operation_id = "getSession", tag = "sessions", params(SessionPath),
+    responses((status = 200, description = "The open session.", body = Session), BadRequest, NotFound, Conflict)
 )]
-async fn one(State(app): State<Arc<App>>, Path(id): Path<String>) -> Result<Json<Session>, Error> {
-    Ok(Json(v1::Session::from(sessions::get(&app, &id)?).into()))
+async fn get(State(app): AppState, Path(SessionPath { id }): Path<SessionPath>) -> Result<Json<Session>, Error> {
+    Ok(Json(sessions::get(&app, &id)?.into()))
 }
 
-/// End a session, after its slot in flight
+/// Close a session after its step in flight
 #[utoipa::path(
-    delete,
-    path = "/v1/sessions/{id}",
-    operation_id = "closeSession",
-    tag = "sessions",
-    params(("id" = String, Path, description = "Name of the session.", example = "flight-1")),
-    responses((status = 200, description = "It has ended; what it was.", body = Session), BadRequest, NotFound, Conflict)
+    delete, path = "/v1/sessions/{id}", operation_id = "closeSession", tag = "sessions", params(SessionPath),
+    responses((status = 200, description = "The session as it ended.", body = Session), BadRequest, NotFound, Conflict)
 )]
-async fn close(State(app): State<Arc<App>>, Path(id): Path<String>) -> Result<Json<Session>, Error> {
-    Ok(Json(v1::Session::from(sessions::close(&app, &id).await?).into()))
+async fn close(State(app): AppState, Path(SessionPath { id }): Path<SessionPath>) -> Result<Json<Session>, Error> {
+    Ok(Json(sessions::close(&app, &id).await?.into()))
 }

@@ -9,7 +9,6 @@ mod mixing;
 mod qmix;
 
 use serde::{Deserialize, Serialize};
-use utoipa::ToSchema;
 
 use self::invariant::{Invariant, InvariantCache};
 use self::qmix::{Qmix, QmixCache};
@@ -17,7 +16,7 @@ use super::agent::Dims;
 use crate::nn::{Batch, ParameterLayout, Real, Rows, RowsMut, Weights};
 
 /// How the UAVs' values become joint values.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MixerKind {
     /// Hypernetworks on the flat state.

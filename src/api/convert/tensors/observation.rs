@@ -3,10 +3,10 @@
 //! Nodes are numbered in the order of the request, UAVs from 0 and users after them.
 
 use super::{Datatype, Tensor};
-use crate::api::convert::fleet::{Ids, check_counts, distinct, request_order};
-use crate::api::convert::{aoi, finite, graph::mirror, point};
 use crate::env::Point;
 use crate::invalid::Invalid;
+use crate::serving::ids::{Ids, check_counts, check_distinct, request_order};
+use crate::serving::nodes::{aoi, finite, mirror, point};
 use crate::serving::{Fleet, Graph, GraphForm, MAX_DETECTIONS, MAX_NODES, Observation, ReportedDetection, Scene, SceneOrGraph};
 
 /// Inputs of which observations are made: name, datatype in which they are described, and what each dimension counts.
@@ -116,7 +116,7 @@ fn points(tensor: &Tensor, expected: &str, count: usize) -> Result<Vec<Point>, I
     }
     let values = tensor.numbers(2 * count)?;
     let pairs = values.chunks_exact(2).enumerate();
-    pairs.map(|(i, pair)| point(|| format!("{}[{i}]", tensor.name), pair[0], pair[1])).collect()
+    pairs.map(|(i, pair)| point(|| format!("{}[{i}]", tensor.name), [pair[0], pair[1]])).collect()
 }
 
 /// The fleet, and where its nodes are in the request.
@@ -132,7 +132,7 @@ impl Nodes {
     fn new(uavs: usize, users: usize, uav_ids: Option<&Tensor>, user_ids: Option<&Tensor>) -> Result<Self, Invalid> {
         let (uav_ids, uavs) = ids(uav_ids, uavs, "[M]", "uav")?;
         let (user_ids, users) = ids(user_ids, users, "[N]", "user")?;
-        distinct((&uav_ids, &uavs), (&user_ids, &users), |is_uav, place| {
+        check_distinct((&uav_ids, &uavs), (&user_ids, &users), |is_uav, place| {
             format!("{}[{place}]", if is_uav { "uav_ids" } else { "user_ids" })
         })?;
         Ok(Self { fleet: Fleet { uavs: uav_ids, users: user_ids }, uavs, users })

@@ -10,6 +10,7 @@ use super::values::Values;
 use crate::api::convert::tensors::{Data, Tensor};
 use crate::api::oip::{InferRequest, Parameter, check_tensor_parameters};
 use crate::api::rest::extract::parse;
+use crate::api::rest::json;
 use crate::invalid::Invalid;
 use crate::service::Error;
 
@@ -26,9 +27,10 @@ struct Body {
 }
 
 #[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, remote = "Self")]
 struct Input {
     name: String,
+    #[serde(deserialize_with = "json::integers")]
     shape: Vec<i64>,
     datatype: String,
     #[serde(default)]
@@ -37,12 +39,14 @@ struct Input {
 }
 
 #[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, remote = "Self")]
 struct Output {
     name: String,
     #[serde(default)]
     parameters: Map<String, Value>,
 }
+
+json::objects_only!(Input, Output);
 
 /// The outputs that the response has as binary data.
 #[derive(Debug, PartialEq, Eq)]

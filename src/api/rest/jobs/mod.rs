@@ -1,32 +1,33 @@
 //! `/v1/jobs` and `/v1/checkpoints`.
 
+mod types;
+
 use std::sync::Arc;
 
 use axum::extract::State;
 use axum::http::{HeaderMap, HeaderName, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 use utoipa::{IntoParams, ToSchema};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
-use uuid::Uuid;
 
 use super::extract::{Json, Path, Query};
 use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
 use super::schemas;
-use crate::api::convert::jobs::{AttemptView, CheckpointView, JobRequest, JobView, MetricView, SummaryView, to_csv};
 use crate::invalid::Invalid;
 use crate::service::{App, Error, PageRequest, checkpoints, jobs};
-use crate::store::{Job, JobAction, JobState};
+use crate::store::{JobAction, JobState};
+pub(super) use types::MetricRow;
+use types::{Attempt, Checkpoint, Job, JobRequest, JobSummary, to_csv};
 
-type Shared = State<Arc<App>>;
+type AppState = State<Arc<App>>;
 
 /// The routes.
 pub(super) fn router() -> OpenApiRouter<Arc<App>> {
     OpenApiRouter::new()
         .routes(routes!(submit, list))
-        .routes(routes!(one, delete))
+        .routes(routes!(get, delete))
         .routes(routes!(cancel))
         .routes(routes!(pause))
         .routes(routes!(resume))
@@ -36,40 +37,37 @@ pub(super) fn router() -> OpenApiRouter<Arc<App>> {
         .routes(routes!(checkpoint))
 }
 
-/// A job in a path.
-#[derive(IntoParams)]
+#[derive(Deserialize, IntoParams)]
 #[into_params(parameter_in = Path)]
-#[expect(dead_code, reason = "read as text; this is its documentation")]
-struct Id {
+pub(super) struct JobPath {
     /// Id of the job.
-    #[param(example = "01a202d1-93be-769e-80f7-75eef9496f12")]
-    id: Uuid,
+    #[param(value_type = Uuid, example = "01a202d1-93be-769e-80f7-75eef9496f12")]
+    pub id: String,
 }
 
-/// Put a job into the queue; what is answered is on the disk
+/// Submit a job
+///
+/// The job is on the disk when it is returned.
 #[utoipa::path(
-    post,
-    path = "/v1/jobs",
-    operation_id = "submitJob",
-    tag = "jobs",
+    post, path = "/v1/jobs", operation_id = "submitJob", tag = "jobs",
     params((
         "idempotency-key" = Option<String>, Header,
-        description = "The same key with the same job is the same job, however often it is sent: 1 to 255 printable characters.",
+        description = "A repeated request with the same key returns the existing job: 1 to 255 printable characters.",
         min_length = 1, max_length = 255, pattern = "^[!-~]([ -~]*[!-~])?$", nullable = false
     )),
     request_body = JobRequest,
     responses(
         (
-            status = 201, description = "It is in the queue, or was already: the same answer.", body = JobView,
+            status = 201, description = "The job, new or existing.", body = Job,
             headers(
-                ("location", description = "Where it is."),
+                ("location", description = "Path of the job."),
                 ("idempotency-replayed", description = "`true` if the key was used before.")
             )
         ),
         BadBody, Conflict, Draining
     )
 )]
-async fn submit(State(app): Shared, headers: HeaderMap, Json(document): Json<Value>) -> Result<Response, Error> {
+async fn submit(State(app): AppState, headers: HeaderMap, Json(request): Json<JobRequest>) -> Result<Response, Error> {
     const KEY: HeaderName = HeaderName::from_static("idempotency-key");
     let key = match headers.get(KEY) {
         None => None,
@@ -78,22 +76,18 @@ async fn submit(State(app): Shared, headers: HeaderMap, Json(document): Json<Val
             Err(_) => return Err(Invalid::new("idempotency-key", format!("{value:?}"), "ASCII").into()),
         },
     };
-    let (job, new) = jobs::submit(&app, document, key).await?;
+    let (job, new) = jobs::submit(&app, request.into(), key).await?;
     let location = (header::LOCATION, format!("/v1/jobs/{}", job.id));
     let replayed = (HeaderName::from_static("idempotency-replayed"), (!new).to_string());
-    // The same answer as the first time: who repeats a request did not see it.
-    Ok((StatusCode::CREATED, [location, replayed], shown(job)).into_response())
-}
-
-fn shown(job: Job) -> Response {
-    axum::Json(JobView::from(job)).into_response()
+    // The status is the one of the first response, which the caller of a retry did not receive.
+    Ok((StatusCode::CREATED, [location, replayed], axum::Json(Job::from(job))).into_response())
 }
 
 #[derive(Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 struct ListQuery {
-    /// Only those in this state.
+    /// Only jobs in this state.
     #[param(nullable = false)]
     state: Option<JobState>,
     /// At most this many jobs; 0: 100. A page ends early before it exceeds about 1 MiB.
@@ -102,96 +96,72 @@ struct ListQuery {
     page_size: u32,
     /// `next_page_token` of the previous page.
     #[serde(default)]
-    #[param(value_type = schemas::NumberToken, inline, required = false)]
+    #[param(schema_with = schemas::number_token, required = false)]
     page_token: String,
 }
 
 #[derive(Serialize, ToSchema)]
 struct JobPage {
-    jobs: Vec<SummaryView>,
+    jobs: Vec<JobSummary>,
     /// Empty on the last page.
     next_page_token: String,
 }
 
 /// List summaries of jobs, newest first
 #[utoipa::path(
-    get,
-    path = "/v1/jobs",
-    operation_id = "listJobs",
-    tag = "jobs",
-    params(ListQuery),
+    get, path = "/v1/jobs", operation_id = "listJobs", tag = "jobs", params(ListQuery),
     responses((status = 200, description = "A page of jobs.", body = JobPage), BadRequest)
 )]
-async fn list(State(app): Shared, Query(query): Query<ListQuery>) -> Result<axum::Json<JobPage>, Error> {
+async fn list(State(app): AppState, Query(query): Query<ListQuery>) -> Result<axum::Json<JobPage>, Error> {
     let ListQuery { state, page_size, page_token } = query;
     let page = jobs::list(&app, state, &PageRequest { size: page_size, token: page_token }).await?.map(Into::into);
     Ok(axum::Json(JobPage { jobs: page.items, next_page_token: page.next_token }))
 }
 
-/// One job
+/// Get a job
 #[utoipa::path(
-    get,
-    path = "/v1/jobs/{id}",
-    operation_id = "getJob",
-    tag = "jobs",
-    params(Id),
-    responses((status = 200, description = "As it stands.", body = JobView), BadRequest, NotFound)
+    get, path = "/v1/jobs/{id}", operation_id = "getJob", tag = "jobs", params(JobPath),
+    responses((status = 200, description = "The job.", body = Job), BadRequest, NotFound)
 )]
-async fn one(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    Ok(shown(jobs::get(&app, &id).await?))
+async fn get(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Job>, Error> {
+    Ok(axum::Json(jobs::get(&app, &id).await?.into()))
 }
 
-/// Forget a job that has ended
+/// Delete a job that has ended
 #[utoipa::path(
-    delete,
-    path = "/v1/jobs/{id}",
-    operation_id = "deleteJob",
-    tag = "jobs",
-    params(Id),
-    responses((status = 204, description = "It is forgotten."), BadRequest, NotFound, Conflict)
+    delete, path = "/v1/jobs/{id}", operation_id = "deleteJob", tag = "jobs", params(JobPath),
+    responses((status = 204, description = "The job is deleted."), BadRequest, NotFound, Conflict)
 )]
-async fn delete(State(app): Shared, Path(id): Path<String>) -> Result<StatusCode, Error> {
+async fn delete(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Result<StatusCode, Error> {
     jobs::change(&app, &id, JobAction::Delete).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 
-/// End a job; a running one is cancelled as soon as its worker has stopped
+/// Cancel a job; a running job ends when its worker has stopped
 #[utoipa::path(
-    post,
-    path = "/v1/jobs/{id}/cancel",
-    operation_id = "cancelJob",
-    tag = "jobs",
-    params(Id),
-    responses((status = 200, description = "As it stands now.", body = JobView), BadRequest, NotFound, Conflict)
+    post, path = "/v1/jobs/{id}/cancel", operation_id = "cancelJob", tag = "jobs", params(JobPath),
+    responses((status = 200, description = "The job.", body = Job), BadRequest, NotFound, Conflict)
 )]
-async fn cancel(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    Ok(shown(jobs::change(&app, &id, JobAction::Cancel).await?))
+async fn cancel(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Job>, Error> {
+    Ok(axum::Json(jobs::change(&app, &id, JobAction::Cancel).await?.into()))
 }
 
-/// Take a job off the machine; a running one is snapshotted first
+/// Pause a job; a running job saves a snapshot first
 #[utoipa::path(
-    post,
-    path = "/v1/jobs/{id}/pause",
-    operation_id = "pauseJob",
-    tag = "jobs",
-    params(Id),
-    responses((status = 200, description = "As it stands now.", body = JobView), BadRequest, NotFound, Conflict)
+    post, path = "/v1/jobs/{id}/pause", operation_id = "pauseJob", tag = "jobs", params(JobPath),
+    responses((status = 200, description = "The job.", body = Job), BadRequest, NotFound, Conflict)
 )]
-async fn pause(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    Ok(shown(jobs::change(&app, &id, JobAction::Pause).await?))
+async fn pause(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Job>, Error> {
+    Ok(axum::Json(jobs::change(&app, &id, JobAction::Pause).await?.into()))
 }
 
-/// Put a paused job back into the queue, to go on where it was
+/// Put a paused job back into the queue; it continues from its snapshot
 #[utoipa::path(
-    post,
-    path = "/v1/jobs/{id}/resume",
-    operation_id = "resumeJob",
-    tag = "jobs",
-    params(Id),
-    responses((status = 200, description = "As it stands now.", body = JobView), BadRequest, NotFound, Conflict, Draining)
+    post, path = "/v1/jobs/{id}/resume", operation_id = "resumeJob", tag = "jobs", params(JobPath),
+    responses((status = 200, description = "The job.", body = Job), BadRequest, NotFound, Conflict, Draining)
 )]
-async fn resume(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
-    Ok(shown(jobs::change(&app, &id, JobAction::Resume).await?))
+async fn resume(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Job>, Error> {
+    Ok(axum::Json(jobs::change(&app, &id, JobAction::Resume).await?.into()))
 }
 
 #[derive(Clone, Copy, Default, Deserialize, ToSchema)]
@@ -218,7 +188,7 @@ struct MetricsQuery {
     page_size: u32,
     /// `next_page_token` of the previous page.
     #[serde(default)]
-    #[param(value_type = schemas::MetricToken, inline, required = false)]
+    #[param(schema_with = schemas::metric_token, required = false)]
     page_token: String,
 }
 
@@ -227,18 +197,14 @@ const NEXT_PAGE_TOKEN: HeaderName = HeaderName::from_static("qedgix-next-page-to
 
 #[derive(Serialize, ToSchema)]
 struct MetricPage {
-    metrics: Vec<MetricView>,
+    metrics: Vec<MetricRow>,
     /// Empty on the last page.
     next_page_token: String,
 }
 
 /// List the metrics of a job by name and step
 #[utoipa::path(
-    get,
-    path = "/v1/jobs/{id}/metrics",
-    operation_id = "listJobMetrics",
-    tag = "jobs",
-    params(Id, MetricsQuery),
+    get, path = "/v1/jobs/{id}/metrics", operation_id = "listJobMetrics", tag = "jobs", params(JobPath, MetricsQuery),
     responses(
         (
             status = 200, description = "A page of rows.", content((MetricPage = "application/json"), (String = "text/csv")),
@@ -247,7 +213,11 @@ struct MetricPage {
         BadRequest, NotFound
     )
 )]
-async fn metrics(State(app): Shared, Path(id): Path<String>, Query(query): Query<MetricsQuery>) -> Result<Response, Error> {
+async fn metrics(
+    State(app): AppState,
+    Path(JobPath { id }): Path<JobPath>,
+    Query(query): Query<MetricsQuery>,
+) -> Result<Response, Error> {
     let MetricsQuery { name, format, page_size, page_token } = query;
     let mut request = PageRequest { size: page_size, token: page_token };
     let mut page = jobs::metrics(&app, &id, name.as_deref(), &request).await?;
@@ -271,62 +241,58 @@ async fn metrics(State(app): Shared, Path(id): Path<String>, Query(query): Query
 
 #[derive(Serialize, ToSchema)]
 struct Checkpoints {
-    checkpoints: Vec<CheckpointView>,
+    checkpoints: Vec<Checkpoint>,
 }
 
-/// Checkpoints of a job, oldest first
+/// List the checkpoints of a job, oldest first
 #[utoipa::path(
-    get,
-    path = "/v1/jobs/{id}/checkpoints",
-    operation_id = "listCheckpoints",
-    tag = "jobs",
-    params(Id),
-    responses((status = 200, description = "The best and the last.", body = Checkpoints), BadRequest, NotFound)
+    get, path = "/v1/jobs/{id}/checkpoints", operation_id = "listCheckpoints", tag = "jobs", params(JobPath),
+    responses((status = 200, description = "The best and the last checkpoint.", body = Checkpoints), BadRequest, NotFound)
 )]
-async fn checkpoints(State(app): Shared, Path(id): Path<String>) -> Result<axum::Json<Checkpoints>, Error> {
+async fn checkpoints(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Checkpoints>, Error> {
     let checkpoints = jobs::checkpoints(&app, &id).await?.into_iter().map(Into::into).collect();
     Ok(axum::Json(Checkpoints { checkpoints }))
 }
 
 #[derive(Serialize, ToSchema)]
 struct Attempts {
-    attempts: Vec<AttemptView>,
+    attempts: Vec<Attempt>,
 }
 
-/// Attempts at a job with the last output of their workers, oldest first
+/// List the attempts at a job with the last output of their workers, oldest first
 #[utoipa::path(
-    get,
-    path = "/v1/jobs/{id}/logs",
-    operation_id = "listJobLogs",
-    tag = "jobs",
-    params(Id),
-    responses((status = 200, description = "All of them.", body = Attempts), BadRequest, NotFound)
+    get, path = "/v1/jobs/{id}/logs", operation_id = "listJobLogs", tag = "jobs", params(JobPath),
+    responses((status = 200, description = "All attempts.", body = Attempts), BadRequest, NotFound)
 )]
-async fn logs(State(app): Shared, Path(id): Path<String>) -> Result<axum::Json<Attempts>, Error> {
+async fn logs(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Attempts>, Error> {
     let attempts = jobs::logs(&app, &id).await?.into_iter().map(Into::into).collect();
     Ok(axum::Json(Attempts { attempts }))
 }
 
-/// A checkpoint, as safetensors
+#[derive(Deserialize, IntoParams)]
+#[into_params(parameter_in = Path)]
+struct CheckpointPath {
+    /// Id of the checkpoint.
+    #[param(value_type = Uuid, example = "01a202d1-93be-769e-80f7-75eef9496f12")]
+    id: String,
+}
+
+/// Download a checkpoint as safetensors
 #[utoipa::path(
-    get,
-    path = "/v1/checkpoints/{id}",
-    operation_id = "getCheckpoint",
-    tag = "jobs",
-    params(("id" = Uuid, Path, description = "Id of the checkpoint.", example = "01a202d1-93be-769e-80f7-75eef9496f12")),
+    get, path = "/v1/checkpoints/{id}", operation_id = "getCheckpoint", tag = "jobs", params(CheckpointPath),
     responses(
         (
-            status = 200, description = "Its bytes.", body = inline(schemas::Bytes), content_type = "application/octet-stream",
+            status = 200, description = "The checkpoint.", content((inline(schemas::Binary) = "application/octet-stream")),
             headers(
                 ("etag", description = "SHA-256 of the bytes, in quotes."),
                 ("qedgix-sha256", description = "SHA-256 of the bytes."),
-                ("content-disposition", description = "A name for the file.")
+                ("content-disposition", description = "Name of the file.")
             )
         ),
         BadRequest, NotFound
     )
 )]
-async fn checkpoint(State(app): Shared, Path(id): Path<String>) -> Result<Response, Error> {
+async fn checkpoint(State(app): AppState, Path(CheckpointPath { id }): Path<CheckpointPath>) -> Result<Response, Error> {
     let (checkpoint, bytes) = checkpoints::get(&app, &id).await?;
     let headers = [
         (header::CONTENT_TYPE, "application/octet-stream".to_owned()),

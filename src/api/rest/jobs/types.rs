@@ -1,0 +1,249 @@
+//! Bodies of `/v1/jobs`: what is submitted, and how jobs, metrics, checkpoints, attempts and events are shown.
+
+use std::collections::BTreeMap;
+
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value, json};
+use utoipa::ToSchema;
+use utoipa::openapi::RefOr;
+use utoipa::openapi::schema::Schema;
+use uuid::Uuid;
+
+use crate::api::rest::config_schemas::{partial_training, schema};
+use crate::api::rest::json;
+use crate::env::EnvConfig;
+use crate::jobs::spec;
+use crate::store::{self, AttemptOutcome, CheckpointKind, JobId, JobKind, JobState, PendingAction, SpecSummary};
+use crate::train_config::{Algorithm, Preset, Training};
+
+/// A job to submit. All fields are optional.
+#[derive(Debug, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+#[schema(example = json!({"name": "my-policy", "algorithm": "qedgix", "training": {"steps": 20_000}, "seed": 1}))]
+pub(super) struct JobRequest {
+    #[schema(schema_with = optional_kind)]
+    kind: Option<JobKind>,
+    /// Name of the job and of the policy that it publishes.
+    #[schema(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$")]
+    name: Option<String>,
+    /// For people.
+    #[schema(schema_with = labels)]
+    labels: Option<BTreeMap<String, String>>,
+    /// CPU cores that the job may use.
+    #[serde(default, deserialize_with = "json::optional_integer")]
+    #[schema(minimum = 1)]
+    threads: Option<usize>,
+    /// Higher runs first.
+    #[serde(default, deserialize_with = "json::optional_integer")]
+    #[schema(minimum = -100, maximum = 100)]
+    priority: Option<i64>,
+    /// Default: `qedgix`.
+    algorithm: Option<Algorithm>,
+    /// The configuration that `environment` and `training` start from; default: `practical`.
+    preset: Option<Preset>,
+    /// Fields that replace those of the preset; the letters of the paper (`M`, `N`, `K`, `v`, `t`, `d`) are accepted, too.
+    #[schema(value_type = Option<EnvConfig>)]
+    environment: Option<Map<String, Value>>,
+    /// Fields that replace those of the preset.
+    #[schema(schema_with = partial_training)]
+    training: Option<Map<String, Value>>,
+    /// Fixes every metric and weight; default: 1.
+    #[serde(default, deserialize_with = "json::optional_integer")]
+    seed: Option<u64>,
+}
+
+impl From<JobRequest> for spec::JobRequest {
+    fn from(request: JobRequest) -> Self {
+        let JobRequest { kind, name, labels, threads, priority, algorithm, preset, environment, training, seed } = request;
+        Self { kind, name, labels, threads, priority, algorithm, preset, environment, training, seed }
+    }
+}
+
+/// The only kind of jobs that this version runs.
+fn kind() -> RefOr<Schema> {
+    schema(json!({"type": "string", "enum": [JobKind::Train]}))
+}
+
+fn optional_kind() -> RefOr<Schema> {
+    schema(json!({"type": ["string", "null"], "enum": [JobKind::Train, null]}))
+}
+
+fn labels() -> RefOr<Schema> {
+    schema(json!({
+        "type": ["object", "null"], "maxProperties": 32,
+        "propertyNames": {"type": "string", "pattern": "^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$"},
+        "additionalProperties": {"type": "string", "pattern": "^[^\\u0000-\\u001f\\u007f-\\u009f]{0,255}$"}
+    }))
+}
+
+/// A job without its environment and its training configuration.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct JobSummary {
+    #[schema(value_type = Uuid)]
+    id: JobId,
+    state: JobState,
+    /// What a running job was asked to do and has not done yet.
+    #[schema(required = true)]
+    wanted: Option<PendingAction>,
+    /// Why the job failed, or why its last attempt ended.
+    #[schema(required = true)]
+    reason: Option<String>,
+    progress: Progress,
+    /// Attempts begun.
+    attempts: u32,
+    /// Attempts that failed.
+    failures: u32,
+    /// `NAME:VERSION` of the published policy.
+    #[schema(required = true)]
+    policy: Option<String>,
+    last_event_id: u64,
+    created_at: Timestamp,
+    #[schema(required = true)]
+    started_at: Option<Timestamp>,
+    #[schema(required = true)]
+    ended_at: Option<Timestamp>,
+    #[schema(schema_with = kind)]
+    kind: JobKind,
+    #[schema(required = true)]
+    name: Option<String>,
+    labels: BTreeMap<String, String>,
+    threads: usize,
+    priority: i64,
+    algorithm: Algorithm,
+    preset: Preset,
+    seed: u64,
+}
+
+#[derive(Debug, Serialize, ToSchema)]
+struct Progress {
+    /// Environment steps done.
+    step: u64,
+    /// Environment steps to do.
+    steps: u64,
+}
+
+/// A job with its whole configuration.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct Job {
+    #[serde(flatten)]
+    summary: JobSummary,
+    environment: EnvConfig,
+    training: Training,
+}
+
+impl From<store::JobSummary> for JobSummary {
+    fn from(job: store::JobSummary) -> Self {
+        let SpecSummary { kind, name, labels, threads, priority, algorithm, preset, seed, steps } = job.spec;
+        Self {
+            id: job.id,
+            state: job.state,
+            wanted: job.pending_action,
+            reason: job.reason,
+            progress: Progress { step: job.step, steps },
+            attempts: job.attempts,
+            failures: job.failures,
+            policy: job.policy,
+            last_event_id: job.last_event,
+            created_at: job.created_at,
+            started_at: job.started_at,
+            ended_at: job.ended_at,
+            kind,
+            name,
+            labels,
+            threads,
+            priority,
+            algorithm,
+            preset,
+            seed,
+        }
+    }
+}
+
+impl From<store::Job> for Job {
+    fn from(job: store::Job) -> Self {
+        let (summary, config) = job.split();
+        Self { summary: summary.into(), environment: config.environment, training: config.training }
+    }
+}
+
+/// A metric at one step.
+#[derive(Debug, Serialize, ToSchema)]
+pub(in crate::api::rest) struct MetricRow {
+    name: String,
+    /// Environment steps.
+    step: u64,
+    /// Null where the value was not a finite number.
+    #[schema(required = true)]
+    value: Option<f64>,
+    at: Timestamp,
+}
+
+impl From<store::MetricRow> for MetricRow {
+    fn from(row: store::MetricRow) -> Self {
+        let store::MetricRow { name, step, value, at } = row;
+        Self { name, step, value, at }
+    }
+}
+
+/// Metrics as a table: a header, then a line per row; an unknown value is empty. Names contain no comma.
+pub(super) fn to_csv(rows: &[store::MetricRow]) -> String {
+    use std::fmt::Write;
+    let mut csv = String::from("name,step,value,at\n");
+    for store::MetricRow { name, step, value, at } in rows {
+        let value = value.map(|v| v.to_string()).unwrap_or_default();
+        writeln!(csv, "{name},{step},{value},{at}").expect("writing to a string cannot fail");
+    }
+    csv
+}
+
+/// A checkpoint without its bytes.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct Checkpoint {
+    id: Uuid,
+    #[schema(value_type = Uuid)]
+    job: JobId,
+    kind: CheckpointKind,
+    attempt: u32,
+    /// Environment steps at which it was taken.
+    step: u64,
+    #[schema(pattern = "^[0-9a-f]{64}$")]
+    sha256: String,
+    /// Bytes.
+    size: u64,
+    /// Metrics of its evaluation.
+    metrics: BTreeMap<String, f64>,
+    /// The job's resolved training configuration.
+    #[schema(value_type = Object)]
+    config: Value,
+    created_at: Timestamp,
+}
+
+impl From<store::Checkpoint> for Checkpoint {
+    fn from(checkpoint: store::Checkpoint) -> Self {
+        let store::Checkpoint { id, job, kind, attempt, step, sha256, size, metrics, config, created_at } = checkpoint;
+        Self { id, job, kind, attempt, step, sha256, size, metrics, config, created_at }
+    }
+}
+
+/// An attempt at a job by one worker process.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct Attempt {
+    attempt: u32,
+    started_at: Timestamp,
+    #[schema(required = true)]
+    ended_at: Option<Timestamp>,
+    #[schema(required = true)]
+    outcome: Option<AttemptOutcome>,
+    #[schema(required = true)]
+    reason: Option<String>,
+    /// The end of the worker's output.
+    log: String,
+}
+
+impl From<store::Attempt> for Attempt {
+    fn from(attempt: store::Attempt) -> Self {
+        let store::Attempt { number, started_at, ended_at, outcome, reason, log } = attempt;
+        Self { attempt: number, started_at, ended_at, outcome, reason, log }
+    }
+}

@@ -1,0 +1,256 @@
+//! Nodes and scenes as callers describe them, whatever the transport, to an [`Observation`]: ids resolved, AoI gathered, detections
+//! made symmetric.
+//!
+//! The adjacency matrix is symmetric (docs/model.md, "Graph"): a detection that one side reports is mirrored; the reports of both
+//! sides have to be each other's negation.
+
+use std::collections::HashMap;
+
+use super::ids::{Ids, check_counts, check_distinct, check_nodes, node_indices, request_order};
+use super::{Fleet, Graph, GraphForm, Observation, ReportedDetection, Scene, SceneOrGraph};
+use crate::env::Point;
+use crate::invalid::{Invalid, in_range};
+
+/// Largest coordinate of an absolute position, in units of the square's side.
+const MAX_COORDINATE: f64 = 1e4;
+/// Largest AoI, in slots.
+const MAX_AOI: f64 = 1e6;
+/// Two reports of one pair may differ by this much, because callers may compute in f32.
+const AGREEMENT: f64 = 1e-5;
+
+/// A node of a graph, with an iterator of its detections.
+#[derive(Clone, Debug)]
+pub struct Node<D> {
+    /// Id.
+    pub id: String,
+    /// Whether it is a UAV; otherwise it is a user.
+    pub is_uav: bool,
+    /// What it detects.
+    pub detections: D,
+    /// Own position of a UAV, where known.
+    pub position: Option<Point>,
+    /// Own AoI of a user in slots, where known.
+    pub aoi: Option<f64>,
+}
+
+/// A detection of the node `target_id`.
+#[derive(Clone, Debug)]
+pub struct NodeDetection {
+    /// The node.
+    pub target_id: String,
+    /// Target position - own position.
+    pub rel: Point,
+    /// AoI of a user in slots; none for a UAV.
+    pub aoi: Option<f64>,
+}
+
+/// Checks a number.
+pub(crate) fn finite(field: impl FnOnce() -> String, value: f64) -> Result<f64, Invalid> {
+    if value.is_finite() { Ok(value) } else { Err(Invalid::new(field(), value, "a finite number")) }
+}
+
+/// Checks an absolute position.
+pub(crate) fn point(field: impl Fn() -> String, [x, y]: Point) -> Result<Point, Invalid> {
+    for (axis, value) in [("x", x), ("y", y)] {
+        if !(-MAX_COORDINATE..=MAX_COORDINATE).contains(&value) {
+            finite(|| format!("{}.{axis}", field()), value)?;
+            in_range(&format!("{}.{axis}", field()), value, -MAX_COORDINATE..=MAX_COORDINATE)?;
+        }
+    }
+    Ok([x, y])
+}
+
+/// Checks an AoI.
+pub(crate) fn aoi(field: impl Fn() -> String, value: f64) -> Result<f32, Invalid> {
+    if !(0.0..=MAX_AOI).contains(&value) {
+        finite(&field, value)?;
+        in_range(&field(), value, 0.0..=MAX_AOI)?;
+    }
+    Ok(value as f32)
+}
+
+impl Observation {
+    /// The observation of a scene: id and position of each UAV; id, position and AoI of each user.
+    ///
+    /// # Errors
+    /// A field that is not valid, named as `scene.users[2].aoi`.
+    pub fn from_scene(
+        uavs: impl ExactSizeIterator<Item = (String, Point)>,
+        users: impl ExactSizeIterator<Item = (String, Point, f64)>,
+    ) -> Result<Self, Invalid> {
+        check_counts("scene", uavs.len(), users.len())?;
+        let mut positions = Vec::with_capacity(uavs.len());
+        let mut ids = Ids::with_capacity(uavs.len());
+        for (i, (id, position)) in uavs.enumerate() {
+            positions.push(point(|| format!("scene.uavs[{i}]"), position)?);
+            ids.push(|| format!("scene.uavs[{i}].id"), id, i)?;
+        }
+        let (uav_ids, uav_places) = ids.sorted();
+        let mut states = Vec::with_capacity(users.len());
+        let mut ids = Ids::with_capacity(users.len());
+        for (i, (id, position, age)) in users.enumerate() {
+            let position = point(|| format!("scene.users[{i}]"), position)?;
+            states.push((position, aoi(|| format!("scene.users[{i}].aoi"), age)?));
+            ids.push(|| format!("scene.users[{i}].id"), id, i)?;
+        }
+        let (user_ids, user_places) = ids.sorted();
+        check_distinct((&uav_ids, &uav_places), (&user_ids, &user_places), |is_uav, place| {
+            format!("scene.{}[{place}].id", if is_uav { "uavs" } else { "users" })
+        })?;
+        Ok(Self {
+            uav_order: request_order(&uav_places),
+            content: SceneOrGraph::Scene(Scene {
+                uavs: uav_places.iter().map(|&place| positions[place as usize]).collect(),
+                users: user_places.iter().map(|&place| states[place as usize].0).collect(),
+                aoi: user_places.iter().map(|&place| states[place as usize].1).collect(),
+            }),
+            fleet: Fleet { uavs: uav_ids, users: user_ids },
+        })
+    }
+
+    /// The observation of a graph.
+    ///
+    /// # Errors
+    /// A field that is not valid, named as `graph.nodes[2].id`; detections that contradict each other.
+    pub fn from_nodes<D: ExactSizeIterator<Item = NodeDetection>>(nodes: Vec<Node<D>>) -> Result<Self, Invalid> {
+        check_nodes("graph.nodes", nodes.len())?;
+        let mut nodes: Vec<Option<Node<D>>> = nodes.into_iter().map(Some).collect();
+        let (mut uavs, mut users) = (Ids::default(), Ids::default());
+        for (place, node) in nodes.iter_mut().flatten().enumerate() {
+            let ids = if node.is_uav { &mut uavs } else { &mut users };
+            ids.push(|| format!("graph.nodes[{place}].id"), std::mem::take(&mut node.id), place)?;
+        }
+        let ((uavs, uav_places), (users, user_places)) = (uavs.sorted(), users.sorted());
+        check_counts("graph.nodes", uavs.len(), users.len())?;
+        check_distinct((&uavs, &uav_places), (&users, &user_places), |_, place| format!("graph.nodes[{place}].id"))?;
+        let indices = node_indices(&uavs, &users);
+        let mut builder = Builder::new(uavs.len(), users.len());
+        for (index, &place) in uav_places.iter().chain(&user_places).enumerate() {
+            if let Some(node) = nodes[place as usize].take() {
+                builder.push(index, place, node, &indices)?;
+            }
+        }
+        let graph = mirror(builder.graph)?;
+        Ok(Self { uav_order: request_order(&uav_places), content: SceneOrGraph::Graph(graph), fleet: Fleet { uavs, users } })
+    }
+}
+
+struct Builder {
+    graph: Graph,
+    /// Whether the AoI of a user was reported.
+    has_aoi: Vec<bool>,
+}
+
+impl Builder {
+    fn new(uavs: usize, users: usize) -> Self {
+        let graph = Graph {
+            positions: vec![None; uavs],
+            aoi: vec![0.0; users],
+            detections: Vec::with_capacity(uavs + users),
+            left_out: vec![false; users],
+            places: Vec::with_capacity(uavs + users),
+            form: GraphForm::Nodes,
+        };
+        Self { graph, has_aoi: vec![false; users] }
+    }
+
+    /// Adds the node at `place` of the request. Nodes come in canonical order.
+    fn push<D: ExactSizeIterator<Item = NodeDetection>>(
+        &mut self,
+        index: usize,
+        place: u32,
+        node: Node<D>,
+        indices: &HashMap<&str, u32>,
+    ) -> Result<(), Invalid> {
+        self.graph.places.push(place);
+        let uavs = self.graph.positions.len();
+        let path = || format!("graph.nodes[{place}]");
+        if let Some(user) = index.checked_sub(uavs) {
+            if let Some(value) = node.aoi {
+                self.set_aoi(user, value, || format!("{}.aoi", path()))?;
+            }
+            if node.position.is_some() {
+                return Err(Invalid::new(
+                    format!("{}.position", path()),
+                    "a position",
+                    "no value, because only UAVs have positions in a graph",
+                ));
+            }
+            self.graph.left_out[user] = node.detections.len() == 0;
+        } else {
+            if let Some(value) = node.aoi {
+                return Err(Invalid::new(format!("{}.aoi", path()), value, "no value, because only users have an AoI"));
+            }
+            if let Some(position) = node.position {
+                self.graph.positions[index] = Some(point(|| format!("{}.position", path()), position)?);
+            }
+        }
+        let mut list = Vec::with_capacity(node.detections.len());
+        for (i, detection) in node.detections.enumerate() {
+            let field = |name: &str| format!("graph.nodes[{place}].detections[{i}].{name}");
+            let NodeDetection { target_id, rel, aoi } = detection;
+            let Some(&target) = indices.get(target_id.as_str()) else {
+                return Err(Invalid::new(field("target_id"), format!("{target_id:?}"), "the id of a node in the graph"));
+            };
+            if target as usize == index {
+                return Err(Invalid::new(field("target_id"), format!("{target_id:?}"), "the id of another node"));
+            }
+            let rel = [finite(|| field("rel_x"), rel[0])?, finite(|| field("rel_y"), rel[1])?];
+            match ((target as usize).checked_sub(uavs), aoi) {
+                (Some(user), Some(value)) => self.set_aoi(user, value, || field("aoi"))?,
+                (Some(_), None) => return Err(Invalid::missing(field("aoi"), "the AoI of the user in slots")),
+                (None, Some(value)) => return Err(Invalid::new(field("aoi"), value, "no value, because the target is a UAV")),
+                (None, None) => {}
+            }
+            list.push(ReportedDetection { target, rel, place: i as u32, mirrored: false });
+        }
+        list.sort_by_key(|s| s.target);
+        if let Some(pair) = list.windows(2).find(|pair| pair[0].target == pair[1].target) {
+            let field = format!("{}.detections[{}].target_id", path(), pair[1].place);
+            return Err(Invalid::new(field, format!("node {} twice", pair[1].target), "one detection per target"));
+        }
+        self.graph.detections.push(list);
+        Ok(())
+    }
+
+    fn set_aoi(&mut self, user: usize, value: f64, field: impl Fn() -> String) -> Result<(), Invalid> {
+        let value = aoi(&field, value)?;
+        let known = self.graph.aoi[user];
+        if self.has_aoi[user] && known.to_bits() != value.to_bits() {
+            return Err(Invalid::new(field(), value, format!("{known}, the AoI of the same user elsewhere in the graph")));
+        }
+        self.graph.aoi[user] = value;
+        self.has_aoi[user] = true;
+        Ok(())
+    }
+}
+
+/// Mirrors detections that one side reports, and compares those that both report. Lists are in ascending order of target.
+pub(crate) fn mirror(mut graph: Graph) -> Result<Graph, Invalid> {
+    let mut mirrored = Vec::new();
+    for (node, list) in graph.detections.iter().enumerate() {
+        for detection in list {
+            let back = [-detection.rel[0], -detection.rel[1]];
+            let other = &graph.detections[detection.target as usize];
+            let Ok(at) = other.binary_search_by_key(&(node as u32), |s| s.target) else {
+                let back = ReportedDetection { target: node as u32, rel: back, place: 0, mirrored: true };
+                mirrored.push((detection.target as usize, back));
+                continue;
+            };
+            let [x, y] = other[at].rel;
+            if (x - back[0]).abs() > AGREEMENT || (y - back[1]).abs() > AGREEMENT {
+                let field = graph.rel_field(detection.target as usize, other[at].place);
+                let expected =
+                    format!("about ({}, {}), the negation of the position that the other node reports", back[0], back[1]);
+                return Err(Invalid::new(field, format!("({x}, {y})"), expected));
+            }
+        }
+    }
+    for (node, detection) in mirrored {
+        graph.detections[node].push(detection);
+    }
+    for list in &mut graph.detections {
+        list.sort_by_key(|s| s.target);
+    }
+    Ok(graph)
+}
