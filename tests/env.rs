@@ -254,7 +254,7 @@ fn replay(name: &str, bytes: &[u8]) {
             for (p, q) in e.uavs().iter().zip(&recorded) {
                 assert!((p[0] - q[0]).abs() < 1e-5 && (p[1] - q[1]).abs() < 1e-5, "{name}: slot {slot}: {p:?}, not {q:?}");
             }
-            // Where a user is within rounding of the edge, either answer is right, and the episode goes its own way.
+            // A user within rounding of the transmission range may or may not be collected, and the episodes diverge.
             let edge = recorded
                 .iter()
                 .any(|p| e.users().iter().any(|u| ((p[0] - u[0]).hypot(p[1] - u[1]) - config.transmission_range).abs() < 1e-6));
@@ -273,7 +273,7 @@ fn replay(name: &str, bytes: &[u8]) {
 
 proptest! {
     #[test]
-    fn whatever_is_flown(
+    fn invariants_hold_for_any_actions(
         seed: u64, uavs in 1..5_usize, users in 1..7_usize, hover: bool, free: bool, walk: bool,
         actions in prop::collection::vec(0..9_u8, 200),
     ) {
@@ -290,7 +290,7 @@ proptest! {
             let moves: Vec<u8> = (0..uavs).map(|i| actions[(slot * uavs + i) % 200] % config.headings() as u8).collect();
             let before: Vec<f32> = one.aoi().to_vec();
             let reward = one.step(&moves).unwrap();
-            // The second copy of a batch is the episode alone, bit for bit.
+            // The second copy of the batch equals the single episode, bit for bit.
             batch.try_step(&moves.repeat(3)).unwrap();
             prop_assert_eq!(&batch.aoi()[users..2 * users], one.aoi());
             prop_assert_eq!(batch.reward()[1], reward);

@@ -52,8 +52,6 @@ pub enum Identity {
 
 /// Width of a `token` identity.
 pub const TOKEN: usize = 4;
-/// H, the hidden width.
-pub const HIDDEN: usize = crate::nn::HIDDEN;
 
 /// Architecture of the agents, shared by all UAVs (docs/model.md, "Agents").
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

@@ -14,7 +14,7 @@ mod slot;
 
 pub use actor::{Actor, StepInput};
 pub use agent::{Agent, AgentCache, Dims};
-pub use config::{AgentConfig, Aggregation, Gnn, HIDDEN, Identity, ObservationKind, TOKEN};
+pub use config::{AgentConfig, Aggregation, Gnn, Identity, ObservationKind, TOKEN};
 pub use features::{Inputs, NO_ACTION, SetEncoder, flat_observation, flat_state};
 pub use geometry::{FleetSpan, Geometry, GeometryConfig, NodeView};
 pub use hop_search::HopSearch;
