@@ -1,4 +1,5 @@
-//! Allocations of the engine: none per slot in steady state.
+//! Allocations of the engine in steady state: one reply channel per task that is queued, none for a task that is computed
+//! inline.
 
 use std::pin::pin;
 use std::sync::Arc;
@@ -65,12 +66,14 @@ fn allocations_per_slot(engine: &Engine, policy: &Arc<LoadedPolicy>, fleets: usi
 }
 
 #[test]
-fn engine_does_not_allocate_in_steady_state() {
+fn engine_allocates_only_reply_channels_in_steady_state() {
     let config = EngineConfig { threads: 2, queue: 64, max_batch: 64, max_batch_delay: Duration::ZERO };
     let engine = Engine::start(config).unwrap();
     let policy = policy();
     let batched = allocations_per_slot(&engine, &policy, 8, 40);
     assert!(batched[0] > 0, "the first slot allocates the buffers");
-    assert_eq!(batched[20..], [0; 20]);
-    assert_eq!(allocations_per_slot(&engine, &policy, 1, 40)[20..], [0; 20]);
+    assert_eq!(batched[20..], [8; 20], "eight tasks are queued per slot");
+    // Most single tasks are computed without the queue; one in sixteen is queued to find out whether others join it.
+    let single = allocations_per_slot(&engine, &policy, 1, 40);
+    assert!(single[20..].iter().sum::<u64>() <= 2, "{single:?}");
 }

@@ -4,8 +4,9 @@
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::{Duration, Instant};
 
+use tokio::sync::oneshot;
+
 use super::metrics::EngineMetrics;
-use super::reply::Sender;
 use super::task::{Task, TaskOutput, Timings};
 use crate::policy::FleetStep;
 use crate::serving::{Error, LoadedPolicy};
@@ -15,7 +16,7 @@ pub(super) struct Queued {
     pub(super) task: Task,
     pub(super) since: Instant,
     pub(super) deadline: Option<Instant>,
-    pub(super) reply: Sender,
+    pub(super) reply: oneshot::Sender<Result<TaskOutput, Error>>,
 }
 
 /// Tasks to compute together, and buffers that are kept from one batch to the next.
@@ -35,7 +36,8 @@ impl Batch {
         let in_time = |queued: &Queued| queued.deadline.is_none_or(|deadline| started < deadline);
         if !self.tasks.iter().all(|queued| in_time(queued) && !queued.reply.is_closed()) {
             for late in self.tasks.extract_if(.., |queued| !in_time(queued)) {
-                late.reply.send(Err(Error::Deadline("in the engine's queue")));
+                // Nothing to do if the caller stopped waiting.
+                let _ = late.reply.send(Err(Error::Deadline("in the engine's queue")));
             }
             self.tasks.retain(|queued| !queued.reply.is_closed());
         }
@@ -53,7 +55,7 @@ impl Batch {
         if result.is_err() {
             counters.failure.increment(size as u64);
             for queued in self.tasks.drain(..) {
-                queued.reply.send(Err(panicked(&policy)));
+                let _ = queued.reply.send(Err(panicked(&policy)));
             }
             return size;
         }
@@ -63,7 +65,7 @@ impl Batch {
             let timings = Timings { queue: started - since, compute, batch_size: size as u32 };
             metrics.record_times(timings.queue, timings.compute);
             // The caller may have stopped waiting during the forward pass.
-            received += u64::from(reply.send(Ok(task.finish(timings))));
+            received += u64::from(reply.send(Ok(task.finish(timings))).is_ok());
         }
         counters.success.increment(received);
         counters.failure.increment(size as u64 - received);

@@ -13,7 +13,6 @@
 
 mod batch;
 mod metrics;
-mod reply;
 mod task;
 
 pub use task::{Decision, OutputBuffers, Task, TaskOutput, Timings};
@@ -25,7 +24,8 @@ use std::time::{Duration, Instant};
 
 use batch::{Batch, Queued};
 use metrics::EngineMetrics;
-use reply::{Receiver, ReplySlots};
+use tokio::sync::oneshot;
+use tokio::sync::oneshot::error::TryRecvError;
 
 use super::Error;
 
@@ -67,7 +67,6 @@ struct Shared {
     queue: Mutex<Queue>,
     /// Notified when a thread may have work.
     queued: Condvar,
-    replies: Arc<ReplySlots>,
     /// Inline batches of one since the last inline batch of several.
     singles: AtomicU32,
     config: EngineConfig,
@@ -180,7 +179,7 @@ impl Shared {
         singles < MAX_SINGLES || singles.is_multiple_of(BATCHING_PROBE_INTERVAL)
     }
 
-    fn enqueue(&self, task: Task, deadline: Option<Instant>) -> Result<Receiver, Error> {
+    fn enqueue(&self, task: Task, deadline: Option<Instant>) -> Result<oneshot::Receiver<Result<TaskOutput, Error>>, Error> {
         let mut queue = self.lock();
         let capacity = self.config.queue;
         if queue.waiting.len() >= capacity {
@@ -197,7 +196,7 @@ impl Shared {
             self.count_failure(&task);
             return Err(Error::Busy(format!("the engine's queue is full ({capacity} fleets)")));
         }
-        let (reply, receiver) = self.replies.channel();
+        let (reply, receiver) = oneshot::channel();
         queue.waiting.push_back(Queued { task, since: Instant::now(), deadline, reply });
         Ok(receiver)
     }
@@ -206,6 +205,11 @@ impl Shared {
 /// Whether a task may be computed inline.
 fn is_small(task: &Task) -> bool {
     task.policy().policy.is_cheap() && task.work() <= MAX_INLINE_WORK
+}
+
+/// The error of a caller whose task was dropped without a reply: a bug in the engine.
+fn lost_request() -> Error {
+    Error::Fault("the engine lost a request".into())
 }
 
 /// Wakes a thread when a caller stops waiting, so that its task leaves the queue soon.
@@ -236,7 +240,6 @@ impl Engine {
         let shared = Arc::new(Shared {
             queue: Mutex::default(),
             queued: Condvar::new(),
-            replies: Arc::default(),
             singles: AtomicU32::new(0),
             config,
             metrics: EngineMetrics::new(),
@@ -284,12 +287,14 @@ impl Engine {
                 tokio::task::yield_now().await;
             }
             loop {
-                if let Some(result) = receiver.try_recv() {
-                    guard.replied = true;
-                    return result;
-                }
-                if !shared.run_batch_inline() {
-                    break;
+                match receiver.try_recv() {
+                    Ok(result) => {
+                        guard.replied = true;
+                        return result;
+                    }
+                    Err(TryRecvError::Closed) => return Err(lost_request()),
+                    Err(TryRecvError::Empty) if shared.run_batch_inline() => {}
+                    Err(TryRecvError::Empty) => break,
                 }
             }
         }
@@ -297,11 +302,12 @@ impl Engine {
         shared.queued.notify_one();
         let result = match deadline {
             None => receiver.await,
-            Some(deadline) => {
-                let late = |_| Err(Error::Deadline("in the engine's queue"));
-                tokio::time::timeout_at(deadline.into(), receiver).await.unwrap_or_else(late)
-            }
+            Some(deadline) => match tokio::time::timeout_at(deadline.into(), receiver).await {
+                Ok(result) => result,
+                Err(_) => Ok(Err(Error::Deadline("in the engine's queue"))),
+            },
         };
+        let result = result.unwrap_or_else(|_| Err(lost_request()));
         guard.replied = !matches!(result, Err(Error::Deadline(_)));
         result
     }
