@@ -114,12 +114,12 @@ async fn recurrent_state_is_checked() {
 #[tokio::test]
 async fn episode_stays_on_its_version() {
     let server = Server::start().await;
-    server.add("p", 1, Arc::new(Deed::Count));
+    server.add("p", 1, Arc::new(TestPolicy::Count));
     server.app.registry.set_alias("p", "prod", 1);
     let mut client = server.grpc().await;
     client.open_session(open("p@prod", "s")).await.unwrap();
     let first = client.act(held("p", Bytes::new(), scene(3, 5, 0))).await.unwrap().into_inner();
-    server.add("p", 2, Arc::new(Deed::Count));
+    server.add("p", 2, Arc::new(TestPolicy::Count));
     server.app.registry.set_alias("p", "prod", 2);
     let version = |answer: v1::ActResponse| answer.policy.unwrap().version;
     let pinned = v1::ActRequest { policy: "p@prod".into(), ..in_session("s", None, scene(3, 5, 0)) };
@@ -181,9 +181,9 @@ async fn idle_session_expires_with_its_own_error() {
     let server = Server::start().await;
     let mut client = server.grpc().await;
     client.open_session(open("sweep", "s")).await.unwrap();
-    server.pass(599);
+    server.advance(599);
     client.act(in_session("s", Some(0), scene(3, 5, 0))).await.unwrap();
-    server.pass(601);
+    server.advance(601);
     let (code, reason, _) = refused(client.act(in_session("s", Some(1), scene(3, 5, 1))).await);
     assert_eq!((code, reason.as_str()), (Code::FailedPrecondition, "session_expired"));
     let closing = client.close_session(v1::CloseSessionRequest { session_id: "s".into() }).await;
@@ -194,7 +194,7 @@ async fn idle_session_expires_with_its_own_error() {
 #[tokio::test]
 async fn q_values_are_optional_and_hovering_has_no_degrees() {
     let server = Server::start().await;
-    server.add("p", 1, Arc::new(Deed::Count));
+    server.add("p", 1, Arc::new(TestPolicy::Count));
     let mut client = server.grpc().await;
     client.open_session(v1::OpenSessionRequest { seed: Some(8), ..open("p", "s") }).await.unwrap();
     let request = v1::ActRequest { return_q_values: true, ..in_session("s", Some(0), scene(2, 1, 0)) };
@@ -213,7 +213,7 @@ async fn q_values_are_optional_and_hovering_has_no_degrees() {
 async fn policies_are_listed_in_pages() {
     let server = Server::start().await;
     let mut client = server.grpc().await;
-    server.add("sweep", 2, Arc::new(Deed::Count));
+    server.add("sweep", 2, Arc::new(TestPolicy::Count));
     server.app.registry.set_alias("sweep", "old", 1);
     let mut names = Vec::new();
     let mut token = String::new();

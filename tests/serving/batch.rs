@@ -78,44 +78,44 @@ async fn stream_continues_after_rejected_slots() {
         }
         requests.send(in_session("a", Some(step + 5), scene(3, 5, step))).await.unwrap();
         for id in ["a", "b"] {
-            let streamed = answered(soon(answers.next()).await.unwrap().unwrap());
+            let streamed = answered(with_timeout(answers.next()).await.unwrap().unwrap());
             let single = client.act(in_session(&format!("{id}-single"), None, scene(3, 5, step))).await.unwrap().into_inner();
             assert_eq!((streamed.step, headings(&streamed)), (step, headings(&single)), "session {id}");
         }
-        let (status, code) = error(soon(answers.next()).await.unwrap().unwrap());
+        let (status, code) = error(with_timeout(answers.next()).await.unwrap().unwrap());
         assert_eq!((status, code.as_str()), (Code::FailedPrecondition.into(), "wrong_step"));
     }
     // A draining server ends the stream after it has answered all earlier requests.
     server.begin_stop();
-    while let Some(rest) = soon(answers.next()).await {
+    while let Some(rest) = with_timeout(answers.next()).await {
         assert!(rest.is_ok_and(|r| matches!(r.result, Some(SlotResult::Error(_)))), "only errors can follow");
     }
     drop(requests);
-    soon(server.stopped()).await;
+    with_timeout(server.stopped()).await;
 }
 
 #[tokio::test]
 async fn batched_fleets_get_the_decisions_of_single_calls() {
     let server = Server::with(|config| (config.engine.threads, config.engine.max_batch) = (1, 4)).await;
     let gate = Arc::new(Gate::default());
-    server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
-    server.add("count", 1, Arc::new(Deed::Count));
+    server.add("slow", 1, Arc::new(TestPolicy::Wait(gate.clone())));
+    server.add("count", 1, Arc::new(TestPolicy::Count));
     let client = server.grpc().await;
-    let ask = |request: v1::ActRequest| {
+    let send = |request: v1::ActRequest| {
         let mut client = client.clone();
         tokio::spawn(async move { client.act(request).await.unwrap().into_inner() })
     };
-    let blocked = ask(held("slow", Bytes::new(), scene(1, 1, 0)));
+    let blocked = send(held("slow", Bytes::new(), scene(1, 1, 0)));
     gate.reached(1).await;
-    let learned: Vec<_> = (0..6).map(|seed| ask(held("qedgix", Bytes::new(), scene(3, 5, seed)))).collect();
-    let other = ask(held("count", Bytes::new(), scene(2, 2, 0)));
+    let learned: Vec<_> = (0..6).map(|seed| send(held("qedgix", Bytes::new(), scene(3, 5, seed)))).collect();
+    let other = send(held("count", Bytes::new(), scene(2, 2, 0)));
     while server.app.engine.waiting() < 7 {
         tokio::task::yield_now().await;
     }
     gate.open();
-    soon(blocked).await.unwrap();
+    with_timeout(blocked).await.unwrap();
     // Waits for all of them, so that the single calls below do not join a batch.
-    let learned: Vec<_> = soon(futures::future::join_all(learned)).await.into_iter().map(Result::unwrap).collect();
+    let learned: Vec<_> = with_timeout(futures::future::join_all(learned)).await.into_iter().map(Result::unwrap).collect();
     let mut sizes = Vec::new();
     for (seed, batched) in learned.into_iter().enumerate() {
         let single = client.clone().act(held("qedgix", Bytes::new(), scene(3, 5, seed as u64))).await.unwrap().into_inner();
@@ -125,7 +125,7 @@ async fn batched_fleets_get_the_decisions_of_single_calls() {
     }
     sizes.sort_unstable();
     assert_eq!(sizes, [2, 2, 4, 4, 4, 4], "at most four fleets per batch");
-    assert_eq!(soon(other).await.unwrap().timings.unwrap().batch_size, 1, "another policy has a batch of its own");
+    assert_eq!(with_timeout(other).await.unwrap().timings.unwrap().batch_size, 1, "another policy has a batch of its own");
 }
 
 #[tokio::test]
@@ -136,15 +136,15 @@ async fn batch_with_delay_starts_when_it_is_full_or_the_delay_has_passed() {
     // The second fleet fills the batch, so the delay of ten seconds does not apply.
     let server = Server::with(|config| delay(config, Duration::from_secs(10))).await;
     let client = server.grpc().await;
-    let ask = || {
+    let send = || {
         let mut client = client.clone();
         tokio::spawn(async move { client.act(held("sweep", Bytes::new(), scene(2, 2, 0))).await.unwrap().into_inner() })
     };
-    let (one, two) = (ask(), ask());
-    assert_eq!(soon(one).await.unwrap().timings.unwrap().batch_size, 2);
-    assert_eq!(soon(two).await.unwrap().timings.unwrap().batch_size, 2);
+    let (one, two) = (send(), send());
+    assert_eq!(with_timeout(one).await.unwrap().timings.unwrap().batch_size, 2);
+    assert_eq!(with_timeout(two).await.unwrap().timings.unwrap().batch_size, 2);
     let server = Server::with(|config| delay(config, Duration::from_millis(1))).await;
-    let single = soon(async { server.grpc().await.act(held("sweep", Bytes::new(), scene(2, 2, 0))).await }).await.unwrap();
+    let single = with_timeout(async { server.grpc().await.act(held("sweep", Bytes::new(), scene(2, 2, 0))).await }).await.unwrap();
     assert_eq!(single.into_inner().timings.unwrap().batch_size, 1);
 }
 

@@ -11,7 +11,7 @@ use qedgix::wire::v1::policy_service_client::PolicyServiceClient;
 use serde_json::Value;
 use tonic::transport::Channel;
 
-use super::harness::soon;
+use super::harness::with_timeout;
 
 /// A `qedgix serve` on free ports; killed when dropped.
 pub struct Binary {
@@ -52,7 +52,7 @@ impl Binary {
             }
         });
         let mut binary = Self { child, grpc: String::new(), http: String::new(), lines, reader: Some(reader), close };
-        let text = soon(async {
+        let text = with_timeout(async {
             loop {
                 if let Ok(text) = std::fs::read_to_string(&endpoints) {
                     break text;
@@ -94,7 +94,7 @@ impl Binary {
 
     /// Waits for a log line that contains `text`.
     pub async fn says(&self, text: &str) -> String {
-        soon(async {
+        with_timeout(async {
             loop {
                 if let Some(line) = self.lines().into_iter().find(|line| line.contains(text)) {
                     return line;
@@ -117,7 +117,7 @@ impl Binary {
 
     /// Waits for the exit and returns the exit code and the whole log.
     pub async fn ended(mut self) -> (Option<i32>, Vec<String>) {
-        let status = soon(async {
+        let status = with_timeout(async {
             loop {
                 if let Some(status) = self.child.try_wait().unwrap() {
                     break status;

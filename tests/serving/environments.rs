@@ -1,4 +1,4 @@
-//! Hosted environments over gRPC and REST: the bits of `BatchEnv`, safe retries, automatic resets, limits.
+//! Hosted environments over gRPC and REST: equality with `BatchEnv`, retries, automatic resets, limits.
 
 use bytes::Bytes;
 use futures::future::join_all;
@@ -27,8 +27,8 @@ fn create(id: &str, count: u32, environment: &Value) -> v1::CreateEnvironmentReq
     v1::CreateEnvironmentRequest { environment, count: Some(count), environment_id, seed: 7, auto_reset: false }
 }
 
-/// The first observation of a new environment.
-async fn made(client: &mut Client, request: v1::CreateEnvironmentRequest) -> v1::EnvironmentState {
+/// Creates an environment and returns its first state.
+async fn create_and_reset(client: &mut Client, request: v1::CreateEnvironmentRequest) -> v1::EnvironmentState {
     let id = client.create_environment(request).await.unwrap().into_inner().environment_id;
     client.reset(reset(&id)).await.unwrap().into_inner()
 }
@@ -48,7 +48,7 @@ fn step(id: &str, step: u64, actions: Vec<v1::Headings>) -> v1::StepRequest {
     v1::StepRequest { environment_id: id.into(), actions, step: Some(step), return_graph: false }
 }
 
-async fn fly(client: &mut Client, request: v1::StepRequest) -> v1::EnvironmentState {
+async fn step_once(client: &mut Client, request: v1::StepRequest) -> v1::EnvironmentState {
     client.step(request).await.unwrap().into_inner()
 }
 
@@ -56,11 +56,11 @@ fn flat(actions: &[v1::Headings]) -> Vec<u8> {
     actions.iter().flat_map(|copy| &copy.headings).map(|&heading| heading as u8).collect()
 }
 
-fn figures(m: EpisodeMetrics) -> v1::EpisodeMetrics {
+fn wire_metrics(m: EpisodeMetrics) -> v1::EpisodeMetrics {
     m.into()
 }
 
-/// Every number that the copies show is the one that `env` holds, to the bit.
+/// Checks that all numbers in `state` are bit-identical to those in `env`.
 fn assert_same(state: &v1::EnvironmentState, env: &BatchEnv) {
     let scenes = || state.copies.iter().map(|copy| copy.scene.as_ref().unwrap());
     let bits = |xs: &[f32]| xs.iter().map(|&x| f64::from(x).to_bits()).collect::<Vec<_>>();
@@ -74,7 +74,7 @@ fn assert_same(state: &v1::EnvironmentState, env: &BatchEnv) {
 }
 
 #[tokio::test]
-async fn an_environment_is_a_batch_env() {
+async fn hosted_environment_is_bit_identical_to_batch_env() {
     let server = Server::start().await;
     let mut client = client(&server).await;
     let cases = [
@@ -86,47 +86,47 @@ async fn an_environment_is_a_batch_env() {
             json!({"slots": 9, "hover": true, "boundary": "free", "start": "random", "user_speed": 0.05, "reward_scale": 5,
                    "weights": [1, 2, 3, 4, 0.5]}),
         ),
-        ("large, stepped elsewhere", 2, json!({"uavs": 40, "users": 700, "slots": 3})),
+        ("large, on a blocking thread", 2, json!({"uavs": 40, "users": 700, "slots": 3})),
     ];
     for (id, count, environment) in cases {
         let config: EnvConfig = train_config::environment(environment.clone()).unwrap();
         let mut env = BatchEnv::new(&config, count).unwrap();
         env.reset(&(0..count as u64).map(|b| 7 + b).collect::<Vec<_>>());
-        let state = made(&mut client, create(id, count as u32, &environment)).await;
+        let state = create_and_reset(&mut client, create(id, count as u32, &environment)).await;
         assert_eq!((state.step, state.episode, state.slot, state.copies.len()), (0, 0, 0, count));
         assert_same(&state, &env);
         for k in 0..config.slots as u64 {
             let actions = headings(count, config.uavs, config.headings() as u32, k);
             env.step(&flat(&actions));
-            let state = fly(&mut client, step(id, k, actions)).await;
+            let state = step_once(&mut client, step(id, k, actions)).await;
             assert_eq!((state.step, state.slot), (k + 1, env.slot() as u32));
             assert_same(&state, &env);
             for (b, copy) in state.copies.into_iter().enumerate() {
                 assert_eq!((copy.truncated, copy.seed), (env.done(), 7 + b as u64), "{id}, copy {b}");
                 let metrics = copy.finished.map(|finished| finished.metrics.unwrap());
-                assert_eq!(metrics, env.done().then(|| figures(env.metrics(b))), "{id}, copy {b}");
+                assert_eq!(metrics, env.done().then(|| wire_metrics(env.metrics(b))), "{id}, copy {b}");
             }
         }
     }
 }
 
 #[tokio::test]
-async fn a_repeated_step_is_flown_once() {
+async fn repeated_step_returns_the_same_state() {
     let server = Server::start().await;
     let mut client = client(&server).await;
     let environment = json!({"slots": 4, "start": "random"});
-    made(&mut client, v1::CreateEnvironmentRequest { auto_reset: true, ..create("e", 2, &environment) }).await;
+    create_and_reset(&mut client, v1::CreateEnvironmentRequest { auto_reset: true, ..create("e", 2, &environment) }).await;
     let actions = |k| headings(2, 3, 8, k);
     assert_eq!(refused(client.step(step("e", 1, actions(1))).await).1, "wrong_step");
     for k in 0..6 {
         let attempts = (0..4).map(|_| {
             let mut client = client.clone();
-            async move { fly(&mut client, step("e", k, actions(k))).await }
+            async move { step_once(&mut client, step("e", k, actions(k))).await }
         });
-        let answers = soon(join_all(attempts)).await;
+        let answers = with_timeout(join_all(attempts)).await;
         assert!(answers.iter().all(|answer| *answer == answers[0]), "step {k}");
-        let other = fly(&mut client, step("e", k, actions(k + 100))).await;
-        assert_eq!(other, answers[0], "the slot has been flown, whatever the retry flies");
+        let other = step_once(&mut client, step("e", k, actions(k + 100))).await;
+        assert_eq!(other, answers[0], "a repetition returns the first state, whatever its actions");
         assert_eq!((other.step, other.slot, other.episode), (k + 1, (k as u32 + 1) % 4, (k + 1) / 4));
         assert_eq!(other.copies[0].finished.is_some(), k == 3);
         for wrong in [k + 2, k.wrapping_sub(1), u64::MAX] {
@@ -134,26 +134,26 @@ async fn a_repeated_step_is_flown_once() {
             assert_eq!((code, reason.as_str()), (Code::FailedPrecondition, "wrong_step"), "{message}");
         }
     }
-    let uncounted = v1::StepRequest { step: None, ..step("e", 0, actions(6)) };
-    assert_eq!(fly(&mut client, uncounted).await.step, 7);
-    let shown = v1::GetEnvironmentRequest { environment_id: "e".into() };
-    let shown = client.get_environment(shown).await.unwrap().into_inner();
+    let without_step = v1::StepRequest { step: None, ..step("e", 0, actions(6)) };
+    assert_eq!(step_once(&mut client, without_step).await.step, 7);
+    let get = v1::GetEnvironmentRequest { environment_id: "e".into() };
+    let shown = client.get_environment(get).await.unwrap().into_inner();
     assert_eq!((shown.step, shown.episode, shown.slot), (7, 1, 3));
 }
 
 #[tokio::test]
-async fn an_automatic_reset_is_the_reset_that_a_caller_would_send() {
+async fn automatic_reset_equals_a_reset_by_the_caller() {
     let server = Server::start().await;
     let mut client = client(&server).await;
     let environment = json!({"slots": 5, "user_speed": 0.02});
-    made(&mut client, v1::CreateEnvironmentRequest { auto_reset: true, ..create("auto", 3, &environment) }).await;
-    made(&mut client, create("by hand", 3, &environment)).await;
+    create_and_reset(&mut client, v1::CreateEnvironmentRequest { auto_reset: true, ..create("auto", 3, &environment) }).await;
+    create_and_reset(&mut client, create("by hand", 3, &environment)).await;
     let graph = |request: v1::StepRequest| v1::StepRequest { return_graph: true, ..request };
     for episode in 0..3 {
         for slot in 0..5 {
             let k = episode * 5 + slot;
-            let auto = fly(&mut client, graph(step("auto", k, headings(3, 3, 8, k)))).await;
-            let by_hand = fly(&mut client, graph(step("by hand", slot, headings(3, 3, 8, k)))).await;
+            let auto = step_once(&mut client, graph(step("auto", k, headings(3, 3, 8, k)))).await;
+            let by_hand = step_once(&mut client, graph(step("by hand", slot, headings(3, 3, 8, k)))).await;
             if slot < 4 {
                 assert_eq!(auto.copies, by_hand.copies);
                 continue;
@@ -165,53 +165,53 @@ async fn an_automatic_reset_is_the_reset_that_a_caller_would_send() {
             assert_eq!((auto.episode, auto.slot), (next.episode, next.slot));
             for ((auto, ended), next) in auto.copies.into_iter().zip(by_hand.copies).zip(next.copies) {
                 assert!(auto.truncated && ended.truncated && !next.truncated);
-                assert_eq!((auto.scene, auto.graph, auto.seed), (next.scene, next.graph, next.seed), "what is seen is the next");
-                assert_eq!((auto.reward, next.reward), (ended.reward, 0.0), "what is earned was the last");
+                assert_eq!((auto.scene, auto.graph, auto.seed), (next.scene, next.graph, next.seed), "the observation is of the next episode");
+                assert_eq!((auto.reward, next.reward), (ended.reward, 0.0), "the reward is of the last step");
                 let (finished, plain) = (auto.finished.unwrap(), ended.finished.unwrap());
-                assert_eq!((finished.scene, finished.graph), (ended.scene, ended.graph), "the end is not lost");
+                assert_eq!((finished.scene, finished.graph), (ended.scene, ended.graph), "the last observation of the episode");
                 assert_eq!((finished.metrics, finished.seed), (plain.metrics, plain.seed));
-                assert_eq!(plain.scene, None, "it is in the observation already");
+                assert_eq!(plain.scene, None, "without automatic reset, the state itself is the last observation");
             }
         }
     }
 }
 
 #[tokio::test]
-async fn a_reset_says_which_episode_and_may_be_repeated() {
+async fn reset_selects_the_episode_and_may_be_repeated() {
     let server = Server::start().await;
     let mut client = client(&server).await;
-    let first = made(&mut client, create("e", 2, &json!({"slots": 3}))).await;
-    assert_eq!(client.reset(reset("e")).await.unwrap().into_inner(), first, "nothing was flown");
-    fly(&mut client, step("e", 0, headings(2, 3, 8, 0))).await;
+    let first = create_and_reset(&mut client, create("e", 2, &json!({"slots": 3}))).await;
+    assert_eq!(client.reset(reset("e")).await.unwrap().into_inner(), first, "a reset at slot 0 changes nothing");
+    step_once(&mut client, step("e", 0, headings(2, 3, 8, 0))).await;
     let second = client.reset(reset("e")).await.unwrap().into_inner();
     assert_eq!((second.episode, second.step, second.slot), (1, 0, 0));
-    assert_eq!(client.reset(reset("e")).await.unwrap().into_inner(), second, "a retry");
-    assert_eq!(refused(client.step(step("e", 1, headings(2, 3, 8, 0))).await).1, "wrong_step", "steps count from a reset");
+    assert_eq!(client.reset(reset("e")).await.unwrap().into_inner(), second, "a repeated reset");
+    assert_eq!(refused(client.step(step("e", 1, headings(2, 3, 8, 0))).await).1, "wrong_step", "steps count from the reset");
     let at = |seed, episode| v1::ResetRequest { seed, episode, ..reset("e") };
-    let ask = async |request| client.clone().reset(request).await.unwrap().into_inner();
-    assert_eq!(ask(at(None, Some(0))).await, first);
-    assert_eq!(ask(at(None, Some(1))).await, second);
-    assert_eq!(ask(at(Some(7), None)).await, first);
-    assert_eq!(ask(at(Some(7), Some(1))).await, second);
-    let other = ask(at(Some(8), None)).await;
-    assert_eq!(other.copies[0], first.copies[1], "copies are seeded one after another");
-    assert_eq!(ask(at(Some(8), Some(1))).await.copies[0], second.copies[1], "in later episodes too");
-    // A seed that was told is the seed of the same episode.
-    let told = second.copies[1].seed;
-    assert!(told < 1 << 53, "JSON holds it");
-    assert_eq!(ask(at(Some(told), None)).await.copies[0].scene, second.copies[1].scene);
+    let reset_to = async |request| client.clone().reset(request).await.unwrap().into_inner();
+    assert_eq!(reset_to(at(None, Some(0))).await, first);
+    assert_eq!(reset_to(at(None, Some(1))).await, second);
+    assert_eq!(reset_to(at(Some(7), None)).await, first);
+    assert_eq!(reset_to(at(Some(7), Some(1))).await, second);
+    let other = reset_to(at(Some(8), None)).await;
+    assert_eq!(other.copies[0], first.copies[1], "consecutive copies have consecutive seeds");
+    assert_eq!(reset_to(at(Some(8), Some(1))).await.copies[0], second.copies[1], "in later episodes too");
+    // The reported seed reproduces the episode.
+    let seed = second.copies[1].seed;
+    assert!(seed < 1 << 53, "exact in JSON");
+    assert_eq!(reset_to(at(Some(seed), None)).await.copies[0].scene, second.copies[1].scene);
     assert_invalid(client.reset(at(Some(1 << 53), None)).await, "seed", "9007199254740992");
 }
 
 #[tokio::test]
-async fn creating_twice_is_a_retry_only_if_nothing_differs() {
+async fn creating_twice_is_a_retry_only_with_equal_requests() {
     let server = Server::start().await;
     let mut client = client(&server).await;
     let good = || create("e", 2, &json!({"users": 4}));
     let first = client.create_environment(good()).await.unwrap().into_inner();
     assert_eq!((first.headings, first.count, first.seed), (8, 2, 7));
     let config = first.environment.as_ref().unwrap();
-    assert_eq!(config.fields["reward_scale"].kind, Some(prost_types::value::Kind::NumberValue(1.0 / 80.0)), "all is said");
+    assert_eq!(config.fields["reward_scale"].kind, Some(prost_types::value::Kind::NumberValue(1.0 / 80.0)), "the response has the complete configuration");
     assert_eq!(client.create_environment(good()).await.unwrap().into_inner(), first);
     let different = [
         v1::CreateEnvironmentRequest { count: Some(3), ..good() },
@@ -223,22 +223,22 @@ async fn creating_twice_is_a_retry_only_if_nothing_differs() {
         let (code, reason, _) = refused(client.create_environment(different).await);
         assert_eq!((code, reason.as_str()), (Code::AlreadyExists, "already_exists"));
     }
-    fly(&mut client, step("e", 0, headings(2, 3, 8, 0))).await;
+    step_once(&mut client, step("e", 0, headings(2, 3, 8, 0))).await;
     assert_eq!(refused(client.create_environment(good()).await).0, Code::AlreadyExists);
     let unnamed = || v1::CreateEnvironmentRequest { environment_id: String::new(), ..good() };
-    let one = client.create_environment(unnamed()).await.unwrap().into_inner().environment_id;
-    assert_ne!(client.create_environment(unnamed()).await.unwrap().into_inner().environment_id, one);
+    let generated = client.create_environment(unnamed()).await.unwrap().into_inner().environment_id;
+    assert_ne!(client.create_environment(unnamed()).await.unwrap().into_inner().environment_id, generated);
 }
 
 #[tokio::test]
-async fn what_is_seen_can_be_sent_to_act() {
+async fn observations_can_be_sent_to_act() {
     let server = Server::start().await;
     let (mut client, mut pilot) = (client(&server).await, server.grpc().await);
     for policy in ["sweep", "qedgix"] {
-        let made = v1::CreateEnvironmentRequest { environment_id: policy.into(), ..create("", 2, &json!({"slots": 40})) };
-        client.create_environment(made).await.unwrap();
-        let see = v1::ResetRequest { return_graph: true, ..reset(policy) };
-        let mut state = client.reset(see).await.unwrap().into_inner();
+        let request = v1::CreateEnvironmentRequest { environment_id: policy.into(), ..create("", 2, &json!({"slots": 40})) };
+        client.create_environment(request).await.unwrap();
+        let with_graph = v1::ResetRequest { return_graph: true, ..reset(policy) };
+        let mut state = client.reset(with_graph).await.unwrap().into_inner();
         let mut memory = [Bytes::new(), Bytes::new()];
         for k in 0..40 {
             let mut actions = Vec::new();
@@ -253,7 +253,7 @@ async fn what_is_seen_can_be_sent_to_act() {
                 actions.push(v1::Headings { headings: answer.actions.iter().map(|a| a.heading_index).collect() });
             }
             let request = v1::StepRequest { return_graph: true, ..step(policy, k, actions) };
-            state = fly(&mut client, request).await;
+            state = step_once(&mut client, request).await;
         }
         let metrics = state.copies[0].finished.as_ref().unwrap().metrics.unwrap();
         assert!(metrics.coverage > 0.0 && metrics.mean_aoi < 40.0, "{metrics:?}");
@@ -261,7 +261,7 @@ async fn what_is_seen_can_be_sent_to_act() {
 }
 
 #[tokio::test]
-async fn input_that_cannot_be_used_names_its_field() {
+async fn invalid_input_names_its_field() {
     let server = Server::start().await;
     let mut client = client(&server).await;
     let cases = [
@@ -301,17 +301,17 @@ async fn input_that_cannot_be_used_names_its_field() {
     for (actions, field, value) in wrong {
         assert_invalid(client.step(step("e", 0, actions)).await, field, value);
     }
-    assert_eq!(fly(&mut client, step("e", 0, headings(2, 3, 8, 0))).await.step, 1, "nothing refused was flown");
+    assert_eq!(step_once(&mut client, step("e", 0, headings(2, 3, 8, 0))).await.step, 1, "rejected requests change nothing");
 }
 
 #[tokio::test]
-async fn idle_environments_expire_and_say_so() {
+async fn idle_environment_expires_with_its_own_error() {
     let server = Server::with(|config| config.environment_ttl = std::time::Duration::from_secs(60)).await;
     let mut client = client(&server).await;
     client.create_environment(create("e", 1, &json!({}))).await.unwrap();
-    server.pass(59);
-    fly(&mut client, step("e", 0, headings(1, 3, 8, 0))).await;
-    server.pass(61);
+    server.advance(59);
+    step_once(&mut client, step("e", 0, headings(1, 3, 8, 0))).await;
+    server.advance(61);
     let named = v1::DeleteEnvironmentRequest { environment_id: "e".into() };
     for (code, reason, _) in [
         refused(client.step(step("e", 1, headings(1, 3, 8, 1))).await),
@@ -323,7 +323,7 @@ async fn idle_environments_expire_and_say_so() {
     }
     assert_eq!(refused(client.reset(reset("never")).await).0, Code::NotFound);
     client.create_environment(create("e", 1, &json!({}))).await.unwrap();
-    fly(&mut client, step("e", 0, headings(1, 3, 8, 0))).await;
+    step_once(&mut client, step("e", 0, headings(1, 3, 8, 0))).await;
     assert_eq!(client.delete_environment(named).await.unwrap().into_inner().step, 1);
     assert_eq!(refused(client.reset(reset("e")).await).0, Code::NotFound);
     server.app.draining.begin();
@@ -337,24 +337,24 @@ async fn idle_environments_expire_and_say_so() {
 }
 
 #[tokio::test]
-async fn their_number_and_their_memory_are_bounded() {
+async fn number_and_memory_of_environments_are_bounded() {
     let server = Server::with(|config| (config.max_environments, config.environment_memory) = (2, 2 << 20)).await;
     let mut client = client(&server).await;
-    let mut ask = async |id: &str, count| client.create_environment(create(id, count, &json!({}))).await;
+    let mut create_copies = async |id: &str, count| client.create_environment(create(id, count, &json!({}))).await;
     for id in ["a", "b"] {
-        ask(id, 1).await.unwrap();
+        create_copies(id, 1).await.unwrap();
     }
-    let (code, reason, _) = refused(ask("c", 1).await);
+    let (code, reason, _) = refused(create_copies("c", 1).await);
     assert_eq!((code, reason.as_str()), (Code::ResourceExhausted, "resource_exhausted"));
-    server.pass(601);
-    ask("c", 1000).await.unwrap();
-    assert_eq!(refused(ask("d", 1000).await).0, Code::ResourceExhausted);
-    ask("c", 1000).await.expect("a retry takes no memory");
-    server.pass(601);
-    ask("d", 1000).await.expect("what expired made room");
+    server.advance(601);
+    create_copies("c", 1000).await.unwrap();
+    assert_eq!(refused(create_copies("d", 1000).await).0, Code::ResourceExhausted);
+    create_copies("c", 1000).await.expect("a retry takes no memory");
+    server.advance(601);
+    create_copies("d", 1000).await.expect("expired environments free their memory");
 
-    let crowd = Server::start().await;
-    let mut client = self::client(&crowd).await;
+    let large = Server::start().await;
+    let mut client = self::client(&large).await;
     client.create_environment(create("e", 1, &json!({"uavs": 10, "users": 1000}))).await.unwrap();
     let with_graph = v1::ResetRequest { return_graph: true, ..reset("e") };
     assert_invalid(client.reset(with_graph).await, "return_graph", "true");
@@ -362,7 +362,7 @@ async fn their_number_and_their_memory_are_bounded() {
 }
 
 #[tokio::test]
-async fn rest_says_the_same() {
+async fn rest_is_equivalent_to_grpc() {
     let server = Server::start().await;
     let (rest, mut client) = (Rest::new(&server), client(&server).await);
     let environment = json!({"K": 3, "uavs": 2.0});
@@ -373,14 +373,14 @@ async fn rest_says_the_same() {
         (StatusCode::CREATED, &json!(3), &json!(8)),
         "{shown}"
     );
-    made(&mut client, v1::CreateEnvironmentRequest { auto_reset: true, ..create("g", 2, &environment) }).await;
+    create_and_reset(&mut client, v1::CreateEnvironmentRequest { auto_reset: true, ..create("g", 2, &environment) }).await;
     for k in 0..4 {
         let actions = headings(2, 2, 8, k);
         let sent: Vec<Value> = actions.iter().map(|copy| json!({"headings": copy.headings})).collect();
         let body = json!({"actions": sent, "step": k, "return_graph": true});
         let (status, state) = rest.post("/v1/environments/r%2F1/step", &body).await;
         assert_eq!(status, StatusCode::OK, "{state}");
-        let expected = fly(&mut client, step("g", k, actions)).await;
+        let expected = step_once(&mut client, step("g", k, actions)).await;
         assert_eq!(
             (&state["step"], &state["slot"], &state["episode"]),
             (&json!(k + 1), &json!(expected.slot), &json!((k + 1) / 3))
@@ -393,7 +393,7 @@ async fn rest_says_the_same() {
             }
             let mean = b.finished.as_ref().map(|finished| finished.metrics.unwrap().mean_aoi);
             assert_eq!(a["finished"]["metrics"]["mean_aoi"].as_f64(), mean);
-            // What is seen goes to Act as it is.
+            // Observations can be sent to Act unchanged.
             let by_scene = rest.post("/v1/act", &json!({"policy": "sweep", "scene": a["scene"]})).await.1;
             let by_graph = rest.post("/v1/act", &json!({"policy": "sweep", "graph": a["graph"]})).await.1;
             assert_eq!(by_scene["actions"].as_array().unwrap().len(), 2, "{by_scene}");
@@ -423,6 +423,6 @@ async fn rest_says_the_same() {
     }
     assert_eq!(rest.send(Method::DELETE, "/v1/environments/g", "").await.0, StatusCode::OK);
     assert_eq!(rest.get("/v1/environments/g").await.0, StatusCode::NOT_FOUND);
-    server.pass(601);
+    server.advance(601);
     assert_eq!(rest.refused("/v1/environments/r%2F1/reset", "{}").await.1, "environment_expired");
 }

@@ -1,4 +1,4 @@
-//! A server in this process, a clock to move, policies that wait or panic, and slots to send.
+//! A server in this process with a manual clock, policies that wait or panic, and requests to send.
 
 use std::collections::HashMap;
 use std::future::Future;
@@ -41,14 +41,14 @@ impl Server {
         Self::on(tempfile::tempdir().unwrap(), change).await
     }
 
-    /// Waits until the server has stopped, and starts another on its data directory.
+    /// Waits until the server has stopped, and starts another one on its data directory.
     pub async fn restarted(self) -> Self {
         self.running.await.unwrap().unwrap();
         drop(self.app);
         Self::on(self.dir, |_| {}).await
     }
 
-    /// On a data directory that may hold something.
+    /// Starts a server on an existing data directory.
     pub async fn on(dir: tempfile::TempDir, change: impl FnOnce(&mut Config)) -> Self {
         let mut config = Config::new(dir.path());
         config.grpc_addr.set_port(0);
@@ -70,7 +70,7 @@ impl Server {
         Self { app, endpoints, dir, time, stop: Some(stop), running }
     }
 
-    pub fn pass(&self, seconds: u64) {
+    pub fn advance(&self, seconds: u64) {
         self.time.advance(Duration::from_secs(seconds));
     }
 
@@ -94,25 +94,27 @@ impl Server {
         self.running.await.unwrap().unwrap();
     }
 
-    /// Adds a policy called `name`, to be flown by any fleet.
+    /// Adds a policy called `name`.
     pub fn add(&self, name: &str, version: u64, policy: Arc<dyn Policy>) {
         let reference = PolicyRef { name: name.into(), version, digest: [version as u8; 32] };
-        self.app.registry.insert(LoadedPolicy::baseline(reference, "of a test", policy, Timestamp::UNIX_EPOCH));
+        self.app.registry.insert(LoadedPolicy::baseline(reference, "policy of a test", policy, Timestamp::UNIX_EPOCH));
     }
 }
 
-/// What a policy of the tests does when it decides.
-pub enum Deed {
-    /// Counts its slots in its memory and flies heading (seed + slot) mod 9 with the Q-values 0, 1, ...
+/// A policy for tests.
+pub enum TestPolicy {
+    /// Decides heading (seed + slot) mod 9, with the Q-values 0, 1, ...
     Count,
     /// Panics.
     Panic,
-    /// Says that it has begun, and waits until the gate is open.
+    /// Waits until the gate is open, then decides like `Count`.
     Wait(Arc<Gate>),
 }
 
+/// Blocks policies until the test opens it.
 #[derive(Default)]
 pub struct Gate {
+    /// Number of policies that have reached the gate, and whether it is open.
     state: Mutex<(usize, bool)>,
     changed: Condvar,
 }
@@ -123,10 +125,10 @@ impl Gate {
         self.changed.notify_all();
     }
 
-    /// Waits until `fleets` have come to the gate.
-    pub async fn reached(self: &Arc<Self>, fleets: usize) {
+    /// Waits until `calls` calls of policies have reached the gate.
+    pub async fn reached(self: &Arc<Self>, calls: usize) {
         let gate = self.clone();
-        let wait = move || drop(gate.changed.wait_while(gate.state.lock().unwrap(), |s| s.0 < fleets).unwrap());
+        let wait = move || drop(gate.changed.wait_while(gate.state.lock().unwrap(), |s| s.0 < calls).unwrap());
         tokio::task::spawn_blocking(wait).await.unwrap();
     }
 
@@ -138,7 +140,7 @@ impl Gate {
     }
 }
 
-impl Policy for Deed {
+impl Policy for TestPolicy {
     fn actions(&self) -> usize {
         9
     }
@@ -173,7 +175,7 @@ impl Policy for Deed {
     }
 }
 
-/// A scene of `uavs` UAVs and `users` users, from a seed.
+/// A random scene of `uavs` UAVs and `users` users.
 pub fn scene(uavs: usize, users: usize, seed: u64) -> v1::Scene {
     let mut rng = qedgix::rng::stream(seed, "test-scene", 0);
     v1::Scene {
@@ -189,22 +191,22 @@ pub fn scene(uavs: usize, users: usize, seed: u64) -> v1::Scene {
     }
 }
 
-/// The graph of a scene: who is within `range` of whom. Users' detections are left out unless `of_users`.
+/// The graph of a scene: detections within `range`. The detections of users are left out unless `of_users`.
 pub fn graph(scene: &v1::Scene, range: f64, of_users: bool) -> v1::Graph {
     let uavs = scene.uavs.iter().map(|u| (u.id.clone(), [u.x, u.y], None));
     let all: Vec<(String, Point, Option<f64>)> =
         uavs.chain(scene.users.iter().map(|u| (u.id.clone(), [u.x, u.y], Some(u.aoi)))).collect();
     let nodes = all.iter().map(|(id, at, aoi)| {
-        let sees =
+        let detections =
             all.iter().filter(|(other, _, _)| other != id && (aoi.is_none() || of_users)).filter_map(|(target, p, aoi)| {
                 let (x, y) = (p[0] - at[0], p[1] - at[1]);
-                let seen = x * x + y * y <= range * range;
-                seen.then(|| v1::Detection { target_id: target.clone(), rel_x: x, rel_y: y, aoi: *aoi })
+                let within = x * x + y * y <= range * range;
+                within.then(|| v1::Detection { target_id: target.clone(), rel_x: x, rel_y: y, aoi: *aoi })
             });
         v1::Node {
             id: id.clone(),
             kind: if aoi.is_none() { v1::NodeKind::Uav.into() } else { v1::NodeKind::User.into() },
-            detections: sees.collect(),
+            detections: detections.collect(),
             position: aoi.is_none().then_some(v1::Position { x: at[0], y: at[1] }),
             aoi: *aoi,
         }
@@ -212,7 +214,7 @@ pub fn graph(scene: &v1::Scene, range: f64, of_users: bool) -> v1::Graph {
     v1::Graph { nodes: nodes.collect() }
 }
 
-/// A request of a scene to a session.
+/// A request with memory in a session.
 pub fn in_session(id: &str, step: Option<u64>, scene: v1::Scene) -> v1::ActRequest {
     v1::ActRequest {
         observation: Some(v1::act_request::Observation::Scene(scene)),
@@ -222,7 +224,7 @@ pub fn in_session(id: &str, step: Option<u64>, scene: v1::Scene) -> v1::ActReque
     }
 }
 
-/// A request of a scene with memory that the caller keeps.
+/// A request with memory that the caller keeps.
 pub fn held(policy: &str, state: bytes::Bytes, scene: v1::Scene) -> v1::ActRequest {
     v1::ActRequest {
         policy: policy.into(),
@@ -232,10 +234,12 @@ pub fn held(policy: &str, state: bytes::Bytes, scene: v1::Scene) -> v1::ActReque
     }
 }
 
+/// A request to open session `id`, with seed 0.
 pub fn open(policy: &str, id: &str) -> v1::OpenSessionRequest {
     v1::OpenSessionRequest { policy: policy.into(), session_id: id.into(), run_id: None, seed: Some(0) }
 }
 
+/// Heading index of each UAV by id.
 pub fn headings(answer: &v1::ActResponse) -> HashMap<String, u32> {
     answer.actions.iter().map(|a| (a.uav_id.clone(), a.heading_index)).collect()
 }
@@ -265,7 +269,7 @@ pub fn assert_invalid<T>(response: Result<tonic::Response<T>, Status>, field: &s
     assert!(code == "invalid_argument" || code == "invalid_schema", "{code}");
 }
 
-/// `future`, which must not hang: a bound that is far beyond what it takes.
-pub async fn soon<T>(future: impl Future<Output = T>) -> T {
-    tokio::time::timeout(Duration::from_secs(60), future).await.expect("this hangs")
+/// Fails if `future` does not complete within a minute.
+pub async fn with_timeout<T>(future: impl Future<Output = T>) -> T {
+    tokio::time::timeout(Duration::from_secs(60), future).await.expect("completes within a minute")
 }

@@ -23,7 +23,7 @@ async fn status(health: &mut HealthClient<Channel>, service: &str) -> ServingSta
 }
 
 async fn next(states: &mut Streaming<HealthCheckResponse>) -> Option<ServingStatus> {
-    soon(states.message()).await.unwrap().map(|state| state.status())
+    with_timeout(states.message()).await.unwrap().map(|state| state.status())
 }
 
 #[tokio::test]
@@ -44,7 +44,7 @@ async fn every_service_has_a_health_status_and_others_are_not_found() {
 async fn health_watches_report_draining_and_do_not_delay_it() {
     let mut server = Server::start().await;
     let gate = Arc::new(Gate::default());
-    server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
+    server.add("slow", 1, Arc::new(TestPolicy::Wait(gate.clone())));
     let mut flying = server.grpc().await;
     let in_flight = tokio::spawn(async move { flying.act(held("slow", Bytes::new(), scene(2, 2, 0))).await });
     gate.reached(1).await;
@@ -63,8 +63,8 @@ async fn health_watches_report_draining_and_do_not_delay_it() {
     assert_eq!(next(&mut unknown).await, None);
     // The clients still hold their streams open, and a request is in flight.
     gate.open();
-    assert_eq!(soon(in_flight).await.unwrap().unwrap().into_inner().actions.len(), 2);
-    soon(server.stopped()).await;
+    assert_eq!(with_timeout(in_flight).await.unwrap().unwrap().into_inner().actions.len(), 2);
+    with_timeout(server.stopped()).await;
     drop((known, whole, unknown));
 }
 

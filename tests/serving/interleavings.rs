@@ -1,6 +1,7 @@
-//! Sessions against a model: calls begun, polled once, dropped and finished in any order, sessions that expire, are closed,
-//! opened again and started over, aliases that move. Memories carry the stamp of the session they belong to, so an answer
-//! from another session's memory, from a step flown twice or from the wrong version is seen.
+//! Random interleavings of calls to sessions, compared with a model. Calls are begun, polled, dropped and completed in any
+//! order, while sessions expire, are closed, reopened and restarted, and new versions are published. The memory of a session
+//! identifies the session, so the test detects responses from the memory of another session, from a step computed twice or
+//! from a wrong version.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -17,14 +18,14 @@ use qedgix::serving::{Observation, SessionOptions};
 
 use super::harness::{Server, scene};
 
-/// Answers with what its memory says: Q-values are the session's stamp, the slots flown, the version.
-struct Stamped {
+/// A policy whose Q-values are the session's seed, the number of its steps, and the policy version.
+struct IdentifyingPolicy {
     version: u64,
-    /// Whether callers compute it, or threads of the engine.
-    by_callers: bool,
+    /// Whether it is computed inline, or on the engine's threads.
+    inline: bool,
 }
 
-impl Policy for Stamped {
+impl Policy for IdentifyingPolicy {
     fn actions(&self) -> usize {
         3
     }
@@ -44,40 +45,40 @@ impl Policy for Stamped {
         memory.copy_from_slice(&[seed as f32, 0.0]);
     }
     fn is_cheap(&self) -> bool {
-        self.by_callers
+        self.inline
     }
     fn act(&self, turns: &mut [FleetStep<'_>]) {
         for turn in turns {
             turn.headings.fill(turn.memory[0] as u8 % 3);
             if let Some(q) = &mut turn.q_values {
-                let told = [turn.memory[0], turn.memory[1], self.version as f32];
-                q.chunks_exact_mut(3).for_each(|q| q.copy_from_slice(&told));
+                let values = [turn.memory[0], turn.memory[1], self.version as f32];
+                q.chunks_exact_mut(3).for_each(|q| q.copy_from_slice(&values));
             }
             turn.memory[1] += 1.0;
         }
     }
 }
 
-/// Idle time after which a session expires, as servers have it by default, in seconds.
+/// Idle time after which a session expires, in seconds: the default of servers.
 const TTL: u64 = 600;
 
 #[derive(Clone, Copy, Debug)]
-enum Step {
-    Unsaid,
+enum StepChoice {
+    Absent,
     Next,
     Last,
     Wrong,
 }
 
 #[derive(Clone, Debug)]
-enum Deed {
+enum Action {
     Open {
         name: u8,
         run: Option<u8>,
     },
     Act {
         name: u8,
-        step: Step,
+        step: StepChoice,
         run: Option<u8>,
     },
     Close {
@@ -89,29 +90,29 @@ enum Deed {
     Drop(prop::sample::Index),
     /// Time passes, in seconds.
     Pass(u64),
-    /// A new version becomes what the policy's name means.
+    /// Publishes a new version of the policy.
     Publish,
 }
 
-fn deeds() -> impl Strategy<Value = Vec<Deed>> {
+fn actions() -> impl Strategy<Value = Vec<Action>> {
     let name = || 0..3_u8;
     let run = || prop::option::weighted(0.2, 0..3_u8);
-    let step = prop_oneof![4 => Just(Step::Unsaid), 3 => Just(Step::Next), 2 => Just(Step::Last), 1 => Just(Step::Wrong)];
-    let deed = prop_oneof![
-        3 => (name(), run()).prop_map(|(name, run)| Deed::Open { name, run }),
-        8 => (name(), step, run()).prop_map(|(name, step, run)| Deed::Act { name, step, run }),
-        1 => name().prop_map(|name| Deed::Close { name }),
-        12 => any::<prop::sample::Index>().prop_map(Deed::Poll),
-        2 => any::<prop::sample::Index>().prop_map(Deed::Drop),
-        1 => (0..TTL * 3 / 2).prop_map(Deed::Pass),
-        1 => Just(Deed::Publish),
+    let step = prop_oneof![4 => Just(StepChoice::Absent), 3 => Just(StepChoice::Next), 2 => Just(StepChoice::Last), 1 => Just(StepChoice::Wrong)];
+    let action = prop_oneof![
+        3 => (name(), run()).prop_map(|(name, run)| Action::Open { name, run }),
+        8 => (name(), step, run()).prop_map(|(name, step, run)| Action::Act { name, step, run }),
+        1 => name().prop_map(|name| Action::Close { name }),
+        12 => any::<prop::sample::Index>().prop_map(Action::Poll),
+        2 => any::<prop::sample::Index>().prop_map(Action::Drop),
+        1 => (0..TTL * 3 / 2).prop_map(Action::Pass),
+        1 => Just(Action::Publish),
     ];
-    prop::collection::vec(deed, 1..80)
+    prop::collection::vec(action, 1..80)
 }
 
-/// One session from its opening to its end; a name may have several, one after another.
+/// Model of one session from its opening to its end. A name may have several, one after another.
 #[derive(Debug)]
-struct Life {
+struct ModelSession {
     seed: u64,
     version: u64,
     run: Option<u8>,
@@ -121,14 +122,14 @@ struct Life {
     used: u64,
 }
 
-impl Life {
+impl ModelSession {
     fn begin(&mut self, run: u8) {
         self.former.extend(self.run.replace(run));
         self.steps = 0;
     }
 
-    /// The run that is new, if it is; the code of the error if it is a former one.
-    fn judge(&self, run: Option<u8>) -> Result<Option<u8>, &'static str> {
+    /// Returns `run` if it is new, and the error code if it is a former run.
+    fn new_run(&self, run: Option<u8>) -> Result<Option<u8>, &'static str> {
         match run.filter(|run| self.run != Some(*run)) {
             Some(run) if self.former.contains(&run) => Err("run_fenced"),
             new => Ok(new),
@@ -136,34 +137,34 @@ impl Life {
     }
 }
 
-/// What an answer says: step, and the values of every UAV.
-type Told = (u64, [f32; 3]);
+/// A response: the step, and the Q-values of every UAV.
+type ActResult = (u64, [f32; 3]);
 
-enum Asked {
+enum CallKind {
     Open { seed: u64, run: Option<u8>, fresh: bool },
     Act { step: Option<u64>, run: Option<u8> },
     Close,
 }
 
 struct Call {
-    life: usize,
-    asked: Asked,
-    answer: BoxFuture<'static, Result<Option<Told>, Error>>,
+    session: usize,
+    kind: CallKind,
+    answer: BoxFuture<'static, Result<Option<ActResult>, Error>>,
 }
 
 struct Model {
     server: Server,
     app: Arc<App>,
     policy: String,
-    by_callers: bool,
+    inline: bool,
     now: u64,
-    lives: Vec<Life>,
+    sessions: Vec<ModelSession>,
     names: BTreeMap<u8, usize>,
     expired: BTreeSet<u8>,
     version: u64,
     calls: Vec<Call>,
-    /// Answers given, to know that the test tests something.
-    answered: usize,
+    /// Completed calls, to check that the test covers something.
+    completed: usize,
 }
 
 impl Model {
@@ -173,16 +174,16 @@ impl Model {
 
     fn publish(&mut self) {
         self.version += 1;
-        let policy = Stamped { version: self.version, by_callers: self.by_callers };
+        let policy = IdentifyingPolicy { version: self.version, inline: self.inline };
         self.server.add(&self.policy, self.version, Arc::new(policy));
     }
 
-    /// The open session of `name`, or the code of the error; as the table has it.
+    /// The open session of `name`, or the error code.
     fn find(&mut self, name: u8) -> Result<usize, &'static str> {
         match self.names.get(&name) {
-            Some(&life) if self.now - self.lives[life].used <= TTL => {
-                self.lives[life].used = self.now;
-                Ok(life)
+            Some(&session) if self.now - self.sessions[session].used <= TTL => {
+                self.sessions[session].used = self.now;
+                Ok(session)
             }
             Some(_) => {
                 self.names.remove(&name);
@@ -195,29 +196,29 @@ impl Model {
     }
 
     fn open(&mut self, name: u8, run: Option<u8>) {
-        let seed = self.lives.len() as u64 + 100;
-        let known = self.names.get(&name).copied().filter(|&life| self.now - self.lives[life].used <= TTL);
-        let life = known.unwrap_or_else(|| {
+        let seed = self.sessions.len() as u64 + 100;
+        let known = self.names.get(&name).copied().filter(|&session| self.now - self.sessions[session].used <= TTL);
+        let session = known.unwrap_or_else(|| {
             let (version, used) = (self.version, self.now);
-            self.lives.push(Life { seed, version, run, former: BTreeSet::new(), steps: 0, ended: false, used });
+            self.sessions.push(ModelSession { seed, version, run, former: BTreeSet::new(), steps: 0, ended: false, used });
             self.expired.remove(&name);
-            self.names.insert(name, self.lives.len() - 1);
-            self.lives.len() - 1
+            self.names.insert(name, self.sessions.len() - 1);
+            self.sessions.len() - 1
         });
         let (app, policy) = (self.app.clone(), self.policy.parse().unwrap());
         let how = SessionOptions { id: Some(self.session(name)), run_id: run.map(|run| run.to_string()), seed: Some(seed) };
         let answer = async move { sessions::open(&app, &policy, how).await.map(|_| None) }.boxed();
-        self.begin(Call { life, asked: Asked::Open { seed, run, fresh: known.is_none() }, answer });
+        self.begin(Call { session, kind: CallKind::Open { seed, run, fresh: known.is_none() }, answer });
     }
 
-    fn act(&mut self, name: u8, step: Step, run: Option<u8>) {
+    fn act(&mut self, name: u8, step: StepChoice, run: Option<u8>) {
         let found = self.find(name);
-        let steps = found.map_or(0, |life| self.lives[life].steps);
+        let steps = found.map_or(0, |session| self.sessions[session].steps);
         let step = match step {
-            Step::Unsaid => None,
-            Step::Next => Some(steps),
-            Step::Last => Some(steps.saturating_sub(1)),
-            Step::Wrong => Some(steps + 3),
+            StepChoice::Absent => None,
+            StepChoice::Next => Some(steps),
+            StepChoice::Last => Some(steps.saturating_sub(1)),
+            StepChoice::Wrong => Some(steps + 3),
         };
         let request = act::Request {
             policy: None,
@@ -231,12 +232,12 @@ impl Model {
         let answer = async move {
             let answer = act::act(&app, request, None).await?;
             let values: [f32; 3] = answer.decision.q_values[..3].try_into().unwrap();
-            assert_eq!(answer.decision.q_values[3..], values, "one fleet, one memory");
+            assert_eq!(answer.decision.q_values[3..], values, "one fleet has one memory");
             assert_eq!(answer.decision.headings, [values[0] as u8 % 3; 2]);
             Ok(Some((answer.decision.step, values)))
         }
         .boxed();
-        self.start(found, Asked::Act { step, run }, answer);
+        self.start(found, CallKind::Act { step, run }, answer);
     }
 
     fn close(&mut self, name: u8) {
@@ -246,26 +247,26 @@ impl Model {
         }
         let (app, id) = (self.app.clone(), self.session(name));
         let answer = async move { sessions::close(&app, &id).await.map(|_| None) }.boxed();
-        self.start(found, Asked::Close, answer);
+        self.start(found, CallKind::Close, answer);
     }
 
-    /// Begins a call that finds a session, or is refused at once.
+    /// Begins a call, or checks that it is rejected immediately.
     fn start(
         &mut self,
         found: Result<usize, &'static str>,
-        asked: Asked,
-        answer: BoxFuture<'static, Result<Option<Told>, Error>>,
+        kind: CallKind,
+        answer: BoxFuture<'static, Result<Option<ActResult>, Error>>,
     ) {
         match found {
-            Ok(life) => self.begin(Call { life, asked, answer }),
+            Ok(session) => self.begin(Call { session, kind, answer }),
             Err(code) => {
-                let refused = answer.now_or_never().expect("refused at once");
+                let refused = answer.now_or_never().expect("rejected immediately");
                 assert_eq!(refused.map_err(|e| e.code().as_str()), Err(code));
             }
         }
     }
 
-    /// The first poll finds the session, so it is part of the beginning.
+    /// The first poll looks up the session, so it belongs to the beginning of the call.
     fn begin(&mut self, call: Call) {
         self.calls.push(call);
         self.poll(self.calls.len() - 1);
@@ -275,55 +276,55 @@ impl Model {
         let waker = futures::task::noop_waker();
         let polled = self.calls[at].answer.poll_unpin(&mut std::task::Context::from_waker(&waker));
         if let Poll::Ready(answer) = polled {
-            let Call { life, asked, .. } = self.calls.swap_remove(at);
-            let expected = self.expect(life, &asked);
+            let Call { session, kind, .. } = self.calls.swap_remove(at);
+            let expected = self.expected_result(session, &kind);
             assert_eq!(answer.map_err(|e| e.code().as_str()), expected);
-            self.answered += 1;
+            self.completed += 1;
         }
     }
 
-    /// What a call is answered that ends now; the model moves on.
-    fn expect(&mut self, life: usize, asked: &Asked) -> Result<Option<Told>, &'static str> {
+    /// The result of a call that completes now. Updates the model.
+    fn expected_result(&mut self, session: usize, kind: &CallKind) -> Result<Option<ActResult>, &'static str> {
         let now = self.now;
-        let life = &mut self.lives[life];
-        match *asked {
-            Asked::Close => life.ended = true,
-            Asked::Open { fresh: true, .. } => {}
-            Asked::Open { seed, run, .. } => {
-                if life.ended {
+        let session = &mut self.sessions[session];
+        match *kind {
+            CallKind::Close => session.ended = true,
+            CallKind::Open { fresh: true, .. } => {}
+            CallKind::Open { seed, run, .. } => {
+                if session.ended {
                     return Err("already_exists");
                 }
-                match life.judge(run)? {
+                match session.new_run(run)? {
                     Some(run) => {
-                        life.begin(run);
-                        life.seed = seed;
-                        life.used = now;
+                        session.begin(run);
+                        session.seed = seed;
+                        session.used = now;
                     }
-                    // Asked the same once more.
-                    None if life.steps == 0 && (life.seed, life.run) == (seed, run) => life.used = now,
+                    // A retry.
+                    None if session.steps == 0 && (session.seed, session.run) == (seed, run) => session.used = now,
                     None => return Err("already_exists"),
                 }
             }
-            Asked::Act { step, run } => {
-                if life.ended {
+            CallKind::Act { step, run } => {
+                if session.ended {
                     return Err("not_found");
                 }
-                let new = life.judge(run)?;
-                let steps = if new.is_some() { 0 } else { life.steps };
+                let new = session.new_run(run)?;
+                let steps = if new.is_some() { 0 } else { session.steps };
                 let step = step.unwrap_or(steps);
-                let told = Ok(Some((step, [life.seed as f32, step as f32, life.version as f32])));
+                let result = Ok(Some((step, [session.seed as f32, step as f32, session.version as f32])));
                 if new.is_none() && step + 1 == steps {
-                    return told;
+                    return result;
                 }
                 if step != steps {
                     return Err("wrong_step");
                 }
                 if let Some(run) = new {
-                    life.begin(run);
+                    session.begin(run);
                 }
-                life.steps = step + 1;
-                life.used = now;
-                return told;
+                session.steps = step + 1;
+                session.used = now;
+                return result;
             }
         }
         Ok(None)
@@ -340,16 +341,16 @@ impl Model {
 }
 
 #[test]
-fn no_interleaving_mixes_two_sessions() {
+fn interleaved_calls_behave_like_the_model() {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
     let mut server = Some(runtime.block_on(Server::start()));
-    let (mut case, mut answered) = (0, 0);
+    let (mut case, mut completed) = (0, 0);
     let mut runner = TestRunner::new(ProptestConfig { cases: 400, failure_persistence: None, ..ProptestConfig::default() });
-    let cell = std::cell::RefCell::new((&mut server, &mut case, &mut answered));
+    let cell = std::cell::RefCell::new((&mut server, &mut case, &mut completed));
     runner
-        .run(&(deeds(), any::<bool>()), |(deeds, by_callers)| {
+        .run(&(actions(), any::<bool>()), |(actions, inline)| {
             let mut held = cell.borrow_mut();
-            let (server, case, answered) = &mut *held;
+            let (server, case, completed) = &mut *held;
             **case += 1;
             let server_now = server.take().expect("one case at a time");
             let app = server_now.app.clone();
@@ -357,38 +358,38 @@ fn no_interleaving_mixes_two_sessions() {
                 server: server_now,
                 app,
                 policy: format!("case-{case}"),
-                by_callers,
+                inline,
                 now: 0,
-                lives: Vec::new(),
+                sessions: Vec::new(),
                 names: BTreeMap::new(),
                 expired: BTreeSet::new(),
                 version: 0,
                 calls: Vec::new(),
-                answered: 0,
+                completed: 0,
             };
             model.publish();
             let outcome = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
                 let _inside = runtime.enter();
-                for deed in deeds {
-                    match deed {
-                        Deed::Open { name, run } => model.open(name, run),
-                        Deed::Act { name, step, run } => model.act(name, step, run),
-                        Deed::Close { name } => model.close(name),
-                        Deed::Publish => model.publish(),
-                        Deed::Pass(seconds) => {
+                for action in actions {
+                    match action {
+                        Action::Open { name, run } => model.open(name, run),
+                        Action::Act { name, step, run } => model.act(name, step, run),
+                        Action::Close { name } => model.close(name),
+                        Action::Publish => model.publish(),
+                        Action::Pass(seconds) => {
                             model.now += seconds;
-                            model.server.pass(seconds);
+                            model.server.advance(seconds);
                         }
-                        Deed::Poll(which) if !model.calls.is_empty() => model.poll(which.index(model.calls.len())),
-                        Deed::Drop(which) if !model.calls.is_empty() => {
+                        Action::Poll(which) if !model.calls.is_empty() => model.poll(which.index(model.calls.len())),
+                        Action::Drop(which) if !model.calls.is_empty() => {
                             model.calls.swap_remove(which.index(model.calls.len()));
                         }
-                        Deed::Poll(_) | Deed::Drop(_) => {}
+                        Action::Poll(_) | Action::Drop(_) => {}
                     }
                 }
                 runtime.block_on(model.drain());
             }));
-            **answered += model.answered;
+            **completed += model.completed;
             model.calls.clear();
             **server = Some(model.server);
             outcome.map_err(|panic| {
@@ -397,5 +398,5 @@ fn no_interleaving_mixes_two_sessions() {
             })
         })
         .unwrap();
-    assert!(answered > 2000, "{answered} calls were answered");
+    assert!(completed > 2000, "{completed} calls were completed");
 }

@@ -187,7 +187,7 @@ async fn act_within(server: &Server, timeout: &'static str, request: v1::ActRequ
     framed.put_u32(request.encoded_len() as u32);
     request.encode(&mut framed).unwrap();
     body.send_data(framed.freeze(), true).unwrap();
-    let answer = soon(answer).await.unwrap();
+    let answer = with_timeout(answer).await.unwrap();
     let header = |name: &str| answer.headers().get(name).map_or("", |value| value.to_str().unwrap()).to_owned();
     (header("grpc-status"), header("qedgix-code"))
 }
@@ -196,7 +196,7 @@ async fn act_within(server: &Server, timeout: &'static str, request: v1::ActRequ
 async fn requests_past_their_deadline_do_not_advance_the_session() {
     let server = Server::with(|config| config.engine.threads = 1).await;
     let gate = Arc::new(Gate::default());
-    server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
+    server.add("slow", 1, Arc::new(TestPolicy::Wait(gate.clone())));
     let mut client = server.grpc().await;
     client.open_session(open("slow", "s")).await.unwrap();
     client.open_session(open("sweep", "t")).await.unwrap();
@@ -207,7 +207,7 @@ async fn requests_past_their_deadline_do_not_advance_the_session() {
     }
     gate.open();
     for session in ["s", "t"] {
-        let answer = soon(client.act(in_session(session, Some(0), scene(2, 2, 0)))).await.unwrap().into_inner();
+        let answer = with_timeout(client.act(in_session(session, Some(0), scene(2, 2, 0)))).await.unwrap().into_inner();
         assert_eq!(answer.step, 0, "the session has not advanced");
     }
     let (status, _) = act_within(&server, "99999999H", in_session("t", Some(1), scene(2, 2, 0))).await;
@@ -218,7 +218,7 @@ async fn requests_past_their_deadline_do_not_advance_the_session() {
 async fn a_retry_during_the_first_attempt_returns_the_same_response() {
     let server = Server::start().await;
     let gate = Arc::new(Gate::default());
-    server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
+    server.add("slow", 1, Arc::new(TestPolicy::Wait(gate.clone())));
     let mut client = server.grpc().await;
     client.open_session(open("slow", "s")).await.unwrap();
     let attempt = || {
@@ -229,7 +229,7 @@ async fn a_retry_during_the_first_attempt_returns_the_same_response() {
     gate.reached(1).await;
     let second = attempt();
     gate.open();
-    let (first, second) = (soon(first).await.unwrap(), soon(second).await.unwrap());
+    let (first, second) = (with_timeout(first).await.unwrap(), with_timeout(second).await.unwrap());
     assert_eq!(first, second);
     let next = client.act(in_session("s", None, scene(2, 2, 0))).await.unwrap().into_inner();
     assert_eq!(next.step, 1, "the session advanced once");
@@ -239,7 +239,7 @@ async fn a_retry_during_the_first_attempt_returns_the_same_response() {
 async fn a_full_queue_refuses_requests_and_recovers() {
     let server = Server::with(|config| (config.engine.threads, config.engine.queue) = (1, 1)).await;
     let gate = Arc::new(Gate::default());
-    server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
+    server.add("slow", 1, Arc::new(TestPolicy::Wait(gate.clone())));
     let client = server.grpc().await;
     let attempt = || {
         let mut client = client.clone();
@@ -247,13 +247,13 @@ async fn a_full_queue_refuses_requests_and_recovers() {
     };
     let first = attempt();
     gate.reached(1).await;
-    let (answered, _, mut waiting) = soon(futures::future::select_all([attempt(), attempt()])).await;
+    let (answered, _, mut waiting) = with_timeout(futures::future::select_all([attempt(), attempt()])).await;
     let status = answered.unwrap().unwrap_err();
     assert_eq!(status.code(), Code::ResourceExhausted);
     assert_eq!(status.metadata().get("retry-after").unwrap(), "1");
     gate.open();
-    assert!(soon(first).await.unwrap().is_ok());
-    assert!(soon(waiting.remove(0)).await.unwrap().is_ok());
+    assert!(with_timeout(first).await.unwrap().is_ok());
+    assert!(with_timeout(waiting.remove(0)).await.unwrap().is_ok());
 }
 
 #[tokio::test]
@@ -262,7 +262,7 @@ async fn open_sessions_are_limited() {
     let mut client = server.grpc().await;
     client.open_session(open("sweep", "a")).await.unwrap();
     assert_eq!(refused(client.open_session(open("sweep", "b")).await).0, Code::ResourceExhausted);
-    server.pass(601);
+    server.advance(601);
     client.open_session(open("sweep", "b")).await.unwrap();
     assert_eq!(refused(client.open_session(open("nearest", "b")).await).0, Code::AlreadyExists);
     assert_eq!(refused(client.open_session(open("swoop", "c")).await).0, Code::NotFound);
@@ -271,7 +271,7 @@ async fn open_sessions_are_limited() {
 #[tokio::test]
 async fn a_panicking_policy_returns_an_internal_error() {
     let server = Server::with(|config| config.engine.threads = 1).await;
-    server.add("panics", 1, Arc::new(Deed::Panic));
+    server.add("panics", 1, Arc::new(TestPolicy::Panic));
     let mut client = server.grpc().await;
     client.open_session(open("panics", "s")).await.unwrap();
     for _ in 0..3 {

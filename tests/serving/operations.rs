@@ -44,7 +44,7 @@ async fn both_listeners_set_tcp_nodelay() {
         let mut client = tokio::net::TcpStream::connect(address).await.unwrap();
         client.write_all(hello).await.unwrap();
         // A response means that the connection was accepted.
-        soon(client.read_u8()).await.unwrap();
+        with_timeout(client.read_u8()).await.unwrap();
         let socket = accepted(client.local_addr().unwrap()).expect("the socket is this process's");
         assert!(socket.nodelay().unwrap(), "{address}");
     }

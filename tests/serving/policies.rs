@@ -200,7 +200,7 @@ async fn an_unloaded_version_serves_nobody_new_and_those_that_fly_it_go_on() {
     assert_eq!(rest.send(Method::PUT, "/v1/policies/mine/aliases/x", r#"{"version": 2}"#).await.1["code"], "policy_unloaded");
     rest.post("/v1/policies/sweep/unload", &Value::Null).await;
     server.begin_stop();
-    let server = soon(server.restarted()).await;
+    let server = with_timeout(server.restarted()).await;
     let rest = Rest::new(&server);
     let of = |name: &str| index(&server.app).into_iter().filter(|entry| entry.name == name).collect::<Vec<_>>();
     let entry = |version, ready| {

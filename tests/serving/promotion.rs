@@ -43,7 +43,7 @@ async fn an_alias_is_set_moved_and_deleted_and_that_is_remembered() {
     assert_eq!(put(1, Some(2)).await.1["detail"], "mine@live means nothing, not version 2 as expected");
     assert_eq!(put(1, Some(0)).await, (StatusCode::CREATED, moved(1, json!(null))));
     assert_eq!(put(1, Some(0)).await.1["code"], "alias_moved");
-    server.pass(5);
+    server.advance(5);
     assert_eq!(put(2, Some(1)).await, (StatusCode::OK, moved(2, json!(1))));
     assert_eq!(put(2, None).await, (StatusCode::OK, moved(2, json!(2))), "nothing happens");
     let (status, problem) = put(3, Some(1)).await;
@@ -95,7 +95,7 @@ async fn an_alias_is_set_moved_and_deleted_and_that_is_remembered() {
         assert_eq!(rest.send(Method::PUT, path, body).await.0.as_u16(), status, "{path} {body}");
     }
     server.begin_stop();
-    let server = soon(server.restarted()).await;
+    let server = with_timeout(server.restarted()).await;
     let rest = Rest::new(&server);
     assert_eq!(rest.get(history).await.1["history"], json!(all));
     assert_eq!(rest.get("/v1/policies/mine/aliases").await.1, json!({"aliases": [{"alias": "old", "version": 1}]}));
@@ -178,7 +178,7 @@ async fn callers_of_an_alias_that_moves_get_one_version_each_and_no_error() {
     }
     let mut seen: BTreeMap<u64, u64> = BTreeMap::new();
     for caller in callers {
-        for (version, episodes) in soon(caller).await.unwrap() {
+        for (version, episodes) in with_timeout(caller).await.unwrap() {
             *seen.entry(version).or_default() += episodes;
         }
     }
@@ -286,7 +286,7 @@ async fn changes_by_many_who_may_leave_keep_the_registry_and_the_database_alike(
         })
     });
     for caller in callers.collect::<Vec<_>>() {
-        soon(caller).await.unwrap();
+        with_timeout(caller).await.unwrap();
     }
     // What those who left have begun goes on without them; each change holds the registry.
     let settled = async {
@@ -294,13 +294,13 @@ async fn changes_by_many_who_may_leave_keep_the_registry_and_the_database_alike(
             tokio::task::yield_now().await;
         }
     };
-    soon(settled).await;
+    with_timeout(settled).await;
     same_as_the_store(&server.app, "mine").await;
     assert!(moves(&server.app, "mine").await.len() > 10);
     let before = policies::index(&server.app);
     let aliases = server.app.registry.aliases("mine").unwrap();
     server.begin_stop();
-    let server = soon(server.restarted()).await;
+    let server = with_timeout(server.restarted()).await;
     assert_eq!((policies::index(&server.app), server.app.registry.aliases("mine").unwrap()), (before, aliases));
     same_as_the_store(&server.app, "mine").await;
 }
@@ -319,7 +319,7 @@ async fn of_all_who_expect_the_same_one_moves_it() {
         });
         let mut won = 0;
         for caller in callers.collect::<Vec<_>>() {
-            match soon(caller).await.unwrap() {
+            match with_timeout(caller).await.unwrap() {
                 Ok(previous) => {
                     assert_eq!(previous.unwrap_or(0), now);
                     won += 1;

@@ -53,7 +53,7 @@ async fn what_was_published_is_served_after_a_restart() {
     let mut client = server.grpc().await;
     let before = client.act(held("mine", Bytes::new(), scene(3, 5, 0))).await.unwrap().into_inner();
     server.begin_stop();
-    let server = soon(server.restarted()).await;
+    let server = with_timeout(server.restarted()).await;
     let mut client = server.grpc().await;
     let after = client.act(held("mine@prod", Bytes::new(), scene(3, 5, 0))).await.unwrap().into_inner();
     assert_eq!((&after.actions, &after.recurrent_state), (&before.actions, &before.recurrent_state));

@@ -179,7 +179,7 @@ async fn the_table_of_errors() {
     assert_eq!(rest.refused("/v1/sessions", r#"{"policy": "swoop"}"#).await.0, 404);
     assert_eq!(rest.refused("/v1/sessions", r#"{"policy": "sweep", "sesion_id": "x"}"#).await.0, 422);
     assert_eq!(rest.refused("/v1/sessions", r#"{"policy": "nearest", "session_id": "s"}"#).await.0, 409);
-    server.pass(601);
+    server.advance(601);
     assert_eq!(rest.refused("/v1/act", &good).await.1, "session_expired");
     for (method, path, status) in [
         (Method::GET, "/nothing/here", 404),
@@ -209,7 +209,7 @@ async fn a_body_that_does_not_say_its_size_is_bounded_too() {
     }
     stream.write_all(b"0\r\n\r\n").await.unwrap();
     let mut answer = String::new();
-    soon(stream.read_to_string(&mut answer)).await.unwrap();
+    with_timeout(stream.read_to_string(&mut answer)).await.unwrap();
     assert!(answer.starts_with("HTTP/1.1 413 "), "{answer}");
 }
 

@@ -18,7 +18,7 @@ use super::harness::*;
 async fn draining_completes_requests_in_flight() {
     let mut server = Server::start().await;
     let gate = Arc::new(Gate::default());
-    server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
+    server.add("slow", 1, Arc::new(TestPolicy::Wait(gate.clone())));
     let mut flying = server.grpc().await;
     let mut health = HealthClient::new(server.channel().await);
     let watch = HealthCheckRequest { service: "qedgix.v1.PolicyService".into() };
@@ -30,12 +30,12 @@ async fn draining_completes_requests_in_flight() {
     let endpoints = server.dir.path().join(ENDPOINTS);
     assert!(std::fs::read_to_string(&endpoints).unwrap().contains(&server.endpoints.grpc.to_string()));
     server.begin_stop();
-    assert_eq!(state(soon(states.message()).await.unwrap()), ServingStatus::NotServing);
+    assert_eq!(state(with_timeout(states.message()).await.unwrap()), ServingStatus::NotServing);
     drop(states);
     assert!(server.app.ready().await.is_err());
     gate.open();
-    assert_eq!(soon(in_flight).await.unwrap().unwrap().into_inner().actions.len(), 2);
-    soon(server.stopped()).await;
+    assert_eq!(with_timeout(in_flight).await.unwrap().unwrap().into_inner().actions.len(), 2);
+    with_timeout(server.stopped()).await;
     assert!(!endpoints.exists());
 }
 

@@ -1,6 +1,6 @@
-//! Mixed load on the real binary: episodes with calls cancelled, deadlines missed, steps repeated, sessions abandoned, expired
-//! and started over, while checkpoints are published, aliases move and policies are unloaded. Every answer is compared, bit
-//! for bit, with the policy flown here. A few seconds by default; for longer:
+//! Mixed load on the real binary: cancelled calls, missed deadlines, repeated steps, abandoned, expired and restarted sessions,
+//! while checkpoints are published, aliases move and policies are unloaded. Every response is compared, bit for bit, with the
+//! policy computed in this process. The test takes a few seconds by default; for longer:
 //!
 //!     QEDGIX_SOAK_SECONDS=600 cargo test --release --test serving -- soak --nocapture
 
@@ -15,8 +15,8 @@ use qedgix::policy::{FleetStep, LearnedPolicy, Policy};
 use qedgix::serving::Observation;
 use qedgix::train_config::{Algorithm, Preset, TrainConfig};
 use qedgix::wire::v1;
-use qedgix::wire::v1::act_request::Observation as Sent;
-use qedgix::wire::v1::act_result::Result as Told;
+use qedgix::wire::v1::act_request::Observation as WireObservation;
+use qedgix::wire::v1::act_result::Result as SlotResult;
 use qedgix::wire::v1::policy_service_client::PolicyServiceClient;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
@@ -29,9 +29,9 @@ use super::harness::{graph, held, in_session, open, scene};
 
 /// Idle time after which sessions expire.
 const TTL: Duration = Duration::from_secs(3);
-/// Episodes at the same time.
-const PILOTS: u64 = 24;
-/// Checkpoints that are published, again and again.
+/// Concurrent callers.
+const CALLERS: u64 = 24;
+/// Different checkpoints to publish, repeatedly.
 const CHECKPOINTS: u64 = 12;
 
 /// The server's process; killed when dropped.
@@ -53,16 +53,16 @@ impl Process {
             .spawn()
             .unwrap();
         let mut process = Self { child, grpc: String::new(), rest: String::new() };
-        let begun = Instant::now();
-        let told: Value = loop {
-            assert!(begun.elapsed() < Duration::from_secs(60), "the server says where it listens");
+        let started = Instant::now();
+        let endpoints: Value = loop {
+            assert!(started.elapsed() < Duration::from_secs(60), "the server writes endpoints.json");
             if let Ok(text) = std::fs::read(dir.join("endpoints.json")) {
                 break serde_json::from_slice(&text).unwrap();
             }
             tokio::time::sleep(Duration::from_millis(20)).await;
         };
-        process.grpc = format!("http://{}", told["grpc"].as_str().unwrap());
-        process.rest = format!("http://{}", told["http"].as_str().unwrap());
+        process.grpc = format!("http://{}", endpoints["grpc"].as_str().unwrap());
+        process.rest = format!("http://{}", endpoints["http"].as_str().unwrap());
         process
     }
 
@@ -81,15 +81,15 @@ impl Drop for Process {
     }
 }
 
-/// The policies that may answer, by digest.
-struct Truth {
-    policies: HashMap<String, Arc<LearnedPolicy>>,
+/// The policies of all checkpoints, by digest, and the checkpoint files.
+struct Policies {
+    by_digest: HashMap<String, Arc<LearnedPolicy>>,
     files: Vec<Vec<u8>>,
 }
 
-impl Truth {
+impl Policies {
     fn new() -> Self {
-        let mut truth = Self { policies: HashMap::new(), files: Vec::new() };
+        let mut all = Self { by_digest: HashMap::new(), files: Vec::new() };
         for seed in 0..CHECKPOINTS {
             let algorithm = [Algorithm::Qedgix, Algorithm::Qmix, Algorithm::Rgcn][seed as usize % 3];
             let mut config = TrainConfig::preset(algorithm, Preset::Practical);
@@ -98,33 +98,33 @@ impl Truth {
             let weights = (0..layout(&config).len()).map(|_| rng.random_range(-0.3..0.3_f32)).collect();
             let checkpoint = Checkpoint::new(config, seed, None, weights).unwrap();
             let file = checkpoint.to_bytes();
-            truth.policies.insert(digest(&file), Arc::new(checkpoint.policy()));
-            truth.files.push(file);
+            all.by_digest.insert(digest(&file), Arc::new(checkpoint.policy()));
+            all.files.push(file);
         }
-        truth
+        all
     }
 }
 
-/// One episode flown here.
-struct Replay {
+/// The policy of one episode, computed in this process.
+struct Reference {
     policy: Arc<LearnedPolicy>,
     digest: String,
     memory: Vec<f32>,
 }
 
-impl Replay {
-    fn new(truth: &Truth, digest: &str, (uavs, users): (usize, usize), seed: u64) -> Self {
-        let policy = truth.policies[digest].clone();
+impl Reference {
+    fn new(policies: &Policies, digest: &str, (uavs, users): (usize, usize), seed: u64) -> Self {
+        let policy = policies.by_digest[digest].clone();
         let mut memory = vec![0.0; policy.memory_len(uavs, users)];
         policy.start(uavs, users, seed, &mut memory);
         Self { policy, digest: digest.to_owned(), memory }
     }
 
-    /// Flies a slot; what every UAV has to be told.
-    fn fly(&mut self, seen: &Sent) -> BTreeMap<String, (u32, Vec<f32>)> {
-        let observation = match seen.clone() {
-            Sent::Scene(scene) => Observation::try_from(scene).unwrap(),
-            Sent::Graph(graph) => Observation::try_from(graph).unwrap(),
+    /// The expected heading and Q-values of every UAV in the next slot.
+    fn decide(&mut self, observation: &WireObservation) -> BTreeMap<String, (u32, Vec<f32>)> {
+        let observation = match observation.clone() {
+            WireObservation::Scene(scene) => Observation::try_from(scene).unwrap(),
+            WireObservation::Graph(graph) => Observation::try_from(graph).unwrap(),
         };
         let ids = observation.fleet.uavs.clone();
         let slot = observation.into_slot(&*self.policy).unwrap();
@@ -132,12 +132,12 @@ impl Replay {
         let (mut headings, mut values) = (vec![0; ids.len()], vec![0.0; ids.len() * actions]);
         let (memory, headings_out, q_values) = (&mut self.memory[..], &mut headings[..], Some(&mut values[..]));
         self.policy.act(&mut [FleetStep { slot: &slot, step: 0, memory, headings: headings_out, q_values }]);
-        let told = headings.iter().zip(values.chunks_exact(actions)).map(|(&heading, q)| (u32::from(heading), q.to_vec()));
-        ids.into_iter().zip(told).collect()
+        let decisions = headings.iter().zip(values.chunks_exact(actions)).map(|(&heading, q)| (u32::from(heading), q.to_vec()));
+        ids.into_iter().zip(decisions).collect()
     }
 }
 
-/// What happened, by name.
+/// Numbers of events, by name.
 #[derive(Clone, Default)]
 struct Counts(Arc<Mutex<BTreeMap<&'static str, u64>>>);
 
@@ -151,98 +151,100 @@ impl Counts {
     }
 }
 
-/// What goes wrong is told with what it went wrong with.
-type Flown = Result<(), String>;
+/// The error describes the first response that is not as expected.
+type CheckResult = Result<(), String>;
 
-struct Pilot {
+/// One caller, which runs episodes one after another.
+struct SoakCaller {
     client: PolicyServiceClient<Channel>,
-    truth: Arc<Truth>,
+    policies: Arc<Policies>,
     counts: Counts,
     rng: ChaCha8Rng,
-    number: u64,
+    /// Number of the last session; the upper half identifies the caller.
+    sessions: u64,
 }
 
 fn code(status: &Status) -> &str {
     status.metadata().get("qedgix-code").and_then(|code| code.to_str().ok()).unwrap_or("")
 }
 
-fn check(answer: &v1::ActResponse, expected: &BTreeMap<String, (u32, Vec<f32>)>, digest: &str, step: u64) -> Flown {
-    let told: BTreeMap<String, (u32, Vec<f32>)> =
+fn check(answer: &v1::ActResponse, expected: &BTreeMap<String, (u32, Vec<f32>)>, digest: &str, step: u64) -> CheckResult {
+    let received: BTreeMap<String, (u32, Vec<f32>)> =
         answer.actions.iter().map(|a| (a.uav_id.clone(), (a.heading_index, a.q_values.clone()))).collect();
     let by = answer.policy.as_ref().map_or("", |policy| policy.digest.as_str());
-    if told == *expected && by == digest && answer.step == step {
+    if received == *expected && by == digest && answer.step == step {
         return Ok(());
     }
-    Err(format!("WRONG ANSWER at step {step}: {told:?} of {by}, step {}; expected {expected:?} of {digest}", answer.step))
+    Err(format!("wrong response at step {step}: {received:?} of {by}, step {}; expected {expected:?} of {digest}", answer.step))
 }
 
-fn unasked(what: &str) -> impl Fn(Status) -> String {
+fn unexpected(what: &str) -> impl Fn(Status) -> String {
     move |status| format!("{what}: {:?} {} {}", status.code(), code(&status), status.message())
 }
 
-impl Pilot {
+impl SoakCaller {
     fn chance(&mut self, percent: u32) -> bool {
         self.rng.random_range(0..100) < percent
     }
 
-    fn observe(&mut self, (uavs, users): (usize, usize)) -> Sent {
+    fn observe(&mut self, (uavs, users): (usize, usize)) -> WireObservation {
         let scene = scene(uavs, users, self.rng.random());
-        if self.chance(50) { Sent::Scene(scene) } else { Sent::Graph(graph(&scene, 0.28, self.rng.random())) }
+        if self.chance(50) { WireObservation::Scene(scene) } else { WireObservation::Graph(graph(&scene, 0.28, self.rng.random())) }
     }
 
-    async fn fly(&mut self) -> Flown {
+    async fn run_episode(&mut self) -> CheckResult {
         let size = (self.rng.random_range(1..5), self.rng.random_range(1..9));
-        if self.chance(25) { self.hold(size).await } else { self.session(size).await }
+        if self.chance(25) { self.stateless_episode(size).await } else { self.session_episode(size).await }
     }
 
-    /// An episode whose memory this side keeps.
-    async fn hold(&mut self, size: (usize, usize)) -> Flown {
+    /// An episode whose memory the caller keeps.
+    async fn stateless_episode(&mut self, size: (usize, usize)) -> CheckResult {
         let (seed, slots) = (self.rng.random(), self.rng.random_range(1..30));
-        let (mut state, mut replay) = (Bytes::new(), None::<Replay>);
+        let (mut state, mut reference) = (Bytes::new(), None::<Reference>);
         for step in 0..slots {
-            let seen = self.observe(size);
+            let observation = self.observe(size);
             let mut request = held("soak@live", state.clone(), v1::Scene::default());
-            (request.observation, request.return_q_values) = (Some(seen.clone()), true);
+            (request.observation, request.return_q_values) = (Some(observation.clone()), true);
             request.seed = (step == 0).then_some(seed);
             if self.chance(10) {
-                self.give_up(request.clone()).await;
+                self.cancel(request.clone()).await;
             }
-            let answer = self.client.act(request).await.map_err(unasked("held memory"))?.into_inner();
+            let answer = self.client.act(request).await.map_err(unexpected("recurrent_state"))?.into_inner();
             let digest = answer.policy.as_ref().map(|policy| policy.digest.clone()).unwrap_or_default();
-            let replay = replay.get_or_insert_with(|| Replay::new(&self.truth, &digest, size, seed));
-            let expected = replay.fly(&seen);
-            check(&answer, &expected, &replay.digest, step)?;
+            let reference = reference.get_or_insert_with(|| Reference::new(&self.policies, &digest, size, seed));
+            let expected = reference.decide(&observation);
+            check(&answer, &expected, &reference.digest, step)?;
             state = answer.recurrent_state;
-            self.counts.add("answers with held memory");
+            self.counts.add("responses with recurrent_state");
         }
         Ok(())
     }
 
     /// An episode whose memory the server keeps.
-    async fn session(&mut self, size: (usize, usize)) -> Flown {
-        self.number += 1;
-        let id = format!("s{}", self.number);
+    async fn session_episode(&mut self, size: (usize, usize)) -> CheckResult {
+        self.sessions += 1;
+        let id = format!("s{}", self.sessions);
         let seed = self.rng.random();
-        let mut how = open("soak@live", &id);
-        how.seed = Some(seed);
-        let opened = self.client.open_session(how).await.map_err(unasked("opening"))?.into_inner();
+        let mut request = open("soak@live", &id);
+        request.seed = Some(seed);
+        let opened = self.client.open_session(request).await.map_err(unexpected("opening"))?.into_inner();
         let digest = opened.policy.unwrap_or_default().digest;
-        let mut replay = Replay::new(&self.truth, &digest, size, seed);
+        let mut reference = Reference::new(&self.policies, &digest, size, seed);
         let mut run = None;
         loop {
             let slots = self.rng.random_range(1..40);
             if self.chance(15) && run.is_none() {
-                self.stream(&id, size, slots, &mut replay).await?;
+                self.stream(&id, size, slots, &mut reference).await?;
             } else {
-                self.slots(&id, size, slots, &mut replay, run.as_deref()).await?;
+                self.slots(&id, size, slots, &mut reference, run.as_deref()).await?;
             }
             if !self.chance(15) {
                 break;
             }
-            // A simulator that starts over.
+            // Like a simulator that restarts.
             self.counts.add("new runs");
             run = Some(format!("run-{}", self.rng.random::<u32>()));
-            replay = Replay::new(&self.truth, &digest, size, seed);
+            reference = Reference::new(&self.policies, &digest, size, seed);
         }
         match self.rng.random_range(0..20) {
             0 => {
@@ -250,24 +252,24 @@ impl Pilot {
                 let late = in_session(&id, None, scene(size.0, size.1, 0));
                 match self.client.act(late).await {
                     Err(status) if code(&status) == "session_expired" => self.counts.add("expired sessions"),
-                    other => return Err(format!("a session that is idle for too long: {other:?}")),
+                    other => return Err(format!("a session after its time to live: {other:?}")),
                 }
             }
             1..5 => self.counts.add("abandoned sessions"),
             _ => {
                 let close = v1::CloseSessionRequest { session_id: id };
-                self.client.close_session(close).await.map_err(unasked("closing"))?;
+                self.client.close_session(close).await.map_err(unexpected("closing"))?;
             }
         }
         Ok(())
     }
 
-    async fn slots(&mut self, id: &str, size: (usize, usize), slots: u64, replay: &mut Replay, run: Option<&str>) -> Flown {
+    async fn slots(&mut self, id: &str, size: (usize, usize), slots: u64, reference: &mut Reference, run: Option<&str>) -> CheckResult {
         let mut last = None;
         for step in 0..slots {
-            let seen = self.observe(size);
+            let observation = self.observe(size);
             let mut request = in_session(id, Some(step), v1::Scene::default());
-            (request.observation, request.return_q_values) = (Some(seen.clone()), true);
+            (request.observation, request.return_q_values) = (Some(observation.clone()), true);
             request.run_id = run.map(str::to_owned);
             if self.chance(3) {
                 let wrong = v1::ActRequest { step: Some(step + 7), ..request.clone() };
@@ -279,39 +281,39 @@ impl Pilot {
             if self.chance(2) {
                 let mut far = scene(size.0, size.1, 0);
                 far.uavs[0].x = f64::NAN;
-                let malformed = v1::ActRequest { observation: Some(Sent::Scene(far)), ..request.clone() };
+                let malformed = v1::ActRequest { observation: Some(WireObservation::Scene(far)), ..request.clone() };
                 match self.client.act(malformed).await {
                     Err(status) if status.code() == Code::InvalidArgument => self.counts.add("malformed requests"),
                     other => return Err(format!("a malformed request: {other:?}")),
                 }
             }
-            let expected = replay.fly(&seen);
+            let expected = reference.decide(&observation);
             if self.chance(10) {
-                self.give_up(request.clone()).await;
+                self.cancel(request.clone()).await;
             }
             if self.chance(10) {
-                let mut hasty = tonic::Request::new(request.clone());
-                hasty.set_timeout(Duration::from_micros(self.rng.random_range(1..2000)));
-                match self.client.act(hasty).await {
-                    Ok(answer) => check(answer.get_ref(), &expected, &replay.digest, step)?,
+                let mut urgent = tonic::Request::new(request.clone());
+                urgent.set_timeout(Duration::from_micros(self.rng.random_range(1..2000)));
+                match self.client.act(urgent).await {
+                    Ok(answer) => check(answer.get_ref(), &expected, &reference.digest, step)?,
                     Err(status) if matches!(status.code(), Code::DeadlineExceeded | Code::Cancelled) => {
                         self.counts.add("missed deadlines");
                     }
-                    Err(status) => return Err(unasked("a short deadline")(status)),
+                    Err(status) => return Err(unexpected("a short deadline")(status)),
                 }
             }
             let sent = Instant::now();
             match self.client.act(request.clone()).await {
-                Ok(answer) => check(answer.get_ref(), &expected, &replay.digest, step)?,
-                // This machine stood still for longer than a session lives.
+                Ok(answer) => check(answer.get_ref(), &expected, &reference.digest, step)?,
+                // The machine was suspended for longer than the time to live.
                 Err(status) if code(&status) == "session_expired" && sent.elapsed() > TTL / 2 => return Ok(()),
-                Err(status) => return Err(unasked("a slot")(status)),
+                Err(status) => return Err(unexpected("a slot")(status)),
             }
-            self.counts.add("answers in sessions");
+            self.counts.add("responses in sessions");
             last = Some((request, expected));
             if let Some((request, expected)) = last.clone().filter(|_| self.chance(5)) {
-                let again = self.client.act(request).await.map_err(unasked("a repeated step"))?;
-                check(again.get_ref(), &expected, &replay.digest, step)?;
+                let again = self.client.act(request).await.map_err(unexpected("a repeated step"))?;
+                check(again.get_ref(), &expected, &reference.digest, step)?;
                 self.counts.add("repeated steps");
             }
         }
@@ -319,55 +321,54 @@ impl Pilot {
         Ok(())
     }
 
-    /// Slots over a stream; sometimes it is dropped before all is answered, and the rest asked one by one.
-    async fn stream(&mut self, id: &str, size: (usize, usize), slots: u64, replay: &mut Replay) -> Flown {
-        let asked: Vec<(v1::ActRequest, _)> = (0..slots)
+    /// Slots over a stream, which is sometimes dropped before all responses have arrived.
+    async fn stream(&mut self, id: &str, size: (usize, usize), slots: u64, reference: &mut Reference) -> CheckResult {
+        let requests: Vec<(v1::ActRequest, _)> = (0..slots)
             .map(|step| {
-                let seen = self.observe(size);
+                let observation = self.observe(size);
                 let mut request = in_session(id, Some(step), v1::Scene::default());
-                (request.observation, request.return_q_values) = (Some(seen.clone()), true);
-                (request, replay.fly(&seen))
+                (request.observation, request.return_q_values) = (Some(observation.clone()), true);
+                (request, reference.decide(&observation))
             })
             .collect();
-        let heard = if self.chance(30) { self.rng.random_range(0..slots) } else { slots };
+        let received = if self.chance(30) { self.rng.random_range(0..slots) } else { slots };
         let (sender, receiver) = tokio::sync::mpsc::channel(slots as usize);
-        for (request, _) in &asked {
+        for (request, _) in &requests {
             sender.try_send(request.clone()).unwrap();
         }
         drop(sender);
         let answers = self.client.act_stream(ReceiverStream::new(receiver)).await;
-        let mut answers = answers.map_err(unasked("a stream"))?.into_inner();
-        for (step, (_, expected)) in asked.iter().enumerate().take(heard as usize) {
-            let answer = answers.message().await.map_err(unasked("a stream's answer"))?.ok_or("a stream ended early")?;
+        let mut answers = answers.map_err(unexpected("a stream"))?.into_inner();
+        for (step, (_, expected)) in requests.iter().enumerate().take(received as usize) {
+            let answer = answers.message().await.map_err(unexpected("a stream's response"))?.ok_or("a stream ended early")?;
             match answer.result {
-                Some(Told::Response(answer)) => check(&answer, expected, &replay.digest, step as u64)?,
-                other => return Err(format!("a stream's answer: {other:?}")),
+                Some(SlotResult::Response(answer)) => check(&answer, expected, &reference.digest, step as u64)?,
+                other => return Err(format!("a stream's response: {other:?}")),
             }
-            self.counts.add("answers of streams");
+            self.counts.add("responses of streams");
         }
         drop(answers);
-        // The server may have flown further than was heard. What it flew last may be asked again, what comes next may be
-        // asked; between the two is nothing.
-        let Some((request, expected)) = asked.get(heard as usize) else { return Ok(()) };
+        // The server may have computed more slots than were received. It accepts its last step and the next one.
+        let Some((request, expected)) = requests.get(received as usize) else { return Ok(()) };
         self.counts.add("dropped streams");
         match self.client.act(request.clone()).await {
-            Ok(answer) => check(answer.get_ref(), expected, &replay.digest, heard),
+            Ok(answer) => check(answer.get_ref(), expected, &reference.digest, received),
             Err(status) if code(&status) == "wrong_step" => Ok(()),
-            Err(status) => Err(unasked("after a dropped stream")(status)),
+            Err(status) => Err(unexpected("after a dropped stream")(status)),
         }
     }
 
-    /// Asks and leaves after a moment.
-    async fn give_up(&mut self, request: v1::ActRequest) {
-        let patience = Duration::from_micros(self.rng.random_range(0..1000));
-        if tokio::time::timeout(patience, self.client.act(request)).await.is_err() {
+    /// Sends a request and cancels it after a random time.
+    async fn cancel(&mut self, request: v1::ActRequest) {
+        let timeout = Duration::from_micros(self.rng.random_range(0..1000));
+        if tokio::time::timeout(timeout, self.client.act(request)).await.is_err() {
             self.counts.add("cancelled calls");
         }
     }
 }
 
 /// Publishes, moves aliases, unloads and loads, until `end`.
-async fn administer(rest: String, truth: Arc<Truth>, counts: Counts, end: Instant) -> Flown {
+async fn administer(rest: String, policies: Arc<Policies>, counts: Counts, end: Instant) -> CheckResult {
     let http = reqwest::Client::new();
     let send = async |request: reqwest::RequestBuilder, what: &str| -> Result<Value, String> {
         let response = request.send().await.map_err(|e| format!("{what}: {e}"))?;
@@ -380,22 +381,22 @@ async fn administer(rest: String, truth: Arc<Truth>, counts: Counts, end: Instan
     };
     let mut rng = qedgix::rng::stream(7, "soak-admin", 0);
     while Instant::now() < end {
-        let which = rng.random_range(0..truth.files.len());
-        let published = upload("soak", &truth.files[which]).await?;
+        let which = rng.random_range(0..policies.files.len());
+        let published = upload("soak", &policies.files[which]).await?;
         counts.add("published checkpoints");
         let version = published["ref"]["version"].as_u64().ok_or_else(|| format!("no version: {published}"))?;
         let alias = http.put(format!("{rest}/v1/policies/soak/aliases/live")).json(&json!({"version": version}));
         send(alias, "moving an alias").await?;
         counts.add("moved aliases");
         send(http.post(format!("{rest}/v1/policies/spare/unload")), "unloading").await?;
-        let gone = http.post(format!("{rest}/v1/sessions")).json(&json!({"policy": "spare"})).send().await;
-        let status = gone.map_err(|e| e.to_string())?.status().as_u16();
+        let rejected = http.post(format!("{rest}/v1/sessions")).json(&json!({"policy": "spare"})).send().await;
+        let status = rejected.map_err(|e| e.to_string())?.status().as_u16();
         if ![404, 409].contains(&status) {
             return Err(format!("a session of an unloaded policy: {status}"));
         }
         send(http.post(format!("{rest}/v1/policies/spare/load")), "loading").await?;
-        let there = send(http.post(format!("{rest}/v1/sessions")).json(&json!({"policy": "spare"})), "a loaded policy").await?;
-        let id = there["session_id"].as_str().unwrap_or_default();
+        let opened = send(http.post(format!("{rest}/v1/sessions")).json(&json!({"policy": "spare"})), "a loaded policy").await?;
+        let id = opened["session_id"].as_str().unwrap_or_default();
         send(http.delete(format!("{rest}/v1/sessions/{id}")), "closing").await?;
         counts.add("policies unloaded and loaded");
         tokio::time::sleep(Duration::from_millis(rng.random_range(0..60))).await;
@@ -404,37 +405,37 @@ async fn administer(rest: String, truth: Arc<Truth>, counts: Counts, end: Instan
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn every_answer_is_the_offline_policys_whatever_goes_on() {
+async fn all_responses_match_the_policy_under_mixed_load() {
     let seconds = std::env::var("QEDGIX_SOAK_SECONDS").map_or(5, |text| text.parse().expect("QEDGIX_SOAK_SECONDS: seconds"));
     let dir = tempfile::tempdir().unwrap();
     let process = Process::start(dir.path()).await;
-    let (truth, counts) = (Arc::new(Truth::new()), Counts::default());
+    let (policies, counts) = (Arc::new(Policies::new()), Counts::default());
     let http = reqwest::Client::new();
     for name in ["soak", "spare"] {
         let upload = http.post(format!("{}/v1/policies/{name}/versions?alias=live", process.rest));
-        let upload = upload.header("content-type", "application/octet-stream").body(truth.files[0].clone());
+        let upload = upload.header("content-type", "application/octet-stream").body(policies.files[0].clone());
         let response = upload.send().await.unwrap();
         assert!(response.status().is_success(), "{}", response.text().await.unwrap());
     }
-    let begun = Instant::now();
-    let end = begun + Duration::from_secs(seconds);
+    let started = Instant::now();
+    let end = started + Duration::from_secs(seconds);
     let mut work = tokio::task::JoinSet::new();
-    work.spawn(administer(process.rest.clone(), truth.clone(), counts.clone(), end));
+    work.spawn(administer(process.rest.clone(), policies.clone(), counts.clone(), end));
     let mut channels = Vec::new();
     for _ in 0..4 {
         channels.push(Channel::from_shared(process.grpc.clone()).unwrap().connect().await.unwrap());
     }
-    for pilot in 0..PILOTS {
-        let mut pilot = Pilot {
-            client: PolicyServiceClient::new(channels[pilot as usize % channels.len()].clone()),
-            truth: truth.clone(),
+    for number in 0..CALLERS {
+        let mut caller = SoakCaller {
+            client: PolicyServiceClient::new(channels[number as usize % channels.len()].clone()),
+            policies: policies.clone(),
             counts: counts.clone(),
-            rng: qedgix::rng::stream(pilot, "soak-pilot", 0),
-            number: pilot << 32,
+            rng: qedgix::rng::stream(number, "soak-caller", 0),
+            sessions: number << 32,
         };
         work.spawn(async move {
             while Instant::now() < end {
-                pilot.fly().await?;
+                caller.run_episode().await?;
             }
             Ok(())
         });
@@ -446,17 +447,17 @@ async fn every_answer_is_the_offline_policys_whatever_goes_on() {
             Some(done) = work.join_next() => wrong.extend(done.unwrap().err()),
             () = tokio::time::sleep(Duration::from_secs(1)) => memory.push(process.memory()),
         }
-        assert!(begun.elapsed() < Duration::from_secs(seconds + 120), "everything ends: {} left", work.len());
+        assert!(started.elapsed() < Duration::from_secs(seconds + 120), "all callers stop: {} left", work.len());
     }
     for (what, count) in counts.0.lock().unwrap().iter() {
         println!("{count:>10}  {what}");
     }
     println!("resident memory in MiB, second by second: {memory:.1?}");
-    assert!(wrong.is_empty(), "{} of {PILOTS} pilots stopped: {wrong:#?}", wrong.len());
-    for what in ["answers in sessions", "answers with held memory", "cancelled calls", "moved aliases", "published checkpoints"] {
+    assert!(wrong.is_empty(), "{} of {CALLERS} callers failed: {wrong:#?}", wrong.len());
+    for what in ["responses in sessions", "responses with recurrent_state", "cancelled calls", "moved aliases", "published checkpoints"] {
         assert!(counts.of(what) > 0, "{what}");
     }
-    // What fills up in the first minute (buffers, names of expired sessions) is done by then.
+    // Buffers and names of expired sessions fill up in the first minute.
     if memory.len() >= 240 {
         let mean = |part: &[f64]| part.iter().sum::<f64>() / part.len() as f64;
         let (early, late) = (mean(&memory[60..120]), mean(&memory[memory.len() - 60..]));

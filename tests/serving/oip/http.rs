@@ -49,7 +49,7 @@ impl Http<'_> {
 
 async fn server() -> Server {
     let server = Server::start().await;
-    server.add("count", 1, Arc::new(Deed::Count));
+    server.add("count", 1, Arc::new(TestPolicy::Count));
     server
 }
 
@@ -185,7 +185,7 @@ async fn the_server_and_its_models() {
     let (status, code, error) = http.refused(INFER, &slot(json!({}))).await;
     assert_eq!((status, code.as_str(), error.as_str()), (404, "not_found", "no loaded model \"count\""));
     assert_eq!(get("/v2/models/count/ready").await, (404, json!({"error": "no loaded model \"count\"", "code": "not_found"})));
-    server.add("count", 1, Arc::new(Deed::Count));
+    server.add("count", 1, Arc::new(TestPolicy::Count));
     assert_eq!(post("/v2/repository/models/sweep/unload", Value::Null).await.0, 200);
     assert_eq!(states().await, (json!("UNAVAILABLE"), json!("READY")));
     assert_eq!(post("/v2/repository/models/sweep/load", Value::Null).await.0, 200);
@@ -199,7 +199,7 @@ async fn the_server_and_its_models() {
 #[tokio::test]
 async fn errors_in_the_words_of_the_protocol() {
     let server = server().await;
-    server.add("panics", 1, Arc::new(Deed::Panic));
+    server.add("panics", 1, Arc::new(TestPolicy::Panic));
     let http = Http(&server, Client::new());
     let with = |path: &str, value: Value| {
         let mut ask = slot(json!({}));

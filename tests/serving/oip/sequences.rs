@@ -31,8 +31,8 @@ async fn fails(client: &mut Client, ask: Ask) -> (Code, String, String) {
 
 async fn counting() -> (Server, Client) {
     let server = Server::start().await;
-    server.add("count", 1, Arc::new(Deed::Count));
-    server.add("other", 1, Arc::new(Deed::Count));
+    server.add("count", 1, Arc::new(TestPolicy::Count));
+    server.add("other", 1, Arc::new(TestPolicy::Count));
     let client = client(&server).await;
     (server, client)
 }
@@ -117,7 +117,7 @@ async fn a_retry_by_step_advances_nothing() {
     assert_eq!(fails(&mut client, slot("count", 5)).await.1, NOT_STARTED.1);
     server.app.sessions.sweep();
     assert_eq!(fly(&mut client, end()).await.0, 3);
-    server.pass(11);
+    server.advance(11);
     server.app.sessions.sweep();
     assert!(server.app.sessions.is_empty());
     assert_eq!(fails(&mut client, end()).await.1, NOT_STARTED.1);
@@ -126,7 +126,7 @@ async fn a_retry_by_step_advances_nothing() {
 #[tokio::test]
 async fn ended_sequences_make_room() {
     let server = Server::with(|config| config.max_sessions = 2).await;
-    server.add("count", 1, Arc::new(Deed::Count));
+    server.add("count", 1, Arc::new(TestPolicy::Count));
     let mut client = client(&server).await;
     for sequence in 1..20 {
         assert_eq!(fly(&mut client, start("count", sequence, 4).flag("sequence_end")).await.0, 4);
@@ -162,7 +162,7 @@ async fn a_start_starts_over_and_a_refused_one_does_not() {
 async fn a_start_that_was_not_answered_did_not_begin() {
     let server = Server::with(|config| config.engine.threads = 1).await;
     let gate = Arc::new(Gate::default());
-    server.add("slow", 1, Arc::new(Deed::Wait(gate.clone())));
+    server.add("slow", 1, Arc::new(TestPolicy::Wait(gate.clone())));
     let mut client = client(&server).await;
     // In microseconds.
     let (code, reason, _) = fails(&mut client, start("slow", 5, 1).int("timeout", 30_000)).await;
@@ -177,7 +177,7 @@ async fn a_start_that_was_not_answered_did_not_begin() {
 async fn a_sequence_stays_with_the_version_it_began_with() {
     let (server, mut client) = counting().await;
     assert_eq!(fly(&mut client, start("count", 5, 0)).await, (0, "1".into()));
-    server.add("count", 2, Arc::new(Deed::Count));
+    server.add("count", 2, Arc::new(TestPolicy::Count));
     server.app.registry.set_alias("count", "live", 2);
     assert_eq!(fly(&mut client, slot("count", 5)).await, (1, "1".into()));
     assert_eq!(fly(&mut client, slot("count@live", 5)).await, (2, "1".into()));
@@ -194,7 +194,7 @@ async fn a_sequence_stays_with_the_version_it_began_with() {
 async fn idle_sequences_expire_and_say_so() {
     let (server, mut client) = counting().await;
     fly(&mut client, start("count", 5, 0)).await;
-    server.pass(601);
+    server.advance(601);
     let (code, reason, _) = fails(&mut client, slot("count", 5)).await;
     assert_eq!((code, reason.as_str()), (Code::FailedPrecondition, "session_expired"));
     assert_eq!(fly(&mut client, start("count", 5, 3)).await.0, 3);
@@ -222,7 +222,7 @@ async fn an_unloaded_model_is_refused_and_its_sequences_go_on() {
     assert_eq!(index(&mut client, false).await, Some(("1".into(), "UNAVAILABLE".into(), false)));
     assert_eq!(index(&mut client, true).await, None);
     assert_eq!(fly(&mut client, slot("count", 5)).await.0, 1, "under way");
-    server.add("count", 1, Arc::new(Deed::Count));
+    server.add("count", 1, Arc::new(TestPolicy::Count));
     client.repository_model_unload(unload("sweep")).await.unwrap();
     assert!(!client.model_ready(ready("sweep")).await.unwrap().into_inner().ready);
     client.repository_model_load(load("sweep")).await.unwrap();
@@ -260,7 +260,7 @@ async fn a_stream_is_answered_in_order_and_outlives_errors() {
     let mut answers = client.model_stream_infer(requests).await.unwrap().into_inner();
     let expected = [Ok(0), Ok(1), Err("not_found"), Ok(5), Err("wrong_step"), Ok(2)];
     for (i, expected) in expected.into_iter().enumerate() {
-        let answer = soon(answers.message()).await.unwrap().unwrap();
+        let answer = with_timeout(answers.message()).await.unwrap().unwrap();
         let response = answer.infer_response.unwrap();
         assert_eq!(response.id, i.to_string());
         let told = |name: &str| response.parameters.get(name).and_then(|p| p.parameter_choice.clone());
@@ -275,16 +275,16 @@ async fn a_stream_is_answered_in_order_and_outlives_errors() {
     }
     // A stream that is open does not hold up the end of the server.
     server.begin_stop();
-    assert!(soon(answers.message()).await.unwrap().is_none());
+    assert!(with_timeout(answers.message()).await.unwrap().is_none());
     drop(send);
-    soon(server.stopped()).await;
+    with_timeout(server.stopped()).await;
 }
 
 #[tokio::test]
 async fn metadata_says_what_a_policy_takes() {
     let server = Server::start().await;
     let reference = PolicyRef { name: "fixed".into(), version: 3, digest: [3; 32] };
-    let policy = LoadedPolicy::baseline(reference, "of a test", Arc::new(Deed::Count), Timestamp::UNIX_EPOCH);
+    let policy = LoadedPolicy::baseline(reference, "of a test", Arc::new(TestPolicy::Count), Timestamp::UNIX_EPOCH);
     let info = PolicyInfo { kind: PolicyKind::Checkpoint, uavs: Some(3), ..(*policy.info).clone() };
     let policy = LoadedPolicy { info: Arc::new(info), ..policy };
     server.app.registry.insert(policy);

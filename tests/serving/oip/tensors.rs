@@ -99,7 +99,7 @@ async fn a_large_fleet() {
 #[tokio::test]
 async fn outputs_are_what_was_asked_for() {
     let server = Server::start().await;
-    server.add("hovers", 1, Arc::new(Deed::Count));
+    server.add("hovers", 1, Arc::new(TestPolicy::Count));
     let mut client = client(&server).await;
     let ask = || Ask::new("hovers", As::Raw, false).scene(&narrow(2, 1, 0)).int("seed", 8);
     let names = |answer: &oip::ModelInferResponse| answer.outputs.iter().map(|o| o.name.clone()).collect::<Vec<_>>();

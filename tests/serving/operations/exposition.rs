@@ -243,7 +243,7 @@ async fn grpc_calls_are_counted_with_their_final_status() {
     let handled = [("OK", 3.0), ("FailedPrecondition", 1.0), ("NotFound", 1.0)];
     // A call is counted after its last byte, which the client may have read before.
     let ended = async |seen: &dyn Fn(&str) -> Calls, expected: Calls| {
-        soon(async {
+        with_timeout(async {
             loop {
                 let now = seen(&binary.metrics().await);
                 if now == expected {
@@ -280,8 +280,8 @@ async fn grpc_calls_are_counted_with_their_final_status() {
     // A stream whose client disconnects.
     let (mut questions, answer) = raw_stream(&binary, "/qedgix.v1.PolicyService/ActStream").await;
     questions.send_data(framed(&in_session("s", None, scene(2, 3, 6))), false).unwrap();
-    let mut answers = soon(answer).await.unwrap().into_body();
-    soon(answers.data()).await.unwrap().unwrap();
+    let mut answers = with_timeout(answer).await.unwrap().into_body();
+    with_timeout(answers.data()).await.unwrap().unwrap();
     questions.send_reset(h2::Reason::CANCEL);
     ended(&stream, counted(2.0, &[("OK", 1.0), ("Canceled", 1.0)], 4.0, 4.0)).await;
 

@@ -45,7 +45,7 @@ async fn sigterm_ends_streams_and_completes_requests_in_flight() {
     let spec = qedgix::api::convert::structs::to_struct(&spec);
     let job = jobs.submit_job(v1::SubmitJobRequest { spec, ..Default::default() }).await.unwrap().into_inner();
     jobs.pause_job(v1::PauseJobRequest { id: job.id.clone() }).await.unwrap();
-    soon(async {
+    with_timeout(async {
         while jobs.get_job(v1::GetJobRequest { id: job.id.clone() }).await.unwrap().into_inner().state() != v1::JobState::Paused {
             tokio::task::yield_now().await;
         }
@@ -70,11 +70,11 @@ async fn sigterm_ends_streams_and_completes_requests_in_flight() {
     let act = in_flight(&binary).await;
 
     binary.signal("TERM");
-    assert_eq!(soon(states.message()).await.unwrap().unwrap().status(), ServingStatus::NotServing);
-    assert!(soon(states.message()).await.unwrap().is_none());
-    assert!(soon(answers.message()).await.unwrap().is_none(), "the server ends the stream");
-    assert!(soon(described.message()).await.unwrap().is_none());
-    let watch_status = soon(async {
+    assert_eq!(with_timeout(states.message()).await.unwrap().unwrap().status(), ServingStatus::NotServing);
+    assert!(with_timeout(states.message()).await.unwrap().is_none());
+    assert!(with_timeout(answers.message()).await.unwrap().is_none(), "the server ends the stream");
+    assert!(with_timeout(described.message()).await.unwrap().is_none());
+    let watch_status = with_timeout(async {
         loop {
             if let Err(status) = watch.message().await {
                 return status;
@@ -82,8 +82,8 @@ async fn sigterm_ends_streams_and_completes_requests_in_flight() {
         }
     });
     assert_eq!(watch_status.await.code(), Code::Unavailable);
-    soon(async { while events.chunk().await.unwrap().is_some() {} }).await;
-    let answer = soon(act).await.unwrap().unwrap().into_inner();
+    with_timeout(async { while events.chunk().await.unwrap().is_some() {} }).await;
+    let answer = with_timeout(act).await.unwrap().unwrap().into_inner();
     assert_eq!(answer.actions.len(), 2);
     let (code, lines) = binary.ended().await;
     assert_eq!(code, Some(0), "{lines:?}");
@@ -103,7 +103,7 @@ async fn a_second_signal_ends_the_process_at_once() {
         binary.signal(signal);
         let (ended, lines) = binary.ended().await;
         assert_eq!(ended, Some(code), "{lines:?}");
-        assert!(soon(act).await.unwrap().is_err());
+        assert!(with_timeout(act).await.unwrap().is_err());
         // Another server can start on the same directory.
         let binary = Binary::start(dir.path(), &[]).await;
         let ready = reqwest::get(format!("{}/readyz", binary.http)).await.unwrap();
@@ -120,5 +120,5 @@ async fn requests_are_closed_after_the_drain_timeout() {
     let (code, lines) = binary.ended().await;
     assert_eq!(code, Some(0), "{lines:?}");
     assert!(lines.iter().any(|line| line.contains("drain timeout")), "{lines:?}");
-    assert!(soon(act).await.unwrap().is_err());
+    assert!(with_timeout(act).await.unwrap().is_err());
 }

@@ -91,7 +91,7 @@ async fn grpc(channel: &Channel, method: &str, key: Option<&str>) -> (Code, Stri
     client.ready().await.unwrap();
     let request = key.map_or_else(|| tonic::Request::new(Bytes::new()), |key| signed(key, Bytes::new()));
     // Every kind of method responds to a stream of one message.
-    let answer = soon(client.server_streaming(request, format!("/{method}").parse().unwrap(), Raw)).await;
+    let answer = with_timeout(client.server_streaming(request, format!("/{method}").parse().unwrap(), Raw)).await;
     answer.map_or_else(|status| (status.code(), status.message().to_owned()), |_| (Code::Ok, String::new()))
 }
 
@@ -141,7 +141,7 @@ async fn grpc_enforces_the_access_table() {
 async fn rest(server: &Server, verb: &Method, path: &str, key: Option<&str>) -> (u16, Option<String>, String) {
     let request = reqwest::Client::new().request(verb.clone(), server.url(path));
     let request = if let Some(key) = key { request.header("x-api-key", key) } else { request };
-    let answer = soon(request.send()).await.unwrap();
+    let answer = with_timeout(request.send()).await.unwrap();
     let asked = answer.headers().get("www-authenticate").map(|value| value.to_str().unwrap().to_owned());
     (answer.status().as_u16(), asked, answer.text().await.unwrap())
 }

@@ -259,7 +259,7 @@ async fn a_job_runs_on_a_server_with_keys_and_client_certificates() {
         let (run, train, trainer) = (run, train.clone(), trainer.clone());
         move || run(train, trainer)
     });
-    assert!(soon(trained).await.unwrap().ends_with("policy over-tls:1"));
+    assert!(with_timeout(trained).await.unwrap().ends_with("policy over-tls:1"));
     let fly = words(&[
         "evaluate",
         "--policy",
@@ -276,14 +276,14 @@ async fn a_job_runs_on_a_server_with_keys_and_client_certificates() {
         &format!("127.0.0.1:{}", server.endpoints.grpc.port()),
     ]);
     let flown = tokio::task::spawn_blocking(move || run(fly, pilot));
-    assert!(soon(flown).await.unwrap().contains("over-tls:1"));
+    assert!(with_timeout(flown).await.unwrap().contains("over-tls:1"));
     // Without a client certificate the server cannot be reached.
     let output = tokio::task::spawn_blocking(move || {
         let bare: Vec<&str> =
             train.iter().map(String::as_str).filter(|word| !word.contains("client-") && !word.contains("own.")).collect();
         failed(&bare, Some(&trainer))
     });
-    assert!(soon(output).await.unwrap().contains("cannot reach https://localhost"));
+    assert!(with_timeout(output).await.unwrap().contains("cannot reach https://localhost"));
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -13,7 +13,7 @@ use super::tls;
 async fn closed(mut stream: TcpStream) -> Vec<u8> {
     let mut said = Vec::new();
     // A reset counts as closed.
-    let _ = soon(stream.read_to_end(&mut said)).await;
+    let _ = with_timeout(stream.read_to_end(&mut said)).await;
     said
 }
 
@@ -48,7 +48,7 @@ async fn the_connection_limit_covers_both_addresses() {
     }
     // A closed connection frees its place.
     drop(stream);
-    soon(async {
+    with_timeout(async {
         while !live(&server).await {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
@@ -113,7 +113,7 @@ async fn shutdown_does_not_wait_for_handshakes() {
     let silent = after(server.endpoints.grpc, b"").await;
     let idle = tls::channel(&tls::caller(&authority, None), server.endpoints.grpc).await.unwrap();
     server.begin_stop();
-    soon(server.stopped()).await;
+    with_timeout(server.stopped()).await;
     closed(silent).await;
     assert!(tls::policies(idle).await.is_err());
 }
@@ -128,7 +128,7 @@ async fn streams_per_connection_are_limited() {
         let get = axum::http::Request::get("http://x/").body(()).unwrap();
         let mut client = client.ready().await.unwrap();
         // The server sends its settings before the response.
-        let _ = soon(client.send_request(get, true).unwrap().0).await;
+        let _ = with_timeout(client.send_request(get, true).unwrap().0).await;
         assert_eq!(client.current_max_send_streams(), streams as usize);
     }
 }

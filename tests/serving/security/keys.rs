@@ -23,9 +23,9 @@ async fn expired_and_revoked_keys_are_refused_and_keys_stay_required() {
     let forever = make(&server, "admin", |_| {}).await;
     let short = make(&server, "read", |new| new.lifetime = Some(Duration::from_secs(3600))).await;
     assert_eq!(ask(&server, &short.key).await.0, 200);
-    server.pass(3599);
+    server.advance(3599);
     assert_eq!(ask(&server, &short.key).await.0, 200);
-    server.pass(1);
+    server.advance(1);
     assert_eq!(ask(&server, &short.key).await, (401, "the API key is expired".into()));
     keys::revoke(&server.app.store, &forever.info.id, server.app.clock.now()).await.unwrap();
     refresh(&server).await;
@@ -82,9 +82,9 @@ async fn a_running_server_notices_new_and_revoked_keys() {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     };
-    soon(until(200)).await;
+    with_timeout(until(200)).await;
     keys::revoke(&store, &created.key, server.app.clock.now()).await.unwrap();
-    soon(until(401)).await;
+    with_timeout(until(401)).await;
 }
 
 #[tokio::test]
@@ -97,12 +97,12 @@ async fn a_stream_ends_when_its_key_is_revoked() {
     let mut answers = client.act_stream(signed(&created.key, stream)).await.unwrap().into_inner();
     let slot = || held("sweep", bytes::Bytes::new(), scene(2, 2, 0));
     sender.send(slot()).await.unwrap();
-    let first = soon(answers.message()).await.unwrap().unwrap();
+    let first = with_timeout(answers.message()).await.unwrap().unwrap();
     assert!(matches!(first.result, Some(v1::act_result::Result::Response(_))), "{first:?}");
     keys::revoke(&server.app.store, &created.info.id, server.app.clock.now()).await.unwrap();
     refresh(&server).await;
     sender.send(slot()).await.unwrap();
-    let status = soon(answers.message()).await.unwrap_err();
+    let status = with_timeout(answers.message()).await.unwrap_err();
     assert_eq!((status.code(), status.message()), (Code::Unauthenticated, "the API key is revoked"));
 }
 
@@ -111,7 +111,7 @@ async fn rotation_copies_a_key_and_lets_the_old_one_expire() {
     let server = Server::start().await;
     let change = |new: &mut keys::NewKey| (new.lifetime, new.rate) = (Some(Duration::from_secs(1000)), Some(50.0));
     let old = make(&server, "read", change).await;
-    server.pass(400);
+    server.advance(400);
     let (store, now) = (&server.app.store, server.app.clock.now());
     let new = keys::rotate(store, &old.key, Duration::from_secs(60), now).await.unwrap();
     assert_ne!(new.info.id, old.info.id);
@@ -119,7 +119,7 @@ async fn rotation_copies_a_key_and_lets_the_old_one_expire() {
     assert_eq!(new.info.expires_at.unwrap().duration_since(now).as_secs(), 1000);
     refresh(&server).await;
     assert_eq!([ask(&server, &old.key).await.0, ask(&server, &new.key).await.0], [200, 200]);
-    server.pass(60);
+    server.advance(60);
     assert_eq!([ask(&server, &old.key).await.0, ask(&server, &new.key).await.0], [401, 200]);
     // A longer grace does not extend the old key, and an expired key cannot be rotated.
     let again = keys::rotate(store, &new.info.id, Duration::from_secs(1_000_000), server.app.clock.now()).await.unwrap();
@@ -179,13 +179,13 @@ async fn properties_of_new_keys_are_validated() {
 async fn the_time_of_last_use_survives_a_restart() {
     let mut server = Server::start().await;
     let created = make(&server, "read", |_| {}).await;
-    server.pass(5000);
+    server.advance(5000);
     assert_eq!(ask(&server, &created.key).await.0, 200);
     let used = async |server: &Server| keys::list(&server.app.store, server.app.clock.now()).await.unwrap()[0].last_used_at;
     assert_eq!(used(&server).await, None, "requests do not write to the database");
     server.app.keys.save_last_used(&server.app.store).await.unwrap();
     assert_eq!(used(&server).await, Some(server.app.clock.now()));
-    server.pass(5);
+    server.advance(5);
     assert_eq!(ask(&server, &created.key).await.0, 200);
     let last = server.app.clock.now();
     server.begin_stop();
@@ -246,12 +246,12 @@ async fn job_event_streams_end_when_their_key_is_revoked() {
         jobs.watch_job(signed(&reader.key, v1::WatchJobRequest { id: id.clone(), after: 0 })).await.unwrap().into_inner();
     let url = server.url(&format!("/v1/jobs/{id}/events"));
     let mut page = client.get(url).bearer_auth(&reader.key).send().await.unwrap();
-    assert!(soon(events.message()).await.unwrap().is_some());
-    assert!(soon(page.chunk()).await.unwrap().is_some());
+    assert!(with_timeout(events.message()).await.unwrap().is_some());
+    assert!(with_timeout(page.chunk()).await.unwrap().is_some());
     keys::revoke(&server.app.store, &reader.key, server.app.clock.now()).await.unwrap();
     refresh(&server).await;
     post(&format!("/v1/jobs/{id}/cancel"), "").await;
-    let status = soon(async {
+    let status = with_timeout(async {
         loop {
             if let Err(status) = events.message().await {
                 return status;
@@ -260,7 +260,7 @@ async fn job_event_streams_end_when_their_key_is_revoked() {
     });
     assert_eq!(status.await.code(), Code::Unauthenticated);
     let mut received = String::new();
-    while let Some(part) = soon(page.chunk()).await.unwrap() {
+    while let Some(part) = with_timeout(page.chunk()).await.unwrap() {
         received += std::str::from_utf8(&part).unwrap();
     }
     assert!(!received.contains("cancelled"), "{received}");

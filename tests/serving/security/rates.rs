@@ -35,9 +35,9 @@ async fn a_key_over_its_rate_is_refused_and_other_keys_are_not() {
     assert_eq!(status.metadata().get("qedgix-code").unwrap(), "resource_exhausted");
     assert_eq!(status.get_error_details().retry_info().unwrap().retry_delay, Some(std::time::Duration::from_secs(2)));
     assert_eq!(rest(&server, &free).await.0, 200);
-    server.pass(1);
+    server.advance(1);
     assert_eq!(rest(&server, &slow).await, (429, Some("1".into())));
-    server.pass(1);
+    server.advance(1);
     assert_eq!(rest(&server, &slow).await.0, 200);
     assert_eq!(rest(&server, &slow).await.0, 429);
 }
@@ -52,7 +52,7 @@ async fn requests_without_the_scope_count_against_the_rate() {
     assert_eq!(list().await, Code::PermissionDenied);
     assert_eq!(rest(&server, &slow).await, (429, Some("2".into())));
     assert_eq!(list().await, Code::ResourceExhausted);
-    server.pass(2);
+    server.advance(2);
     assert_eq!(rest(&server, &slow).await.0, 403);
 }
 
@@ -81,7 +81,7 @@ async fn slots_of_batches_and_streams_are_counted() {
     let answer = client.act_batch(signed(&batch, v1::ActBatchRequest { requests: vec![slot(); 6] })).await.unwrap();
     assert!(answer.into_inner().results.iter().all(|result| matches!(result.result, Some(ActResult::Response(_)))));
     assert_eq!(client.act(signed(&batch, slot())).await.unwrap_err().metadata().get("retry-after").unwrap(), "4");
-    server.pass(4);
+    server.advance(4);
     client.act(signed(&batch, slot())).await.unwrap();
 
     // Opening a stream counts as one request, and each slot as another. Slots over the rate are refused individually.
@@ -89,7 +89,7 @@ async fn slots_of_batches_and_streams_are_counted() {
     let slots = tokio_stream::iter(vec![slot(); 4]);
     let mut answers = client.act_stream(signed(&stream, slots)).await.unwrap().into_inner();
     let mut codes = Vec::new();
-    while let Some(answer) = soon(answers.message()).await.unwrap() {
+    while let Some(answer) = with_timeout(answers.message()).await.unwrap() {
         codes.push(match answer.result.unwrap() {
             ActResult::Response(_) => Code::Ok,
             ActResult::Error(error) => Code::from(error.status),

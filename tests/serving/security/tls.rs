@@ -83,21 +83,21 @@ pub async fn get(caller: &ClientConfig, http2: bool, url: &str) -> Result<(u16, 
     let connector = if http2 { builder.enable_all_versions().build() } else { builder.enable_http1().build() };
     let client = Client::builder(TokioExecutor::new()).build(connector);
     let request = Request::get(url).body(Body::empty()).unwrap();
-    let answer = soon(client.request(request)).await.map_err(|e| format!("{e:?}"))?;
+    let answer = with_timeout(client.request(request)).await.map_err(|e| format!("{e:?}"))?;
     Ok((answer.status().as_u16(), answer.version()))
 }
 
 pub async fn channel(caller: &ClientConfig, address: impl std::fmt::Display) -> Result<Channel, String> {
     let connector = HttpsConnectorBuilder::new().with_tls_config(caller.clone()).https_only().enable_http2().build();
     let uri: Uri = format!("https://{address}").parse().unwrap();
-    let connected = soon(Endpoint::from(uri).connect_with_connector(connector)).await;
+    let connected = with_timeout(Endpoint::from(uri).connect_with_connector(connector)).await;
     connected.map_err(|e| format!("{e:?}"))
 }
 
 /// Lists policies. A handshake that the server aborts fails here at the latest.
 pub async fn policies(channel: Channel) -> Result<usize, String> {
     let mut client = PolicyServiceClient::new(channel);
-    let answer = soon(client.list_policies(v1::ListPoliciesRequest::default())).await;
+    let answer = with_timeout(client.list_policies(v1::ListPoliciesRequest::default())).await;
     answer.map(|answer| answer.into_inner().policies.len()).map_err(|status| format!("{status:?}"))
 }
 
@@ -162,7 +162,7 @@ async fn send(address: std::net::SocketAddr, bytes: &[u8]) -> Vec<u8> {
     stream.write_all(bytes).await.unwrap();
     let mut answer = Vec::new();
     // A reset counts as closed.
-    let _ = soon(stream.read_to_end(&mut answer)).await;
+    let _ = with_timeout(stream.read_to_end(&mut answer)).await;
     answer
 }
 
