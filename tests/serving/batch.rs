@@ -144,7 +144,8 @@ async fn batch_with_delay_starts_when_it_is_full_or_the_delay_has_passed() {
     assert_eq!(with_timeout(one).await.unwrap().timings.unwrap().batch_size, 2);
     assert_eq!(with_timeout(two).await.unwrap().timings.unwrap().batch_size, 2);
     let server = Server::with(|config| delay(config, Duration::from_millis(1))).await;
-    let single = with_timeout(async { server.grpc().await.act(held("sweep", Bytes::new(), scene(2, 2, 0))).await }).await.unwrap();
+    let single =
+        with_timeout(async { server.grpc().await.act(held("sweep", Bytes::new(), scene(2, 2, 0))).await }).await.unwrap();
     assert_eq!(single.into_inner().timings.unwrap().batch_size, 1);
 }
 

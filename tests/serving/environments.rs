@@ -165,7 +165,11 @@ async fn automatic_reset_equals_a_reset_by_the_caller() {
             assert_eq!((auto.episode, auto.slot), (next.episode, next.slot));
             for ((auto, ended), next) in auto.copies.into_iter().zip(by_hand.copies).zip(next.copies) {
                 assert!(auto.truncated && ended.truncated && !next.truncated);
-                assert_eq!((auto.scene, auto.graph, auto.seed), (next.scene, next.graph, next.seed), "the observation is of the next episode");
+                assert_eq!(
+                    (auto.scene, auto.graph, auto.seed),
+                    (next.scene, next.graph, next.seed),
+                    "the observation is of the next episode"
+                );
                 assert_eq!((auto.reward, next.reward), (ended.reward, 0.0), "the reward is of the last step");
                 let (finished, plain) = (auto.finished.unwrap(), ended.finished.unwrap());
                 assert_eq!((finished.scene, finished.graph), (ended.scene, ended.graph), "the last observation of the episode");
@@ -211,7 +215,11 @@ async fn creating_twice_is_a_retry_only_with_equal_requests() {
     let first = client.create_environment(good()).await.unwrap().into_inner();
     assert_eq!((first.headings, first.count, first.seed), (8, 2, 7));
     let config = first.environment.as_ref().unwrap();
-    assert_eq!(config.fields["reward_scale"].kind, Some(prost_types::value::Kind::NumberValue(1.0 / 80.0)), "the response has the complete configuration");
+    assert_eq!(
+        config.fields["reward_scale"].kind,
+        Some(prost_types::value::Kind::NumberValue(1.0 / 80.0)),
+        "the response has the complete configuration"
+    );
     assert_eq!(client.create_environment(good()).await.unwrap().into_inner(), first);
     let different = [
         v1::CreateEnvironmentRequest { count: Some(3), ..good() },

@@ -189,7 +189,11 @@ impl SoakCaller {
 
     fn observe(&mut self, (uavs, users): (usize, usize)) -> WireObservation {
         let scene = scene(uavs, users, self.rng.random());
-        if self.chance(50) { WireObservation::Scene(scene) } else { WireObservation::Graph(graph(&scene, 0.28, self.rng.random())) }
+        if self.chance(50) {
+            WireObservation::Scene(scene)
+        } else {
+            WireObservation::Graph(graph(&scene, 0.28, self.rng.random()))
+        }
     }
 
     async fn run_episode(&mut self) -> CheckResult {
@@ -264,7 +268,14 @@ impl SoakCaller {
         Ok(())
     }
 
-    async fn slots(&mut self, id: &str, size: (usize, usize), slots: u64, reference: &mut Reference, run: Option<&str>) -> CheckResult {
+    async fn slots(
+        &mut self,
+        id: &str,
+        size: (usize, usize),
+        slots: u64,
+        reference: &mut Reference,
+        run: Option<&str>,
+    ) -> CheckResult {
         let mut last = None;
         for step in 0..slots {
             let observation = self.observe(size);
@@ -454,7 +465,9 @@ async fn all_responses_match_the_policy_under_mixed_load() {
     }
     println!("resident memory in MiB, second by second: {memory:.1?}");
     assert!(wrong.is_empty(), "{} of {CALLERS} callers failed: {wrong:#?}", wrong.len());
-    for what in ["responses in sessions", "responses with recurrent_state", "cancelled calls", "moved aliases", "published checkpoints"] {
+    for what in
+        ["responses in sessions", "responses with recurrent_state", "cancelled calls", "moved aliases", "published checkpoints"]
+    {
         assert!(counts.of(what) > 0, "{what}");
     }
     // Buffers and names of expired sessions fill up in the first minute.

@@ -32,8 +32,8 @@ async fn a_corrected_wall_time_expires_keys_but_neither_refills_rates_nor_expire
     assert_eq!(status(&server, "/v1/policies", &short).await, StatusCode::UNAUTHORIZED);
     // Set back, the wall time neither blocks rates nor keeps sessions.
     server.time.set_wall(start);
-    server.pass(2);
+    server.advance(2);
     assert_eq!(status(&server, "/v1/policies", &slow).await, StatusCode::OK);
-    server.pass(600);
+    server.advance(600);
     assert_eq!(status(&server, "/v1/sessions/s", &all).await, StatusCode::CONFLICT);
 }
