@@ -165,7 +165,7 @@ fn tensors_must_match_the_configuration() {
     other.training.mixer = MixerKind::Qmix;
     let other = serde_json::to_string(&other).unwrap();
     let error = error_after(|h| h["__metadata__"]["config"] = json!(other));
-    assert!(matches!(&error, Error::Missing { name } if name.starts_with("mixer.")), "{error}");
+    assert!(matches!(&error, Error::Shape { name, .. } if name.starts_with("mixer.")), "{error}");
 }
 
 #[test]
