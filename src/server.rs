@@ -1,7 +1,7 @@
 //! Listeners, background tasks and graceful shutdown of one server on one data directory.
 //!
-//! Shutdown has four steps: the server reports not ready and refuses new work; workers snapshot their jobs, which return to the queue;
-//! streams end and requests in flight are answered; the listeners close and the data directory is unlocked.
+//! Shutdown has four steps: the server reports not ready and refuses new work; workers snapshot their jobs, which return to the
+//! queue; streams end and requests in flight are answered; the listeners close and the data directory is unlocked.
 
 mod connections;
 mod keys;
@@ -179,8 +179,8 @@ impl DataDir {
 /// Opens the database, loads policies and keys, and starts the engine.
 ///
 /// # Errors
-/// [`Error::Config`] when a setting is invalid, [`Error::Store`], [`Error::Keys`] or [`Error::Policies`] when the database or a policy
-/// in it cannot be read.
+/// [`Error::Config`] when a setting is invalid, [`Error::Store`], [`Error::Keys`] or [`Error::Policies`] when the database or a
+/// policy in it cannot be read.
 pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<App>, Error> {
     config.validate()?;
     // The recorder must exist before anything creates a metric.

@@ -54,7 +54,8 @@ impl fmt::Debug for Secret {
 pub type Connector = HttpsConnector<HttpConnector>;
 
 impl ConnectArgs {
-    /// Parses `HOST:PORT` or a URL. Without a scheme, the scheme is `https` when a certificate flag is given, and `http` otherwise.
+    /// Parses `HOST:PORT` or a URL. Without a scheme, the scheme is `https` when a certificate flag is given, and `http`
+    /// otherwise.
     ///
     /// # Errors
     /// `address` is neither.
@@ -95,8 +96,8 @@ impl ConnectArgs {
         Ok(builder.enable_http2().wrap_connector(tcp))
     }
 
-    /// The TLS configuration for `url`. The certificate authorities of this machine are loaded only for `https`, because a machine may
-    /// have none.
+    /// The TLS configuration for `url`. The certificate authorities of this machine are loaded only for `https`, because a
+    /// machine may have none.
     ///
     /// # Errors
     /// A certificate or private key cannot be read or used.

@@ -183,8 +183,8 @@ fn reload_on_hangup(tls: Option<Arc<Tls>>) -> std::io::Result<()> {
     Ok(())
 }
 
-/// Resolves on the first ctrl-c or SIGTERM. The second signal ends the process at once. No acknowledged change is lost, because it
-/// is committed to the database; workers end with the server.
+/// Resolves on the first ctrl-c or SIGTERM. The second signal ends the process at once. No acknowledged change is lost, because
+/// it is committed to the database; workers end with the server.
 fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
     let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
     let mut next = async move || {

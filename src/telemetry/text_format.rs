@@ -1,7 +1,7 @@
 //! Formats the fields of text log lines as `name=value`.
 //!
-//! Fields that only the trace export uses (`otel.*`) are left out. Control characters are escaped, because values may come from callers
-//! and must not break lines or control a terminal.
+//! Fields that only the trace export uses (`otel.*`) are left out. Control characters are escaped, because values may come from
+//! callers and must not break lines or control a terminal.
 
 use std::fmt::{self, Debug, Write};
 

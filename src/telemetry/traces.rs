@@ -1,7 +1,8 @@
 //! Trace export by OTLP over gRPC.
 //!
-//! A thread of the OpenTelemetry SDK sends finished spans in batches from a bounded queue. When the collector is unreachable and the
-//! queue is full, spans are dropped; requests never wait. The standard environment variables apply (`OTEL_TRACES_SAMPLER`, `OTEL_BSP_*`,
+//! A thread of the OpenTelemetry SDK sends finished spans in batches from a bounded queue. When the collector is unreachable
+//! and the queue is full, spans are dropped; requests never wait. The standard environment variables apply
+//! (`OTEL_TRACES_SAMPLER`, `OTEL_BSP_*`,
 //! `OTEL_SERVICE_NAME`).
 
 use std::time::Duration;

@@ -24,14 +24,14 @@ pub struct BenchArgs {
 enum What {
     /// Measure the learner: time per update and per rollout, environment steps per second, and the roofline of an update
     ///
-    /// The roofline is the time of the matrix products of an update alone, with the same shapes and threads. Fields that --set does
-    /// not change differ from the preset as follows: flat observation without own position, one-hot identity, mean aggregation,
-    /// qmix mixer, a batch of 128 episodes, one update per rollout of 8.
+    /// The roofline is the time of the matrix products of an update alone, with the same shapes and threads. Fields that --set
+    /// does not change differ from the preset as follows: flat observation without own position, one-hot identity, mean
+    /// aggregation, qmix mixer, a batch of 128 episodes, one update per rollout of 8.
     Learner(LearnerArgs),
     /// Measure gRPC Act: throughput and latencies, next to those of a plain gRPC echo service
     ///
-    /// Each session runs real episodes. Rounds of Act alternate with rounds of an echo service that returns messages of the same size,
-    /// so other load on the machine slows both. Read the ratios first.
+    /// Each session runs real episodes. Rounds of Act alternate with rounds of an echo service that returns messages of the
+    /// same size, so other load on the machine slows both. Read the ratios first.
     Act(act::ActArgs),
     /// The echo service in a process of its own; `bench act --server` starts it
     #[command(hide = true)]

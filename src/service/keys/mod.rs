@@ -143,8 +143,8 @@ pub async fn revoke(store: &Store, id: &str, now: Timestamp) -> Result<(), Error
     if store.revoke_key(id, now).await? { Ok(()) } else { Err(Error::not_found("API key", id)) }
 }
 
-/// Replaces a key, given as its id or in full: creates a key with the same properties and lifetime, and lets the old key expire after
-/// `grace`, in one transaction.
+/// Replaces a key, given as its id or in full: in one transaction, creates a key with the same properties and lifetime, and lets the
+/// old key expire after `grace`.
 ///
 /// # Errors
 /// [`Error::NotFound`] when there is no such key, [`Error::Precondition`] when it is revoked or expired.

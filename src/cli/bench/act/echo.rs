@@ -1,6 +1,7 @@
 //! The echo service that `Act` is compared with: it decodes the requests of `Act` and always returns the same `ActResponse`.
 //!
-//! It uses the transport settings of the server. It runs in this process when the server does, and in a process of its own otherwise.
+//! It uses the transport settings of the server. It runs in this process when the server does, and in a process of its own
+//! otherwise.
 
 use std::net::SocketAddr;
 use std::process::Stdio;

@@ -1,7 +1,8 @@
 //! Clients that send requests and measure latencies.
 //!
-//! Closed loop: each client sends its next request when it has the previous response. Open loop: requests are due at fixed times, and
-//! latencies count from those times, so that a slow response also shows in the latencies of the requests that it delays.
+//! Closed loop: each client sends its next request when it has the previous response. Open loop: requests are due at fixed
+//! times, and latencies count from those times, so that a slow response also shows in the latencies of the requests that it
+//! delays.
 
 use std::time::{Duration, Instant};
 

@@ -1,7 +1,7 @@
 //! `qedgix bench act`: measures gRPC `Act` and compares it with a plain gRPC echo service.
 //!
-//! This file owns the flags and the order of rounds. `fleet` makes requests, `load` sends and times them, `echo` is the service to
-//! compare with, `metrics` computes and formats the results.
+//! This file owns the flags and the order of rounds. `fleet` makes requests, `load` sends and times them, `echo` is the service
+//! to compare with, `metrics` computes and formats the results.
 
 mod echo;
 mod fleet;
@@ -59,8 +59,8 @@ pub struct ActArgs {
     /// Form of the observations
     #[arg(long, env = "QEDGIX_OBSERVATION", default_value = "scene", value_enum)]
     observation: ObservationForm,
-    /// Detection range in units of the square's side: lengths in requests are scaled so that the policy's range corresponds to this
-    /// one [default: the policy's range, unscaled]
+    /// Detection range in units of the square's side: lengths in requests are scaled so that the policy's range corresponds to
+    /// this one [default: the policy's range, unscaled]
     #[arg(long, env = "QEDGIX_RANGE")]
     range: Option<f64>,
     /// Open loop: Acts per second of all sessions together, with latencies from the time at which each is due [default: closed
