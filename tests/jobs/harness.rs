@@ -92,6 +92,8 @@ pub struct Rest {
 
 impl Rest {
     pub fn new(http: String) -> Self {
+        // The client requires a TLS provider even for plain HTTP; a later call finds the first one installed.
+        let _ = rustls::crypto::ring::default_provider().install_default();
         Self { http, client: reqwest::Client::new() }
     }
 

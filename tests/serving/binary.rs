@@ -11,7 +11,7 @@ use qedgix::wire::v1::policy_service_client::PolicyServiceClient;
 use serde_json::Value;
 use tonic::transport::Channel;
 
-use super::harness::with_timeout;
+use super::harness::{install_tls_provider, with_timeout};
 
 /// A `qedgix serve` on free ports; killed when dropped.
 pub struct Binary {
@@ -27,6 +27,7 @@ const POLL: Duration = Duration::from_millis(5);
 
 impl Binary {
     pub async fn start(dir: &Path, flags: &[&str]) -> Self {
+        install_tls_provider();
         let endpoints = dir.join(qedgix::server::ENDPOINTS);
         // A killed server leaves its file behind.
         let _ = std::fs::remove_file(&endpoints);

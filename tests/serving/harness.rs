@@ -23,6 +23,11 @@ use tonic::transport::Channel;
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
 
+/// Installs a TLS provider, which `reqwest` requires even for plain HTTP. Further calls have no effect.
+pub fn install_tls_provider() {
+    let _ = rustls::crypto::ring::default_provider().install_default();
+}
+
 pub struct Server {
     pub app: Arc<App>,
     pub endpoints: Endpoints,
@@ -50,6 +55,7 @@ impl Server {
 
     /// Starts a server on an existing data directory.
     pub async fn on(dir: tempfile::TempDir, change: impl FnOnce(&mut Config)) -> Self {
+        install_tls_provider();
         let mut config = Config::new(dir.path());
         config.grpc_addr.set_port(0);
         config.http_addr.set_port(0);

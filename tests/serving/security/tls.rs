@@ -212,6 +212,6 @@ async fn errors_of_tls_files_name_flag_and_path() {
         change(&mut files, path(name));
         config.tls = Some(files);
         let error = Listeners::bind(&config).await.unwrap_err().to_string();
-        assert!(error.starts_with(&format!("{flag}: {}", path(name).display())), "{error}");
+        assert!(error.starts_with(&format!("{flag}: got {}", path(name).display())), "{error}");
     }
 }
