@@ -4,7 +4,8 @@
 use jiff::Timestamp;
 use sqlx::{FromRow, SqliteConnection};
 
-use super::jobs::{Transition, find, named_enum, transition};
+use super::jobs::{Transition, find, transition};
+use super::named_enum::named_enum;
 use super::{Job, JobId, JobState, PendingAction, Result, Store, corrupt, timestamp};
 
 named_enum! {

@@ -7,7 +7,7 @@ use sqlx::FromRow;
 use uuid::Uuid;
 
 use super::attempts::is_active;
-use super::jobs::named_enum;
+use super::named_enum::named_enum;
 use super::{JobId, Lease, Result, Store, corrupt, timestamp};
 
 named_enum! {

@@ -7,6 +7,7 @@ mod events;
 mod jobs;
 mod keys;
 mod metrics;
+mod named_enum;
 mod policies;
 mod promotions;
 mod snapshots;
