@@ -65,7 +65,10 @@ impl From<Paging> for PageRequest {
 #[into_params(parameter_in = Path)]
 struct PolicyPath {
     /// NAME (its newest version), NAME@ALIAS or NAME:VERSION.
-    #[param(schema_with = schemas::policy_spec, example = "qedgix")]
+    #[param(
+        pattern = "^[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}(@[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}|:[1-9][0-9]{0,18})?$",
+        example = "qedgix"
+    )]
     policy: String,
 }
 
@@ -73,7 +76,7 @@ struct PolicyPath {
 #[into_params(parameter_in = Path)]
 struct VersionsPath {
     /// NAME (all its versions) or NAME:VERSION.
-    #[param(schema_with = schemas::name_or_version, example = "qedgix")]
+    #[param(pattern = "^[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}(:[1-9][0-9]{0,18})?$", example = "qedgix")]
     policy: String,
 }
 
@@ -81,7 +84,7 @@ struct VersionsPath {
 #[into_params(parameter_in = Path)]
 struct NamePath {
     /// NAME of the policy, without a version or alias.
-    #[param(schema_with = schemas::name, example = "qedgix")]
+    #[param(pattern = "^[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}$", example = "qedgix")]
     name: String,
 }
 
@@ -89,10 +92,10 @@ struct NamePath {
 #[into_params(parameter_in = Path)]
 struct AliasPath {
     /// NAME of the policy, without a version or alias.
-    #[param(schema_with = schemas::name, example = "qedgix")]
+    #[param(pattern = "^[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}$", example = "qedgix")]
     name: String,
     /// The alias.
-    #[param(schema_with = schemas::name, example = "live")]
+    #[param(pattern = "^[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}$", example = "live")]
     alias: String,
 }
 

@@ -37,11 +37,6 @@ pub(super) fn name() -> RefOr<Schema> {
     string(concat!("^", name!(), "$"))
 }
 
-/// NAME or NAME:VERSION.
-pub(super) fn name_or_version() -> RefOr<Schema> {
-    string(concat!("^", name!(), "(:", version!(), ")?$"))
-}
-
 /// NAME, NAME@ALIAS or NAME:VERSION.
 pub(super) fn policy_spec() -> RefOr<Schema> {
     string(concat!("^", name!(), "(@", name!(), "|:", version!(), ")?$"))
