@@ -192,16 +192,15 @@ fn inconsistent_containers_are_rejected() {
         bytes[..8].copy_from_slice(&length.to_le_bytes());
         Checkpoint::from_bytes(&bytes).unwrap_err()
     };
-    for length in [u64::MAX, 1 << 63, 1 << 40, (16 << 20) + 1, 16 << 20, length - 8, 0] {
-        assert!(matches!(with_length(length), Error::Container(_)), "a header of {length} bytes");
+    for absurd in [u64::MAX, 1 << 63, 1 << 40, (16 << 20) + 1] {
+        assert_eq!(with_length(absurd), Error::HeaderTooLarge { found: absurd, limit: 16 << 20 });
     }
-    for len in 0..8 {
-        assert!(matches!(Checkpoint::from_bytes(&good[..len]), Err(Error::Container(_))), "{len} bytes");
+    assert_eq!(with_length(16 << 20), Error::Truncated { found: good.len(), header: 16 << 20 });
+    assert!(matches!(with_length(length - 8), Error::Header(_)));
+    assert!(matches!(with_length(0), Error::Header(_)));
+    for cut in 0..8 {
+        assert_eq!(Checkpoint::from_bytes(&good[..cut]), Err(Error::Truncated { found: cut, header: 0 }));
     }
-    // An error of the container that names this tensor.
-    let names = |tensor: &str, error: Error| {
-        assert!(matches!(&error, Error::Container(reason) if reason.contains(&format!("`{tensor}`"))), "{error}");
-    };
     let offsets = |name: &'static str, from: u64, to: u64| error_after(move |h| h[name]["data_offsets"] = json!([from, to]));
     // Names are in the order of their data: the first tensor is agent.fc.bias, 256 bytes.
     let (header, data) = parts(&good);
@@ -209,31 +208,30 @@ fn inconsistent_containers_are_rejected() {
     assert_eq!(header[first]["data_offsets"], json!([0, 256]));
     let second = "agent.fc.weight";
     let end = header[second]["data_offsets"][1].as_u64().unwrap();
-    names(second, offsets(second, 0, end)); // overlap
-    names(second, offsets(second, 260, end)); // gap
-    names(first, offsets(first, 0, 255)); // shorter than the shape
-    names(first, offsets(first, 0, usize::MAX as u64)); // beyond the data
-    for (from, to) in [(0, 256), (end, 256)] {
-        assert!(matches!(offsets(second, from, to), Error::Container(_)), "bytes {from} to {to}");
+    for (case, from, to) in [("overlap", 0, end), ("the same data twice", 0, 256), ("a gap", 260, end), ("backwards", end, 256)] {
+        let error = offsets(second, from, to);
+        assert!(matches!(error, Error::Offsets { .. }), "{case}: {error}");
     }
-    names(first, error_after(|h| h[first]["shape"] = json!([1_u64 << 62, 1_u64 << 62])));
-    let longer = Checkpoint::from_bytes(&[&good[..], &[0; 4]].concat());
-    assert!(matches!(longer, Err(Error::Container(_))), "{longer:?}");
-    for (field, value) in [("color", json!("red")), ("shape", json!([-1]))] {
-        let error = error_after(|h| h[first][field] = value);
-        assert!(matches!(error, Error::Container(_)), "{error}");
-    }
+    assert_eq!(offsets(first, 0, 255), Error::Size { name: first.into(), shape: vec![64], found: 255 });
+    let huge = offsets(first, 0, usize::MAX as u64);
+    assert!(matches!(huge, Error::Offsets { len, .. } if len == data.len()), "{huge}");
+    let overflowing = error_after(|h| h[first]["shape"] = json!([1_u64 << 62, 1_u64 << 62]));
+    assert_eq!(overflowing, Error::Size { name: first.into(), shape: vec![1 << 62, 1 << 62], found: 256 });
+    let longer = Checkpoint::from_bytes(&[&good[..], &[0; 4]].concat()).unwrap_err();
+    assert_eq!(longer, Error::TrailingData { found: data.len() + 4, expected: data.len() });
+    assert!(matches!(error_after(|h| h[first]["color"] = json!("red")), Error::Header(_)));
+    assert!(matches!(error_after(|h| h[first]["shape"] = json!([-1])), Error::Header(_)));
     let text = header.to_string();
     for name in [first, "__metadata__"] {
         let entry = format!("\"{name}\":{}", header[name]);
         let twice = text.replacen(&entry, &format!("{entry},{entry}"), 1);
         let bytes = [&(twice.len() as u64).to_le_bytes()[..], twice.as_bytes(), &data].concat();
         let error = Checkpoint::from_bytes(&bytes).unwrap_err();
-        assert!(matches!(error, Error::Container(_)), "duplicate {name:?}: {error}");
+        assert!(matches!(error, Error::Header(_)), "duplicate {name:?}: {error}");
     }
     let deep = format!("{{\"a\":{}", "[".repeat(1 << 20));
     let bytes = [&(deep.len() as u64).to_le_bytes()[..], deep.as_bytes()].concat();
-    assert!(matches!(Checkpoint::from_bytes(&bytes), Err(Error::Container(_))));
+    assert!(matches!(Checkpoint::from_bytes(&bytes), Err(Error::Header(_))));
 }
 
 /// Runs the policy for a few slots with the fleet of its training and, if possible, with others.

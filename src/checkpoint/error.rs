@@ -6,9 +6,57 @@ use crate::invalid::Invalid;
 /// Why bytes are not a usable checkpoint.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum Error {
-    /// The bytes are truncated or damaged, or are not a safetensors file.
-    #[error("not a safetensors file: {0}")]
-    Container(String),
+    /// The file is shorter than its header.
+    #[error("not a safetensors file: {found} bytes, fewer than the length and the {header} bytes of the header")]
+    Truncated {
+        /// Bytes of the file.
+        found: usize,
+        /// Bytes of the header, as far as the file says.
+        header: u64,
+    },
+    /// The header is larger than the limit.
+    #[error("not a safetensors file: a header of {found} bytes; expected at most {limit}")]
+    HeaderTooLarge {
+        /// Bytes of the header.
+        found: u64,
+        /// The limit.
+        limit: u64,
+    },
+    /// The header is not JSON of the format, or has a name twice.
+    #[error("not a safetensors file: header: {0}")]
+    Header(String),
+    /// The data of the tensors has a gap, overlaps, or exceeds the file.
+    #[error("not a safetensors file: tensor `{name}` has bytes {start} to {end} of {len}; expected a start at {expected}")]
+    Offsets {
+        /// Name of the tensor.
+        name: String,
+        /// Offset of its first byte.
+        start: usize,
+        /// Offset behind its last byte.
+        end: usize,
+        /// Offset where its data must start.
+        expected: usize,
+        /// Bytes of data in the file.
+        len: usize,
+    },
+    /// The shape of a tensor does not match the number of its bytes.
+    #[error("not a safetensors file: tensor `{name}` of shape {shape:?} has {found} bytes")]
+    Size {
+        /// Name of the tensor.
+        name: String,
+        /// Its shape.
+        shape: Vec<usize>,
+        /// Bytes of its data.
+        found: usize,
+    },
+    /// The file has data after the last tensor.
+    #[error("not a safetensors file: {found} bytes of data; the tensors have {expected}")]
+    TrailingData {
+        /// Bytes of data in the file.
+        found: usize,
+        /// Bytes of all tensors.
+        expected: usize,
+    },
     /// The safetensors file was not written by this program.
     #[error("not a checkpoint of this program: metadata `format` is {found:?}; expected {:?}", FORMAT)]
     Format {

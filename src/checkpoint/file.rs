@@ -58,18 +58,17 @@ const LARGEST_HEADER: u64 = 16 << 20;
 /// Metadata and tensors of a file, sorted by name. Values that are not finite or too large are rejected. Memory is bounded by a
 /// small multiple of the length of `bytes`, whatever sizes the header states.
 pub(super) fn read(bytes: &[u8]) -> Result<(BTreeMap<String, String>, Vec<Tensor>), Error> {
-    let container = |reason: String| Error::Container(reason);
     let Some((header_len, rest)) = bytes.split_first_chunk() else {
-        return Err(container(format!("{} bytes, less than the length of a header", bytes.len())));
+        return Err(Error::Truncated { found: bytes.len(), header: 0 });
     };
     let header_len = u64::from_le_bytes(*header_len);
     if header_len > LARGEST_HEADER {
-        return Err(container(format!("a header of {header_len} bytes; at most {LARGEST_HEADER} are read")));
+        return Err(Error::HeaderTooLarge { found: header_len, limit: LARGEST_HEADER });
     }
     let Some((header, data)) = rest.split_at_checked(header_len as usize) else {
-        return Err(container(format!("a header of {header_len} bytes in a file of {}", bytes.len())));
+        return Err(Error::Truncated { found: bytes.len(), header: header_len });
     };
-    let header: Header = serde_json::from_slice(header).map_err(|e| container(format!("its header: {e}")))?;
+    let header: Header = serde_json::from_slice(header).map_err(|e| Error::Header(e.to_string()))?;
     let mut entries: Vec<(String, Entry)> = header.tensors.into_iter().collect();
     entries.sort_by_key(|(_, entry)| entry.data_offsets);
     let mut tensors = Vec::with_capacity(entries.len());
@@ -78,17 +77,12 @@ pub(super) fn read(bytes: &[u8]) -> Result<(BTreeMap<String, String>, Vec<Tensor
         if dtype != "F32" {
             return Err(Error::Type { name, found: dtype });
         }
-        if from != end {
-            return Err(container(format!(
-                "tensor `{name}` begins at byte {from} of the data; expected {end}, without gap or overlap"
-            )));
-        }
-        let Some(values) = data.get(from..to) else {
-            return Err(container(format!("tensor `{name}` is bytes {from} to {to} of {} bytes of data", data.len())));
+        let Some(values) = data.get(from..to).filter(|_| from == end) else {
+            return Err(Error::Offsets { name, start: from, end: to, expected: end, len: data.len() });
         };
         let size = shape.iter().try_fold(4, |size: usize, &n| size.checked_mul(n));
         if size != Some(values.len()) {
-            return Err(container(format!("tensor `{name}` of shape {shape:?} has {} bytes", values.len())));
+            return Err(Error::Size { name, shape, found: values.len() });
         }
         let values: Vec<f32> = values.chunks_exact(4).map(|x| f32::from_le_bytes([x[0], x[1], x[2], x[3]])).collect();
         if let Some(index) = values.iter().position(|x| x.is_nan() || x.abs() > LARGEST) {
@@ -98,7 +92,7 @@ pub(super) fn read(bytes: &[u8]) -> Result<(BTreeMap<String, String>, Vec<Tensor
         tensors.push(Tensor { name, shape, values });
     }
     if end != data.len() {
-        return Err(container(format!("{} bytes of data, of which tensors take {end}", data.len())));
+        return Err(Error::TrailingData { found: data.len(), expected: end });
     }
     tensors.sort_by(|a, b| a.name.cmp(&b.name));
     Ok((header.metadata, tensors))

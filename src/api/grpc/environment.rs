@@ -1,9 +1,10 @@
-//! `EnvironmentService`: decode, call one use case, encode.
+//! `qedgix.v1.EnvironmentService`.
 
 use std::sync::Arc;
 
 use tonic::{Request, Response, Status};
 
+use super::GrpcResult;
 use crate::api::convert::environments::{create, environment_state, is_large};
 use crate::api::offload;
 use crate::service::{App, Error, environments};
@@ -18,38 +19,36 @@ pub fn service(app: Arc<App>) -> EnvironmentServiceServer<impl EnvironmentServic
 
 struct Service(Arc<App>);
 
-type Answer<T> = Result<Response<T>, Status>;
-
-async fn respond(id: String, state: EnvironmentState) -> Answer<v1::EnvironmentState> {
+async fn respond(id: String, state: EnvironmentState) -> GrpcResult<v1::EnvironmentState> {
     Ok(Response::new(offload(is_large(&state), || environment_state(id, state)).await?))
 }
 
 #[tonic::async_trait]
 impl EnvironmentService for Service {
-    async fn create_environment(&self, request: Request<v1::CreateEnvironmentRequest>) -> Answer<v1::Environment> {
+    async fn create_environment(&self, request: Request<v1::CreateEnvironmentRequest>) -> GrpcResult<v1::Environment> {
         let create = create(request.into_inner()).map_err(Error::from)?;
         Ok(Response::new(environments::create(&self.0, create).await?.into()))
     }
 
-    async fn reset(&self, request: Request<v1::ResetRequest>) -> Answer<v1::EnvironmentState> {
+    async fn reset(&self, request: Request<v1::ResetRequest>) -> GrpcResult<v1::EnvironmentState> {
         let mut request = request.into_inner();
         let id = std::mem::take(&mut request.environment_id);
         let state = environments::reset(&self.0, &id, request.into()).await?;
         respond(id, state).await
     }
 
-    async fn step(&self, request: Request<v1::StepRequest>) -> Answer<v1::EnvironmentState> {
+    async fn step(&self, request: Request<v1::StepRequest>) -> GrpcResult<v1::EnvironmentState> {
         let mut request = request.into_inner();
         let id = std::mem::take(&mut request.environment_id);
         let state = environments::step(&self.0, &id, request.into()).await?;
         respond(id, state).await
     }
 
-    async fn get_environment(&self, request: Request<v1::GetEnvironmentRequest>) -> Answer<v1::Environment> {
+    async fn get_environment(&self, request: Request<v1::GetEnvironmentRequest>) -> GrpcResult<v1::Environment> {
         Ok(Response::new(environments::get(&self.0, &request.into_inner().environment_id)?.into()))
     }
 
-    async fn delete_environment(&self, request: Request<v1::DeleteEnvironmentRequest>) -> Answer<v1::Environment> {
+    async fn delete_environment(&self, request: Request<v1::DeleteEnvironmentRequest>) -> GrpcResult<v1::Environment> {
         Ok(Response::new(environments::delete(&self.0, &request.into_inner().environment_id).await?.into()))
     }
 }

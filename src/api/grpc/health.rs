@@ -1,8 +1,8 @@
-//! `grpc.health.v1.Health`: a status per service that says whether its calls would be answered.
+//! `grpc.health.v1.Health`: a status for each service.
 //!
-//! As the protocol says, and not as `tonic-health`'s own service does: a watch of an unknown service stays open and tells
-//! when the service becomes known; a status that is set again is not sent again. While the server drains every service is
-//! `NOT_SERVING`; watches end when the server closes, so that they do not keep it.
+//! As the protocol requires, and unlike the service of `tonic-health`: a watch of an unknown service stays open until the service
+//! becomes known, and setting the same status again sends nothing. While the server drains, every service is `NOT_SERVING`.
+//! Watches end when the server closes, so that they do not delay the shutdown.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -21,7 +21,7 @@ use crate::service::operations::{ServerHealth, server_health, server_health_chan
 use crate::service::{App, Error};
 use crate::wire::v1;
 
-/// Statuses by service; cheap to clone.
+/// The statuses of all services. Cheap to clone.
 #[derive(Clone, Debug)]
 pub struct Health {
     /// Whether each service answers, unless the server drains.
@@ -51,7 +51,7 @@ impl Health {
         status(&self.serving.borrow(), service, self.draining.begun())
     }
 
-    /// Says which services answer while the server is in this state.
+    /// Derives the status of each service from the state of the server.
     pub fn report(&self, health: ServerHealth) {
         let ServerHealth { database, policies, scheduler } = health;
         self.set("", database && policies);
@@ -60,14 +60,14 @@ impl Health {
                 v1::environment_service_server::SERVICE_NAME => true,
                 v1::job_service_server::SERVICE_NAME => database && scheduler,
                 v1::worker_service_server::SERVICE_NAME => database,
-                // Those that ask policies.
+                // Services that run policies.
                 _ => policies,
             };
             self.set(service, serving);
         }
     }
 
-    /// Reports the server's state again and again.
+    /// Keeps the statuses up to date.
     pub async fn follow(self, app: Arc<App>) {
         loop {
             server_health_changed(&app).await;
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_watch_tells_what_changes_and_nothing_twice() {
+    async fn a_watch_sends_changes_only() {
         let closing = CancellationToken::new();
         let health = Health::new(Draining::default(), closing.clone());
         let mut states = watch(&health, "a.Later").await;
@@ -148,7 +148,7 @@ mod tests {
         assert_eq!(next(&mut states).await, Some(ServingStatus::Serving));
         health.set("a.Later", false);
         assert_eq!(next(&mut states).await, Some(ServingStatus::NotServing));
-        // What came and went between two looks is not told.
+        // A change that is reverted before the next poll is not sent.
         health.set("a.Later", true);
         health.set("a.Later", false);
         let mut later = Box::pin(next(&mut states));
@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_server_that_drains_says_so_before_watches_end() {
+    async fn watches_send_not_serving_before_they_end() {
         let closing = CancellationToken::new();
         let draining = Draining::default();
         let health = Health::new(draining.clone(), closing.clone());
@@ -175,9 +175,9 @@ mod tests {
     }
 
     #[test]
-    fn a_service_depends_on_what_it_needs() {
+    fn the_status_of_a_service_depends_on_its_dependencies() {
         let health = Health::new(Draining::default(), CancellationToken::new());
-        let of = |service: &str| health.status(service).map(|status| status == ServingStatus::Serving);
+        let is_serving = |service: &str| health.status(service).map(|status| status == ServingStatus::Serving);
         let all = ServerHealth { database: true, policies: true, scheduler: true };
         let cases = [
             (all, [true; 5]),
@@ -194,8 +194,8 @@ mod tests {
                 "qedgix.v1.JobService",
                 "qedgix.v1.WorkerService",
             ];
-            assert_eq!(services.map(|service| of(service).unwrap()), expected, "{components:?}");
+            assert_eq!(services.map(|service| is_serving(service).unwrap()), expected, "{components:?}");
         }
-        assert_eq!(of("nobody"), None);
+        assert_eq!(is_serving("nobody"), None);
     }
 }

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use futures::stream::{BoxStream, StreamExt, TryStreamExt};
 use tonic::{Request, Response, Status};
 
+use super::GrpcResult;
 use crate::api::auth::StreamCaller;
 use crate::api::convert::jobs::state_filter;
 use crate::api::convert::structs::from_struct;
@@ -23,63 +24,61 @@ pub fn service(app: Arc<App>) -> JobServiceServer<impl JobService> {
 
 struct Service(Arc<App>);
 
-type Answer<T> = Result<Response<T>, Status>;
-
 impl Service {
-    async fn change(&self, id: &str, verb: JobAction) -> Answer<v1::Job> {
+    async fn change(&self, id: &str, verb: JobAction) -> GrpcResult<v1::Job> {
         Ok(Response::new(jobs::change(&self.0, id, verb).await?.into()))
     }
 }
 
-/// Absent where empty, as proto3 strings are.
-fn given(text: &str) -> Option<&str> {
+/// The text, or nothing if it is empty: proto3 strings have no other way to be absent.
+fn non_empty(text: &str) -> Option<&str> {
     (!text.is_empty()).then_some(text)
 }
 
 #[tonic::async_trait]
 impl JobService for Service {
-    async fn submit_job(&self, request: Request<v1::SubmitJobRequest>) -> Answer<v1::Job> {
+    async fn submit_job(&self, request: Request<v1::SubmitJobRequest>) -> GrpcResult<v1::Job> {
         let v1::SubmitJobRequest { spec, idempotency_key } = request.into_inner();
         let document = from_struct("spec", spec.unwrap_or_default()).map_err(Error::from)?;
         let job = JobRequest::from_json(document).map_err(Error::from)?;
-        let key = given(&idempotency_key).map(str::to_owned);
+        let key = non_empty(&idempotency_key).map(str::to_owned);
         let (job, _) = jobs::submit(&self.0, job, key).await?;
         Ok(Response::new(job.into()))
     }
 
-    async fn get_job(&self, request: Request<v1::GetJobRequest>) -> Answer<v1::Job> {
+    async fn get_job(&self, request: Request<v1::GetJobRequest>) -> GrpcResult<v1::Job> {
         Ok(Response::new(jobs::get(&self.0, &request.into_inner().id).await?.into()))
     }
 
-    async fn list_jobs(&self, request: Request<v1::ListJobsRequest>) -> Answer<v1::ListJobsResponse> {
+    async fn list_jobs(&self, request: Request<v1::ListJobsRequest>) -> GrpcResult<v1::ListJobsResponse> {
         let v1::ListJobsRequest { state, page_size, page_token } = request.into_inner();
         let state = state_filter(state).map_err(Error::from)?;
         let page = jobs::list(&self.0, state, &PageRequest { size: page_size, token: page_token }).await?.map(Into::into);
         Ok(Response::new(v1::ListJobsResponse { jobs: page.items, next_page_token: page.next_token }))
     }
 
-    async fn cancel_job(&self, request: Request<v1::CancelJobRequest>) -> Answer<v1::Job> {
+    async fn cancel_job(&self, request: Request<v1::CancelJobRequest>) -> GrpcResult<v1::Job> {
         self.change(&request.into_inner().id, JobAction::Cancel).await
     }
 
-    async fn pause_job(&self, request: Request<v1::PauseJobRequest>) -> Answer<v1::Job> {
+    async fn pause_job(&self, request: Request<v1::PauseJobRequest>) -> GrpcResult<v1::Job> {
         self.change(&request.into_inner().id, JobAction::Pause).await
     }
 
-    async fn resume_job(&self, request: Request<v1::ResumeJobRequest>) -> Answer<v1::Job> {
+    async fn resume_job(&self, request: Request<v1::ResumeJobRequest>) -> GrpcResult<v1::Job> {
         self.change(&request.into_inner().id, JobAction::Resume).await
     }
 
-    async fn get_job_metrics(&self, request: Request<v1::GetJobMetricsRequest>) -> Answer<v1::GetJobMetricsResponse> {
+    async fn get_job_metrics(&self, request: Request<v1::GetJobMetricsRequest>) -> GrpcResult<v1::GetJobMetricsResponse> {
         let v1::GetJobMetricsRequest { id, name, page_size, page_token } = request.into_inner();
         let page = PageRequest { size: page_size, token: page_token };
-        let page = jobs::metrics(&self.0, &id, given(&name), &page).await?.map(Into::into);
+        let page = jobs::metrics(&self.0, &id, non_empty(&name), &page).await?.map(Into::into);
         Ok(Response::new(v1::GetJobMetricsResponse { rows: page.items, next_page_token: page.next_token }))
     }
 
     type WatchJobStream = BoxStream<'static, Result<v1::JobEvent, Status>>;
 
-    async fn watch_job(&self, request: Request<v1::WatchJobRequest>) -> Answer<Self::WatchJobStream> {
+    async fn watch_job(&self, request: Request<v1::WatchJobRequest>) -> GrpcResult<Self::WatchJobStream> {
         let (app, caller) = (self.0.clone(), StreamCaller::new(request.extensions()));
         let v1::WatchJobRequest { id, after } = request.into_inner();
         let events = events::watch(&self.0, &id, after).await?.events();

@@ -36,6 +36,9 @@ pub const SERVICES: &[&str] = &[
     oip::grpc_inference_service_server::SERVICE_NAME,
 ];
 
+/// The result of a unary method.
+type GrpcResult<T> = Result<tonic::Response<T>, tonic::Status>;
+
 const BUILT_IN: &str = "the descriptors are built into the program";
 
 /// The services with authorization and the middleware for all calls.

@@ -1,4 +1,4 @@
-//! `PolicyService`: decode, call one use case, encode.
+//! `qedgix.v1.PolicyService`.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -23,22 +23,22 @@ pub fn service(app: Arc<App>) -> PolicyServiceServer<impl PolicyService> {
     PolicyServiceServer::new(Handlers(app))
 }
 
-/// Most slots of one `ActBatch`.
-const LARGEST_BATCH: usize = 1024;
-/// Slots of one `ActStream` that are worked on together; the caller's next ones wait in the transport.
-const IN_FLIGHT: usize = 64;
+/// Most requests in one `ActBatch`.
+const MAX_BATCH: usize = 1024;
+/// Requests of one `ActStream` that are processed concurrently. Flow control delays further ones.
+const MAX_IN_FLIGHT: usize = 64;
 
 struct Handlers(Arc<App>);
 
-/// Answers one slot, however it came.
-async fn answer(app: &App, request: v1::ActRequest, deadline: Option<Instant>) -> Result<v1::ActResponse, Error> {
+/// Handles one `ActRequest` of any method.
+async fn act_one(app: &App, request: v1::ActRequest, deadline: Option<Instant>) -> Result<v1::ActResponse, Error> {
     let values = request.return_q_values;
-    let request = offload(nodes(&request) >= act::INLINE_NODES, || act::Request::try_from(request)).await??;
+    let request = offload(node_count(&request) >= act::INLINE_NODES, || act::Request::try_from(request)).await??;
     Ok(act_response(act::act(app, request, deadline).await?, values))
 }
 
-/// How many nodes a request tells about.
-fn nodes(request: &v1::ActRequest) -> usize {
+/// Number of UAVs and users in the observation.
+fn node_count(request: &v1::ActRequest) -> usize {
     use v1::act_request::Observation;
     match &request.observation {
         Some(Observation::Graph(graph)) => graph.nodes.len(),
@@ -47,28 +47,27 @@ fn nodes(request: &v1::ActRequest) -> usize {
     }
 }
 
-/// One slot of several: answered or refused.
-fn act_result(answer: Result<v1::ActResponse, Error>) -> v1::ActResult {
-    use v1::act_result::Result as Told;
-    let told = answer.map_or_else(|error| Told::Error(act_error(&error)), Told::Response);
-    v1::ActResult { result: Some(told) }
+/// The result of one request in a batch or stream.
+fn act_result(response: Result<v1::ActResponse, Error>) -> v1::ActResult {
+    use v1::act_result::Result::{Error, Response};
+    v1::ActResult { result: Some(response.map_or_else(|error| Error(act_error(&error)), Response)) }
 }
 
 #[tonic::async_trait]
 impl PolicyService for Handlers {
     async fn act(&self, request: Request<v1::ActRequest>) -> Result<Response<v1::ActResponse>, Status> {
         let deadline = deadline(request.extensions());
-        Ok(Response::new(answer(&self.0, request.into_inner(), deadline).await?))
+        Ok(Response::new(act_one(&self.0, request.into_inner(), deadline).await?))
     }
 
     async fn act_batch(&self, request: Request<v1::ActBatchRequest>) -> Result<Response<v1::ActBatchResponse>, Status> {
         let (deadline, caller) = (deadline(request.extensions()), StreamCaller::new(request.extensions()));
         let requests = request.into_inner().requests;
-        in_range("requests", requests.len(), 1..=LARGEST_BATCH).map_err(Error::from)?;
-        // One of them was counted as the call itself.
+        in_range("requests", requests.len(), 1..=MAX_BATCH).map_err(Error::from)?;
+        // The call itself counts as one request.
         caller.charge(&self.0, requests.len() as u32 - 1);
-        let answers = requests.into_iter().map(|request| answer(&self.0, request, deadline));
-        let results = join_all(answers).await.into_iter().map(act_result).collect();
+        let responses = requests.into_iter().map(|request| act_one(&self.0, request, deadline));
+        let results = join_all(responses).await.into_iter().map(act_result).collect();
         Ok(Response::new(v1::ActBatchResponse { results }))
     }
 
@@ -78,16 +77,16 @@ impl PolicyService for Handlers {
         let (deadline, caller) = (deadline(request.extensions()), StreamCaller::new(request.extensions()));
         let app = self.0.clone();
         let requests = stream::requests(app.clone(), request.into_inner());
-        let answers = requests.map(move |request| {
+        let results = requests.map(move |request| {
             let (app, counted) = (app.clone(), caller.count_message(&app));
             async move {
                 Ok(act_result(match (request?, counted?) {
-                    (request, Ok(())) => answer(&app, request, deadline).await,
+                    (request, Ok(())) => act_one(&app, request, deadline).await,
                     (_, Err(busy)) => Err(busy),
                 }))
             }
         });
-        Ok(Response::new(answers.buffered(IN_FLIGHT).boxed()))
+        Ok(Response::new(results.buffered(MAX_IN_FLIGHT).boxed()))
     }
 
     async fn open_session(&self, request: Request<v1::OpenSessionRequest>) -> Result<Response<v1::Session>, Status> {

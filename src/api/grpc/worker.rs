@@ -7,7 +7,7 @@ use futures::Stream;
 use tonic::metadata::MetadataMap;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::upload;
+use super::{GrpcResult, upload};
 use crate::api::errors::stream_status;
 use crate::service::worker::{self, CheckpointUpload, Credentials, SnapshotUpload, UploadHeader};
 use crate::service::{App, Error};
@@ -15,7 +15,7 @@ use crate::store::{Lease, Metric};
 use crate::wire::v1;
 use crate::wire::v1::worker_service_server::{WorkerService, WorkerServiceServer};
 
-/// Largest message of a worker, in bytes, whatever the limit for others is: a chunk and its envelope.
+/// Largest message of a worker in bytes, independent of the limit for other messages: a chunk with its framing.
 pub const LARGEST_MESSAGE: usize = 4 << 20;
 
 /// The service.
@@ -25,11 +25,10 @@ pub fn service(app: Arc<App>) -> WorkerServiceServer<impl WorkerService> {
 
 struct Service(Arc<App>);
 
-type Answer<T> = Result<Response<T>, Status>;
-
 impl Service {
     async fn lease(&self, metadata: &MetadataMap) -> Result<Lease, Error> {
-        const MISSING: Error = Error::Unauthenticated("a worker shows qedgix-job, qedgix-attempt and authorization: Bearer");
+        const MISSING: Error =
+            Error::Unauthenticated("a worker must send qedgix-job, qedgix-attempt and authorization: Bearer TOKEN");
         let text = |key| metadata.get(key).and_then(|value| value.to_str().ok()).ok_or(MISSING);
         let token = text("authorization")?.strip_prefix("Bearer ").ok_or(MISSING)?;
         let (job, attempt) = (text("qedgix-job")?.to_owned(), text("qedgix-attempt")?.to_owned());
@@ -39,7 +38,7 @@ impl Service {
 
 #[tonic::async_trait]
 impl WorkerService for Service {
-    async fn fetch(&self, request: Request<v1::FetchRequest>) -> Answer<v1::FetchResponse> {
+    async fn fetch(&self, request: Request<v1::FetchRequest>) -> GrpcResult<v1::FetchResponse> {
         let lease = self.lease(request.metadata()).await?;
         let task = worker::fetch(&self.0, lease).await?;
         Ok(Response::new(v1::FetchResponse {
@@ -52,7 +51,7 @@ impl WorkerService for Service {
 
     type DownloadSnapshotStream = Pin<Box<dyn Stream<Item = Result<v1::Chunk, Status>> + Send>>;
 
-    async fn download_snapshot(&self, request: Request<v1::DownloadSnapshotRequest>) -> Answer<Self::DownloadSnapshotStream> {
+    async fn download_snapshot(&self, request: Request<v1::DownloadSnapshotRequest>) -> GrpcResult<Self::DownloadSnapshotStream> {
         let lease = self.lease(request.metadata()).await?;
         let snapshot = worker::snapshot(&self.0, lease).await?;
         let app = Arc::clone(&self.0);
@@ -66,7 +65,7 @@ impl WorkerService for Service {
         Ok(Response::new(Box::pin(chunks)))
     }
 
-    async fn report(&self, request: Request<v1::ReportRequest>) -> Answer<v1::ReportResponse> {
+    async fn report(&self, request: Request<v1::ReportRequest>) -> GrpcResult<v1::ReportResponse> {
         let lease = self.lease(request.metadata()).await?;
         let v1::ReportRequest { metrics, step } = request.into_inner();
         let metrics: Vec<Metric> = metrics.into_iter().map(Into::into).collect();
@@ -77,7 +76,7 @@ impl WorkerService for Service {
     async fn upload_snapshot(
         &self,
         request: Request<Streaming<v1::UploadSnapshotRequest>>,
-    ) -> Answer<v1::UploadSnapshotResponse> {
+    ) -> GrpcResult<v1::UploadSnapshotResponse> {
         let lease = self.lease(request.metadata()).await?;
         let mut messages = request.into_inner();
         let header = upload::header(&mut messages).await?;
@@ -93,7 +92,7 @@ impl WorkerService for Service {
     async fn upload_checkpoint(
         &self,
         request: Request<Streaming<v1::UploadCheckpointRequest>>,
-    ) -> Answer<v1::UploadCheckpointResponse> {
+    ) -> GrpcResult<v1::UploadCheckpointResponse> {
         let lease = self.lease(request.metadata()).await?;
         let mut messages = request.into_inner();
         let header = upload::header(&mut messages).await?;
@@ -106,13 +105,13 @@ impl WorkerService for Service {
         Ok(Response::new(v1::UploadCheckpointResponse { id: id.to_string() }))
     }
 
-    async fn heartbeat(&self, request: Request<v1::HeartbeatRequest>) -> Answer<v1::HeartbeatResponse> {
+    async fn heartbeat(&self, request: Request<v1::HeartbeatRequest>) -> GrpcResult<v1::HeartbeatResponse> {
         let lease = self.lease(request.metadata()).await?;
         let directive = worker::heartbeat(&self.0, lease).await?;
         Ok(Response::new(v1::HeartbeatResponse { directive: v1::Directive::from(directive).into() }))
     }
 
-    async fn finish(&self, request: Request<v1::FinishRequest>) -> Answer<v1::FinishResponse> {
+    async fn finish(&self, request: Request<v1::FinishRequest>) -> GrpcResult<v1::FinishResponse> {
         let lease = self.lease(request.metadata()).await?;
         worker::finish(&self.0, lease, request.into_inner().try_into().map_err(Error::from)?).await?;
         Ok(Response::new(v1::FinishResponse {}))

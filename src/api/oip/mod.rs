@@ -95,10 +95,10 @@ pub async fn infer(app: &App, request: InferRequest, deadline: Option<Instant>) 
     let timeout = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
     let deadline = deadline.into_iter().chain(timeout).min();
     let request = act::Request { policy: Some(spec.clone()), observation, memory, step, run_id: None, seed };
-    let answer = act::act(app, request, deadline).await.map_err(|error| model_error(&spec, error))?;
-    let reference = &answer.policy.reference;
-    let (version, digest, step) = (reference.version, reference.digest_hex(), answer.decision.step);
-    Ok(InferResponse { model, version, id, step, digest, outputs: outputs.tensors(answer) })
+    let response = act::act(app, request, deadline).await.map_err(|error| model_error(&spec, error))?;
+    let reference = &response.policy.reference;
+    let (version, digest, step) = (reference.version, reference.digest_hex(), response.decision.step);
+    Ok(InferResponse { model, version, id, step, digest, outputs: outputs.tensors(response) })
 }
 
 /// Checks the names of the parameters of the input or output `field`.

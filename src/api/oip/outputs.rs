@@ -36,32 +36,32 @@ impl OutputSelection {
     }
 
     /// The selected tensors, with the UAVs in the order of the request.
-    pub(super) fn tensors(self, answer: Response) -> Vec<Tensor> {
+    pub(super) fn tensors(self, response: Response) -> Vec<Tensor> {
         let names = if self.0.is_empty() {
-            let values = answer.decision.q_values.iter().all(|value| !value.is_nan());
-            let available = |name: &&str| (*name != Q_VALUES || values) && (*name != STATE || answer.recurrent_state.is_some());
+            let values = response.decision.q_values.iter().all(|value| !value.is_nan());
+            let available = |name: &&str| (*name != Q_VALUES || values) && (*name != STATE || response.recurrent_state.is_some());
             NAMES.iter().filter(|name| available(name)).map(|name| (*name).to_owned()).collect()
         } else {
             self.0
         };
-        names.into_iter().map(|name| output(name, &answer)).collect()
+        names.into_iter().map(|name| output(name, &response)).collect()
     }
 }
 
-fn output(name: String, answer: &Response) -> Tensor {
-    let uavs = answer.order.len() as i64;
-    let order = answer.order.iter().map(|&uav| uav as usize);
-    let heading = |uav: usize| answer.decision.headings[uav];
-    let actions = answer.policy.policy.actions();
+fn output(name: String, response: &Response) -> Tensor {
+    let uavs = response.order.len() as i64;
+    let order = response.order.iter().map(|&uav| uav as usize);
+    let heading = |uav: usize| response.decision.headings[uav];
+    let actions = response.policy.policy.actions();
     let (shape, data) = match name.as_str() {
         INDEX => (vec![uavs], Data::Int32(order.map(|uav| i32::from(heading(uav))).collect())),
         // Hovering has no direction.
         DEGREES => (vec![uavs], Data::Fp32(order.map(|uav| degrees(heading(uav)).map_or(f32::NAN, |x| x as f32)).collect())),
         Q_VALUES => {
-            let values = order.flat_map(|uav| answer.decision.q_values[uav * actions..(uav + 1) * actions].iter().copied());
+            let values = order.flat_map(|uav| response.decision.q_values[uav * actions..(uav + 1) * actions].iter().copied());
             (vec![uavs, actions as i64], Data::Fp32(values.collect()))
         }
-        _ => (vec![1], Data::Bytes(vec![answer.recurrent_state.clone().unwrap_or_default()])),
+        _ => (vec![1], Data::Bytes(vec![response.recurrent_state.clone().unwrap_or_default()])),
     };
     let datatype = data.datatype().map_or("", |datatype| datatype.name()).to_owned();
     Tensor { name, datatype, shape, data }

@@ -10,7 +10,7 @@ use futures::stream::{BoxStream, StreamExt};
 use tonic::{Request, Response, Status, Streaming};
 
 use self::messages::{config, final_response, infer_request, infer_response, metadata};
-use super::{deadline, stream};
+use super::{GrpcResult, deadline, stream};
 use crate::api::auth::StreamCaller;
 use crate::api::errors::act_error;
 use crate::api::oip;
@@ -25,8 +25,6 @@ pub fn service(app: Arc<App>) -> GrpcInferenceServiceServer<impl GrpcInferenceSe
 }
 
 struct Service(Arc<App>);
-
-type GrpcResult<T> = Result<Response<T>, Status>;
 
 async fn infer(
     app: &App,
@@ -105,11 +103,11 @@ impl GrpcInferenceService for Service {
         let app = self.0.clone();
         let requests = stream::requests(app.clone(), request.into_inner());
         // One after another, because the slots of a sequence need not have steps.
-        let answers = requests.then(move |request| {
+        let responses = requests.then(move |request| {
             let (app, counted) = (app.clone(), caller.count_message(&app));
             async move { Ok(infer_in_stream(&app, request?, counted?, deadline).await) }
         });
-        Ok(Response::new(answers.boxed()))
+        Ok(Response::new(responses.boxed()))
     }
 
     async fn model_config(&self, request: Request<wire::ModelConfigRequest>) -> GrpcResult<wire::ModelConfigResponse> {
