@@ -36,7 +36,7 @@ fn statuses(error: &Error) -> (Code, StatusCode) {
         Error::Deadline(_) => (Code::DeadlineExceeded, StatusCode::GATEWAY_TIMEOUT),
         Error::Draining | Error::Unavailable(_) => (Code::Unavailable, StatusCode::SERVICE_UNAVAILABLE),
         Error::Unauthenticated(_) => (Code::Unauthenticated, StatusCode::UNAUTHORIZED),
-        Error::PermissionDenied(_) => (Code::PermissionDenied, StatusCode::FORBIDDEN),
+        Error::PermissionDenied { .. } => (Code::PermissionDenied, StatusCode::FORBIDDEN),
         Error::Internal(_) => (Code::Internal, StatusCode::INTERNAL_SERVER_ERROR),
     }
 }
@@ -54,6 +54,14 @@ pub fn retry_after_seconds(error: &Error) -> Option<u64> {
 fn limit(error: &Error) -> Option<u64> {
     match error {
         Error::TooLarge { limit, .. } => *limit,
+        _ => None,
+    }
+}
+
+/// The scope that the API key lacks.
+fn required_scope(error: &Error) -> Option<&'static str> {
+    match error {
+        Error::PermissionDenied { scope, .. } => Some(scope),
         _ => None,
     }
 }
@@ -87,6 +95,7 @@ fn details(error: &Error) -> ErrorDetails {
         metadata.insert("expected".to_owned(), invalid.expected.clone());
     }
     metadata.extend(limit(error).map(|limit| ("limit".to_owned(), limit.to_string())));
+    metadata.extend(required_scope(error).map(|scope| ("required_scope".to_owned(), scope.to_owned())));
     if let Some(seconds) = retry_after_seconds(error) {
         details.set_retry_info(Some(Duration::from_secs(seconds)));
     }
@@ -162,6 +171,10 @@ pub struct Problem {
     #[schema(example = 1)]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub retry_after: Option<u64>,
+    /// The scope that the API key lacks.
+    #[schema(example = "act")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub required_scope: Option<&'static str>,
 }
 
 fn code_schema() -> Object {
@@ -192,6 +205,7 @@ impl Problem {
             expected: None,
             limit: None,
             retry_after: None,
+            required_scope: None,
         }
     }
 }
@@ -205,6 +219,7 @@ impl From<&Error> for Problem {
             expected: invalid.map(|invalid| invalid.expected.clone()),
             limit: limit(error),
             retry_after: retry_after_seconds(error),
+            required_scope: required_scope(error),
             ..Self::new(statuses(error).1, error.code(), error.to_string())
         }
     }

@@ -44,7 +44,7 @@ impl Client {
     /// `GET path`.
     ///
     /// # Errors
-    /// The server cannot be reached, or returns an error, whose detail the message contains.
+    /// The server cannot be reached, or returns an error, whose detail and code the message contains.
     pub async fn get(&self, path: &str) -> anyhow::Result<Value> {
         self.json(Method::GET, path, None).await
     }
@@ -124,7 +124,8 @@ impl Client {
         let body = response.bytes().await.map_err(failed)?;
         if !status.is_success() {
             let problem: Value = serde_json::from_slice(&body).unwrap_or(Value::Null);
-            bail!("{path}: {}", problem["detail"].as_str().unwrap_or(status.as_str()));
+            let code = problem["code"].as_str().map(|code| format!(" ({code})")).unwrap_or_default();
+            bail!("{path}: {}{code}", problem["detail"].as_str().unwrap_or(status.as_str()));
         }
         Ok(body.into())
     }

@@ -67,8 +67,13 @@ pub enum Error {
     #[error("{0}")]
     Unauthenticated(&'static str),
     /// The API key lacks the required scope.
-    #[error("{0}")]
-    PermissionDenied(String),
+    #[error("{message}")]
+    PermissionDenied {
+        /// The required scope and those of the key.
+        message: String,
+        /// The required scope.
+        scope: &'static str,
+    },
     /// The server failed. Clients do not see the cause; it is logged.
     #[error("internal error")]
     Internal(#[source] Box<dyn std::error::Error + Send + Sync>),
@@ -89,7 +94,7 @@ impl Error {
             Self::Draining => ErrorCode::Draining,
             Self::Unavailable(_) => ErrorCode::Unavailable,
             Self::Unauthenticated(_) => ErrorCode::Unauthenticated,
-            Self::PermissionDenied(_) => ErrorCode::PermissionDenied,
+            Self::PermissionDenied { .. } => ErrorCode::PermissionDenied,
             Self::Internal(_) => ErrorCode::Internal,
         }
     }

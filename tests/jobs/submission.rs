@@ -61,8 +61,7 @@ async fn invalid_requests_return_the_documented_errors() {
     let large = post(&format!("{{\"name\": \"{}\"}}", "x".repeat(20 << 20)));
     expect(large, StatusCode::PAYLOAD_TOO_LARGE).await;
     let problem = expect(post("{\"threads\": 3}"), StatusCode::BAD_REQUEST).await;
-    assert_eq!(problem["field"], "threads");
-    assert!(problem["detail"].as_str().unwrap().contains("1 to 2"), "{problem}");
+    assert_eq!((&problem["field"], &problem["value"]), (&json!("threads"), &json!("3")), "{problem}");
 
     for query in ["state=resting", "page_size=1001", "page_size=-1", "page_token=x", "colour=red"] {
         expect(server.request(Method::GET, &format!("/v1/jobs?{query}")), StatusCode::BAD_REQUEST).await;

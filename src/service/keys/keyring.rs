@@ -186,7 +186,8 @@ impl Caller {
             return Ok(());
         }
         let (scope, id, scopes) = (scope.name(), self.id(), self.0.scopes);
-        Err(Error::PermissionDenied(format!("this operation requires the scope {scope}; the API key {id} has {scopes}")))
+        let message = format!("this operation requires the scope {scope}; the API key {id} has {scopes}");
+        Err(Error::PermissionDenied { message, scope })
     }
 
     /// Counts one request against the rate of the key.

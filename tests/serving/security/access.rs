@@ -11,6 +11,7 @@ use reqwest::Method;
 use serde_json::Value;
 use tonic::Code;
 use tonic::transport::Channel;
+use tonic_types::StatusExt;
 
 use super::super::harness::*;
 use super::super::limits::Raw;
@@ -86,13 +87,16 @@ async fn without_workers() -> Server {
     Server::with(|config| config.worker = Some("/bin/false".into())).await
 }
 
-async fn grpc(channel: &Channel, method: &str, key: Option<&str>) -> (Code, String) {
+/// Status of a call and the scope that its key lacks.
+async fn grpc(channel: &Channel, method: &str, key: Option<&str>) -> (Code, Option<String>) {
     let mut client = tonic::client::Grpc::new(channel.clone());
     client.ready().await.unwrap();
     let request = key.map_or_else(|| tonic::Request::new(Bytes::new()), |key| signed(key, Bytes::new()));
     // Every kind of method responds to a stream of one message.
     let answer = with_timeout(client.server_streaming(request, format!("/{method}").parse().unwrap(), Raw)).await;
-    answer.map_or_else(|status| (status.code(), status.message().to_owned()), |_| (Code::Ok, String::new()))
+    let Err(status) = answer else { return (Code::Ok, None) };
+    let info = status.get_details_error_info();
+    (status.code(), info.and_then(|info| info.metadata.get("required_scope").cloned()))
 }
 
 #[tokio::test]
@@ -107,22 +111,22 @@ async fn grpc_enforces_the_access_table() {
     let of = [key(&server, "read").await, key(&server, "act").await, key(&server, "jobs").await, key(&server, "admin").await];
     for method in grpc_methods() {
         let worker = method.starts_with("qedgix.v1.WorkerService/");
-        let (code, message) = grpc(&channel, &method, None).await;
-        let Some((scope, others)) = scopes(access::grpc_requirement(&format!("/{method}"))) else {
-            // Workers are asked for the token of their attempt.
-            assert!(!message.starts_with("an API key"), "{method}: {message}");
-            assert_eq!(code == Code::Unauthenticated, worker, "{method}: {message}");
+        let (code, _) = grpc(&channel, &method, None).await;
+        let requirement = access::grpc_requirement(&format!("/{method}"));
+        let Some((scope, others)) = scopes(requirement) else {
+            assert_eq!(requirement, Requirement::NoKey, "{method}");
+            // Workers authenticate with the token of their attempt.
+            assert_eq!(code == Code::Unauthenticated, worker, "{method}");
             continue;
         };
         assert_eq!(code, Code::Unauthenticated, "{method}");
         for right in [scope, Scope::Admin] {
-            let (code, message) = grpc(&channel, &method, Some(&of[right as usize])).await;
-            assert!(!matches!(code, Code::Unauthenticated | Code::PermissionDenied), "{method} with {right:?}: {message}");
+            let (code, _) = grpc(&channel, &method, Some(&of[right as usize])).await;
+            assert!(!matches!(code, Code::Unauthenticated | Code::PermissionDenied), "{method} with {right:?}");
         }
         for wrong in others {
-            let (code, message) = grpc(&channel, &method, Some(&of[wrong as usize])).await;
-            assert_eq!(code, Code::PermissionDenied, "{method} with {wrong:?}");
-            assert!(message.contains(&format!("the scope {}", scope.name())), "{message}");
+            let refused = grpc(&channel, &method, Some(&of[wrong as usize])).await;
+            assert_eq!(refused, (Code::PermissionDenied, Some(scope.name().to_owned())), "{method} with {wrong:?}");
         }
     }
     for nowhere in ["qedgix.v1.PolicyService/Forget", "no.such.Service/Method"] {
@@ -169,8 +173,9 @@ async fn rest_enforces_the_access_table() {
         for wrong in others {
             let (status, _, text) = rest(&server, &verb, &path, Some(&of[wrong as usize])).await;
             assert_eq!(status, 403, "{verb} {route} with {wrong:?}: {text}");
-            let named = format!("the scope {}", scope.name());
-            assert!(text.contains("\"code\":\"permission_denied\"") && text.contains(&named), "{text}");
+            let problem: Value = serde_json::from_str(&text).unwrap();
+            assert_eq!(problem["code"], "permission_denied", "{text}");
+            assert_eq!(problem["required_scope"], scope.name(), "{text}");
         }
     }
     assert!(open.contains("/livez") && open.contains("/readyz"), "{open:?}");

@@ -211,7 +211,8 @@ async fn errors_of_tls_files_name_flag_and_path() {
         let mut files = good.clone();
         change(&mut files, path(name));
         config.tls = Some(files);
-        let error = Listeners::bind(&config).await.unwrap_err().to_string();
-        assert!(error.starts_with(&format!("{flag}: got {}", path(name).display())), "{error}");
+        let error = Listeners::bind(&config).await.unwrap_err();
+        let qedgix::server::Error::Config(invalid) = error else { panic!("{error}") };
+        assert_eq!((invalid.field.as_str(), invalid.value), (flag, Some(path(name).display().to_string())));
     }
 }
