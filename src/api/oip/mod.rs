@@ -17,7 +17,7 @@ pub use parameters::Parameter;
 use self::model::{model_error, policy_spec};
 use self::outputs::OutputSelection;
 use self::parameters::Parameters;
-use super::convert::tensors::{INPUTS, Tensor, observation, weight};
+use super::convert::tensors::{INPUTS, Tensor, element_count, observation};
 use crate::invalid::Invalid;
 use crate::service::act::{self, Memory};
 use crate::service::{App, Error};
@@ -79,7 +79,7 @@ pub async fn infer(app: &App, request: InferRequest, deadline: Option<Instant>) 
     let Parameters { sequence, step, seed, timeout } = Parameters::read(parameters)?;
     let outputs = OutputSelection::new(outputs, sequence.is_none())?;
     check_names(&inputs)?;
-    let (state, observation) = if weight(&inputs) < LARGE {
+    let (state, observation) = if element_count(&inputs) < LARGE {
         read(inputs)?
     } else {
         tokio::task::spawn_blocking(|| read(inputs)).await.map_err(Error::internal)??

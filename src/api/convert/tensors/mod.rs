@@ -1,7 +1,6 @@
-//! Tensors: names, datatypes, shapes and values as the Open Inference Protocol writes them, read with every size checked
-//! before memory is taken.
+//! Tensors of the Open Inference Protocol: names, datatypes, shapes and values. Every size is checked before memory is allocated.
 //!
-//! A value is little-endian, tensors are row by row, and an element of BYTES is preceded by its length in 4 bytes.
+//! Values are little-endian, in row-major order. An element of BYTES is preceded by its length in 4 bytes.
 
 mod observation;
 
@@ -11,27 +10,27 @@ use bytes::{Buf, BufMut, Bytes, BytesMut};
 
 use crate::invalid::Invalid;
 
-pub use observation::{Dimension, INPUTS, observation, weight};
+pub use observation::{Dimension, INPUTS, element_count, observation};
 
-/// Datatypes that are spoken here.
+/// The supported datatypes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Datatype {
-    /// Whole numbers of 32 bits.
+    /// Signed integers of 32 bits.
     Int32,
-    /// Whole numbers of 64 bits.
+    /// Signed integers of 64 bits.
     Int64,
-    /// Numbers of 32 bits.
+    /// Floating-point numbers of 32 bits.
     Fp32,
-    /// Numbers of 64 bits.
+    /// Floating-point numbers of 64 bits.
     Fp64,
-    /// Strings of bytes.
+    /// Byte strings.
     Bytes,
 }
 
 impl Datatype {
     const ALL: [Self; 5] = [Self::Int32, Self::Int64, Self::Fp32, Self::Fp64, Self::Bytes];
 
-    /// As the protocol writes it.
+    /// The name in the protocol.
     pub fn name(self) -> &'static str {
         match self {
             Self::Int32 => "INT32",
@@ -42,12 +41,12 @@ impl Datatype {
         }
     }
 
-    /// The datatype called `name`, if it is spoken here.
+    /// The datatype called `name`, if it is supported.
     pub fn parse(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|datatype| datatype.name() == name)
     }
 
-    /// Bytes of an element, at least.
+    /// Least number of bytes of an element.
     fn size(self) -> usize {
         match self {
             Self::Int32 | Self::Fp32 | Self::Bytes => 4,
@@ -62,7 +61,7 @@ impl fmt::Display for Datatype {
     }
 }
 
-/// A tensor as it was sent: nothing about it has been checked.
+/// A tensor as the client sent it, unchecked.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tensor {
     /// Name.
@@ -84,7 +83,7 @@ pub struct TensorShape {
     pub datatype: Datatype,
     /// -1: any size.
     pub shape: Vec<i64>,
-    /// Whether a request may lack it.
+    /// Whether a request may omit the tensor.
     pub optional: bool,
 }
 
@@ -145,32 +144,34 @@ impl Data {
 }
 
 impl Tensor {
-    fn wrong(&self, part: &str, value: impl fmt::Display, expected: impl Into<String>) -> Invalid {
+    fn invalid(&self, part: &str, value: impl fmt::Display, expected: impl Into<String>) -> Invalid {
         Invalid::new(format!("{}{part}", self.name), value, expected)
     }
 
-    fn wrong_shape(&self, expected: &str) -> Invalid {
-        self.wrong(".shape", format!("{:?}", self.shape), expected)
+    fn invalid_shape(&self, expected: &str) -> Invalid {
+        self.invalid(".shape", format!("{:?}", self.shape), expected)
     }
 
-    /// The size of the first of the dimensions `expected`, the others of which are `inner`; at most `most`.
-    fn rows(&self, expected: &str, inner: &[i64], most: usize) -> Result<usize, Invalid> {
-        let (first, rest) = self.shape.split_first().ok_or_else(|| self.wrong_shape(expected))?;
-        let rows = usize::try_from(*first).ok().filter(|_| rest == inner).ok_or_else(|| self.wrong_shape(expected))?;
-        if rows > most {
-            return Err(self.wrong_shape(&format!("{expected}, the first of which is at most {most}")));
+    /// The first dimension of a tensor whose other dimensions must be `inner`. At most `max`.
+    ///
+    /// `expected` describes the shape in errors.
+    fn rows(&self, expected: &str, inner: &[i64], max: usize) -> Result<usize, Invalid> {
+        let (first, rest) = self.shape.split_first().ok_or_else(|| self.invalid_shape(expected))?;
+        let rows = usize::try_from(*first).ok().filter(|_| rest == inner).ok_or_else(|| self.invalid_shape(expected))?;
+        if rows > max {
+            return Err(self.invalid_shape(&format!("{expected}, the first dimension at most {max}")));
         }
         Ok(rows)
     }
 
-    /// The one of `allowed` that the tensor is of.
+    /// The datatype of the tensor, if `allowed` has it.
     fn check_datatype(&self, allowed: &[Datatype]) -> Result<Datatype, Invalid> {
         let found = Datatype::parse(&self.datatype).filter(|datatype| allowed.contains(datatype));
         let names = || allowed.iter().map(|datatype| datatype.name()).collect::<Vec<_>>().join(" or ");
-        let datatype = found.ok_or_else(|| self.wrong(".datatype", format!("{:?}", self.datatype), names()))?;
+        let datatype = found.ok_or_else(|| self.invalid(".datatype", format!("{:?}", self.datatype), names()))?;
         match self.data.datatype() {
             Some(other) if other != datatype => {
-                Err(self.wrong("", format!("values of {other}"), format!("values of {datatype}, the datatype of the tensor")))
+                Err(self.invalid("", format!("values of {other}"), format!("values of {datatype}, the datatype of the tensor")))
             }
             _ => Ok(datatype),
         }
@@ -180,19 +181,19 @@ impl Tensor {
         if len == count {
             return Ok(());
         }
-        Err(self.wrong("", format!("{len} values"), format!("{count} values for the shape {:?}", self.shape)))
+        Err(self.invalid("", format!("{len} values"), format!("{count} values for the shape {:?}", self.shape)))
     }
 
-    /// `count` elements of raw values of a fixed size.
+    /// Checks that `raw` has `count` elements of a fixed size.
     fn check_raw<'a>(&self, raw: &'a Bytes, datatype: Datatype, count: usize) -> Result<&'a [u8], Invalid> {
         if Some(raw.len()) == count.checked_mul(datatype.size()) {
             return Ok(raw);
         }
         let expected = format!("{count} values of {} bytes for the shape {:?}", datatype.size(), self.shape);
-        Err(self.wrong("", format!("{} bytes", raw.len()), expected))
+        Err(self.invalid("", format!("{} bytes", raw.len()), expected))
     }
 
-    /// `count` numbers of FP32 or FP64, not necessarily finite.
+    /// `count` numbers of FP32 or FP64, which may be infinite or NaN.
     fn numbers(&self, count: usize) -> Result<Vec<f64>, Invalid> {
         let datatype = self.check_datatype(&[Datatype::Fp32, Datatype::Fp64])?;
         Ok(match &self.data {
@@ -215,7 +216,7 @@ impl Tensor {
         })
     }
 
-    /// `count` whole numbers of INT32 or INT64.
+    /// `count` integers of INT32 or INT64.
     fn integers(&self, count: usize) -> Result<Vec<i64>, Invalid> {
         let datatype = self.check_datatype(&[Datatype::Int32, Datatype::Int64])?;
         Ok(match &self.data {
@@ -238,7 +239,7 @@ impl Tensor {
         })
     }
 
-    /// `count` strings of bytes.
+    /// `count` byte strings.
     fn byte_strings(&self, count: usize) -> Result<Vec<Bytes>, Invalid> {
         self.check_datatype(&[Datatype::Bytes])?;
         match &self.data {
@@ -251,33 +252,33 @@ impl Tensor {
         }
     }
 
-    /// Cuts raw BYTES into `count` elements.
+    /// Splits raw BYTES into `count` elements.
     fn split(&self, mut raw: Bytes, count: usize) -> Result<Vec<Bytes>, Invalid> {
         let size = raw.len();
-        let wrong = |place: usize, left: usize| {
+        let invalid = |place: usize, left: usize| {
             let value = format!("{size} bytes, {left} of them for element {place}");
-            self.wrong("", value, format!("{count} elements, each preceded by its length in 4 bytes"))
+            self.invalid("", value, format!("{count} elements, each preceded by its length in 4 bytes"))
         };
-        // Four bytes are the least that an element takes: nothing is reserved for elements that cannot be there.
+        // An element takes at least 4 bytes, so this bounds the allocation by the size of the input.
         if count.checked_mul(4).is_none_or(|least| least > size) {
-            return Err(wrong(size / 4, size % 4));
+            return Err(invalid(size / 4, size % 4));
         }
         let mut elements = Vec::with_capacity(count);
         for place in 0..count {
             let left = raw.len();
-            let len = raw.try_get_u32_le().map_err(|_| wrong(place, left))? as usize;
+            let len = raw.try_get_u32_le().map_err(|_| invalid(place, left))? as usize;
             if len > raw.len() {
-                return Err(wrong(place, left));
+                return Err(invalid(place, left));
             }
             elements.push(raw.split_to(len));
         }
-        if raw.is_empty() { Ok(elements) } else { Err(wrong(count, raw.len())) }
+        if raw.is_empty() { Ok(elements) } else { Err(invalid(count, raw.len())) }
     }
 
-    /// The one element of a BYTES tensor of shape [1]; empty where the tensor is.
+    /// The element of a BYTES tensor of shape [1], or an empty one for shape [0].
     ///
     /// # Errors
-    /// Another datatype or shape, or bytes that are not such an element.
+    /// [`Invalid`] for another datatype or shape, or for bytes that are not such an element.
     pub fn one_byte_string(&self) -> Result<Bytes, Invalid> {
         let count = self.rows("[1]", &[], 1)?;
         Ok(self.byte_strings(count)?.pop().unwrap_or_default())

@@ -1,6 +1,6 @@
-//! Tensors to [`Observation`]: a scene, or a graph as a list of edges.
+//! Conversion of tensors to an [`Observation`]: a scene, or a graph as a list of edges.
 //!
-//! Nodes are numbered in the order of the request, UAVs from 0 and users after them.
+//! Node indices have the order of the request: first the UAVs, then the users.
 
 use super::{Datatype, Tensor};
 use crate::env::Point;
@@ -9,7 +9,7 @@ use crate::serving::ids::{Ids, check_counts, check_distinct, request_order};
 use crate::serving::nodes::{aoi, finite, mirror, point};
 use crate::serving::{Fleet, Graph, GraphForm, MAX_DETECTIONS, MAX_NODES, Observation, ReportedDetection, Scene, SceneOrGraph};
 
-/// Inputs of which observations are made: name, datatype in which they are described, and what each dimension counts.
+/// The inputs of an observation: name, datatype in the metadata, and the meaning of each dimension.
 pub const INPUTS: [(&str, Datatype, &[Dimension]); 8] = [
     ("uav_positions", Datatype::Fp32, &[Dimension::Uavs, Dimension::Two]),
     ("user_positions", Datatype::Fp32, &[Dimension::Users, Dimension::Two]),
@@ -21,34 +21,34 @@ pub const INPUTS: [(&str, Datatype, &[Dimension]); 8] = [
     ("user_ids", Datatype::Bytes, &[Dimension::Users]),
 ];
 
-/// What a dimension of an input counts.
+/// The meaning of a dimension.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Dimension {
     /// One value.
     One,
-    /// x and y, or from and to.
+    /// x and y, or the two nodes of an edge.
     Two,
-    /// M.
+    /// Number of UAVs.
     Uavs,
-    /// N.
+    /// Number of users.
     Users,
-    /// E.
+    /// Number of edges.
     Edges,
 }
 
-/// About how much work the tensors are: elements, as far as their shapes tell.
-pub fn weight(tensors: &[Tensor]) -> usize {
-    let of = |tensor: &Tensor| {
+/// Number of elements according to the shapes: an estimate of the work.
+pub fn element_count(tensors: &[Tensor]) -> usize {
+    let elements = |tensor: &Tensor| {
         let sizes = tensor.shape.iter().map(|&size| usize::try_from(size).unwrap_or(0));
         sizes.fold(1_usize, usize::saturating_mul)
     };
-    tensors.iter().map(of).fold(0, usize::saturating_add)
+    tensors.iter().map(elements).fold(0, usize::saturating_add)
 }
 
-/// Takes the observation out of `tensors`, in which no name occurs twice; what belongs to none stays.
+/// Removes the inputs of the observation from `tensors` and converts them. Names must be distinct.
 ///
 /// # Errors
-/// A tensor that is missing, too many, of a wrong datatype or shape, or with a value that cannot be used.
+/// [`Invalid`] for a tensor that is missing, superfluous, or not accepted.
 pub fn observation(tensors: &mut Vec<Tensor>) -> Result<Observation, Invalid> {
     let mut take = |name: &str| {
         let at = tensors.iter().position(|tensor| tensor.name == name)?;
@@ -56,8 +56,7 @@ pub fn observation(tensors: &mut Vec<Tensor>) -> Result<Observation, Invalid> {
     };
     let [uav_positions, user_positions, user_aoi, edge_index, edge_relative, uav_count, uav_ids, user_ids] =
         INPUTS.map(|(name, ..)| take(name));
-    let missing = |name: &str, expected: &str| Invalid::missing(name, expected);
-    let user_aoi = user_aoi.ok_or_else(|| missing("user_aoi", "the AoI of each user in slots, [N]"))?;
+    let user_aoi = user_aoi.ok_or_else(|| Invalid::missing("user_aoi", "the AoI of each user in slots, [N]"))?;
     let users = user_aoi.rows("[N]", &[], MAX_NODES)?;
     let uavs = count_uavs(uav_positions.as_ref(), uav_count.as_ref(), uav_ids.as_ref())?;
     check_counts("uavs and users", uavs, users)?;
@@ -67,18 +66,18 @@ pub fn observation(tensors: &mut Vec<Tensor>) -> Result<Observation, Invalid> {
     let nodes = Nodes::new(uavs, users, uav_ids.as_ref(), user_ids.as_ref())?;
     let content = match (user_positions, edge_index, edge_relative) {
         (Some(tensor), None, None) => {
-            let own = own.ok_or_else(|| missing("uav_positions", "the position of each UAV, [M, 2]"))?;
+            let own = own.ok_or_else(|| Invalid::missing("uav_positions", "the position of each UAV, [M, 2]"))?;
             let all = points(&tensor, "[N, 2]", users)?;
             let uavs = nodes.uavs.iter().map(|&place| own[place as usize]).collect();
-            SceneOrGraph::Scene(Scene { uavs, users: nodes.of_users(&all), aoi: nodes.of_users(&ages) })
+            SceneOrGraph::Scene(Scene { uavs, users: nodes.sort_users(&all), aoi: nodes.sort_users(&ages) })
         }
         (None, Some(index), Some(relative)) => SceneOrGraph::Graph(graph(&nodes, own.as_deref(), &ages, &index, &relative)?),
         (None, None, None) => {
             let expected = "the position of each user, [N, 2], or edge_index and edge_relative";
-            return Err(missing("user_positions", expected));
+            return Err(Invalid::missing("user_positions", expected));
         }
-        (None, None, Some(_)) => return Err(missing("edge_index", "the nodes of each edge, [E, 2]")),
-        (None, Some(_), None) => return Err(missing("edge_relative", "the relative coordinates of each edge, [E, 2]")),
+        (None, None, Some(_)) => return Err(Invalid::missing("edge_index", "the nodes of each edge, [E, 2]")),
+        (None, Some(_), None) => return Err(Invalid::missing("edge_relative", "the relative coordinates of each edge, [E, 2]")),
         (Some(_), ..) => {
             let expected = "no value beside edges, because a request has a scene or a graph";
             return Err(Invalid::new("user_positions", "a tensor", expected));
@@ -87,24 +86,24 @@ pub fn observation(tensors: &mut Vec<Tensor>) -> Result<Observation, Invalid> {
     Ok(Observation { uav_order: request_order(&nodes.uavs), content, fleet: nodes.fleet })
 }
 
-/// M, as everything says that tells it.
+/// The number of UAVs, which all inputs must agree on.
 fn count_uavs(positions: Option<&Tensor>, count: Option<&Tensor>, ids: Option<&Tensor>) -> Result<usize, Invalid> {
-    let told = |tensor: &Tensor| -> Result<usize, Invalid> {
+    let count_of = |tensor: &Tensor| -> Result<usize, Invalid> {
         tensor.rows("[1]", &[], 1)?;
         let value = tensor.integers(1)?[0];
         let fits = usize::try_from(value).ok().filter(|value| (1..=MAX_NODES).contains(value));
         fits.ok_or_else(|| Invalid::new("uav_count", value, format!("a number from 1 to {MAX_NODES}")))
     };
-    let told = [
+    let counts = [
         positions.map(|tensor| Ok(("uav_positions", tensor.rows("[M, 2]", &[2], MAX_NODES)?))).transpose()?,
-        count.map(|tensor| Ok(("uav_count", told(tensor)?))).transpose()?,
+        count.map(|tensor| Ok(("uav_count", count_of(tensor)?))).transpose()?,
         ids.map(|tensor| Ok(("uav_ids", tensor.rows("[M]", &[], MAX_NODES)?))).transpose()?,
     ];
-    let mut told = told.into_iter().flatten();
-    let Some((first, uavs)) = told.next() else {
+    let mut counts = counts.into_iter().flatten();
+    let Some((first, uavs)) = counts.next() else {
         return Err(Invalid::missing("uav_positions", "the position of each UAV, [M, 2], or uav_count or uav_ids"));
     };
-    match told.find(|&(_, other)| other != uavs) {
+    match counts.find(|&(_, other)| other != uavs) {
         Some((name, other)) => Err(Invalid::new(name, format!("{other} UAVs"), format!("{uavs}, the number in {first}"))),
         None => Ok(uavs),
     }
@@ -112,19 +111,19 @@ fn count_uavs(positions: Option<&Tensor>, count: Option<&Tensor>, ids: Option<&T
 
 fn points(tensor: &Tensor, expected: &str, count: usize) -> Result<Vec<Point>, Invalid> {
     if tensor.rows(expected, &[2], MAX_NODES)? != count {
-        return Err(tensor.wrong_shape(&format!("[{count}, 2]")));
+        return Err(tensor.invalid_shape(&format!("[{count}, 2]")));
     }
     let values = tensor.numbers(2 * count)?;
     let pairs = values.chunks_exact(2).enumerate();
     pairs.map(|(i, pair)| point(|| format!("{}[{i}]", tensor.name), [pair[0], pair[1]])).collect()
 }
 
-/// The fleet, and where its nodes are in the request.
+/// The fleet and the places of its nodes in the request.
 struct Nodes {
     fleet: Fleet,
     /// Place of each UAV among the request's UAVs, in canonical order.
     uavs: Vec<u32>,
-    /// The same of users.
+    /// Place of each user among the users of the request, in canonical order.
     users: Vec<u32>,
 }
 
@@ -138,12 +137,12 @@ impl Nodes {
         Ok(Self { fleet: Fleet { uavs: uav_ids, users: user_ids }, uavs, users })
     }
 
-    /// Brings what is told of users into canonical order.
-    fn of_users<T: Copy>(&self, all: &[T]) -> Vec<T> {
+    /// Values of the users in canonical order.
+    fn sort_users<T: Copy>(&self, all: &[T]) -> Vec<T> {
         self.users.iter().map(|&place| all[place as usize]).collect()
     }
 
-    /// Canonical index of each node of the request.
+    /// Canonical index of each node in the order of the request.
     fn canonical(&self) -> Vec<u32> {
         let uavs = self.uavs.len() as u32;
         let users = request_order(&self.users).into_iter().map(|user| uavs + user);
@@ -151,19 +150,19 @@ impl Nodes {
     }
 }
 
-/// Ids in canonical order with their places; `KIND-0`, `KIND-1`, ... where none are given, which are in order.
+/// Ids in canonical order with their places in the request. Default ids: `KIND-0`, `KIND-1`, ...
 fn ids(tensor: Option<&Tensor>, count: usize, expected: &str, kind: &str) -> Result<(Vec<String>, Vec<u32>), Invalid> {
     let Some(tensor) = tensor else {
         return Ok((0..count as u32).map(|i| (format!("{kind}-{i}"), i)).unzip());
     };
     if tensor.rows(expected, &[], MAX_NODES)? != count {
-        return Err(tensor.wrong_shape(&format!("[{count}]")));
+        return Err(tensor.invalid_shape(&format!("[{count}]")));
     }
     let mut ids = Ids::with_capacity(count);
     for (place, bytes) in tensor.byte_strings(count)?.into_iter().enumerate() {
         let field = || format!("{}[{place}]", tensor.name);
-        let shown = || format!("{:?}", String::from_utf8_lossy(&bytes));
-        let id = std::str::from_utf8(&bytes).map_err(|_| Invalid::new(field(), shown(), "text in UTF-8"))?;
+        let value = || format!("{:?}", String::from_utf8_lossy(&bytes));
+        let id = std::str::from_utf8(&bytes).map_err(|_| Invalid::new(field(), value(), "text in UTF-8"))?;
         ids.push(field, id.to_owned(), place)?;
     }
     Ok(ids.sorted())
@@ -173,7 +172,7 @@ fn graph(nodes: &Nodes, own: Option<&[Point]>, ages: &[f32], index: &Tensor, rel
     let (uavs, users) = (nodes.uavs.len(), nodes.users.len());
     let edges = index.rows("[E, 2]", &[2], MAX_DETECTIONS)?;
     if relative.rows("[E, 2]", &[2], MAX_DETECTIONS)? != edges {
-        return Err(relative.wrong_shape(&format!("[{edges}, 2], as edge_index")));
+        return Err(relative.invalid_shape(&format!("[{edges}, 2], as edge_index")));
     }
     let ends = index.integers(2 * edges)?;
     let relative = relative.numbers(2 * edges)?;
@@ -206,10 +205,10 @@ fn graph(nodes: &Nodes, own: Option<&[Point]>, ages: &[f32], index: &Tensor, rel
             Some(own) => nodes.uavs.iter().map(|&place| Some(own[place as usize])).collect(),
             None => vec![None; uavs],
         },
-        aoi: nodes.of_users(ages),
+        aoi: nodes.sort_users(ages),
         left_out: detections[uavs..].iter().map(Vec::is_empty).collect(),
         detections,
-        // Edges are named by their own places.
+        // The fields of edges have the places of edges, not of nodes.
         places: Vec::new(),
         form: GraphForm::Edges,
     })
