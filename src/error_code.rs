@@ -51,7 +51,7 @@ error_codes! {
     InvalidSchema = "invalid_schema",
     /// The path does not support the HTTP method.
     MethodNotAllowed = "method_not_allowed",
-    /// The policy or job has no checkpoint.
+    /// The policy is a baseline, which has no checkpoint and no aliases.
     NoCheckpoint = "no_checkpoint",
     /// The resource does not exist.
     NotFound = "not_found",

@@ -304,6 +304,14 @@ mod tests {
     }
 
     #[test]
+    fn every_code_is_documented() {
+        let document = include_str!("../../docs/errors.md");
+        for code in ErrorCode::ALL {
+            assert_eq!(document.matches(&format!("\n| `{code}` |")).count(), 1, "{code}");
+        }
+    }
+
+    #[test]
     fn clients_do_not_see_the_cause_of_an_internal_error() {
         let status = Status::from(Error::internal("the secret cause"));
         assert_eq!(status.message(), "internal error");
