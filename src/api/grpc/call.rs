@@ -35,15 +35,15 @@ pub(super) struct Call {
     context: Arc<CallContext>,
     method: usize,
     id: RequestId,
-    begun: Instant,
+    started: Instant,
     span: Span,
-    over: bool,
+    ended: bool,
 }
 
 impl Call {
-    /// A call of method number `method` that begins now.
+    /// A call of method number `method` that starts now.
     pub(super) fn begin(context: Arc<CallContext>, method: usize, id: RequestId, span: Span) -> Self {
-        Self { context, method, id, begun: Instant::now(), span, over: false }
+        Self { context, method, id, started: Instant::now(), span, ended: false }
     }
 
     pub(super) fn id(&self) -> &RequestId {
@@ -60,11 +60,11 @@ impl Call {
 
     /// Counts and logs the call, the first time it is called.
     pub(super) fn end(&mut self, code: Code, detail: &dyn Display) {
-        if std::mem::replace(&mut self.over, true) {
+        if std::mem::replace(&mut self.ended, true) {
             return;
         }
         let method = self.method();
-        let seconds = self.begun.elapsed().as_secs_f64();
+        let seconds = self.started.elapsed().as_secs_f64();
         method.handled(code).increment(1);
         method.handles().seconds.record(seconds);
         let severity = match code {
@@ -261,6 +261,6 @@ mod tests {
         let Poll::Ready(Some(Ok(frame))) = Pin::new(&mut body).poll_frame(&mut context) else { panic!("no frame") };
         let status = Status::from_header_map(frame.trailers_ref().unwrap()).unwrap();
         assert_eq!((status.code(), status.message()), (Code::Internal, "internal error"));
-        assert!(body.call.over && matches!(Pin::new(&mut body).poll_frame(&mut context), Poll::Ready(None)));
+        assert!(body.call.ended && matches!(Pin::new(&mut body).poll_frame(&mut context), Poll::Ready(None)));
     }
 }

@@ -33,7 +33,7 @@ impl Middleware {
 
     /// Handles one request.
     pub(super) async fn handle(self: Arc<Self>, request: Request, next: Next) -> Response {
-        let begun = Instant::now();
+        let started = Instant::now();
         let verb = verb(request.method());
         let matched = request.extensions().get::<MatchedPath>().cloned();
         let route = matched.as_ref().map_or("unknown", MatchedPath::as_str);
@@ -44,7 +44,7 @@ impl Middleware {
         let response = AssertUnwindSafe(next.run(request).instrument(span.clone())).catch_unwind().await;
         let mut response = response.unwrap_or_else(|_| Error::internal("a handler panicked").into_response());
         response.headers_mut().insert(REQUEST_ID, id.header());
-        let (seconds, status) = (begun.elapsed().as_secs_f64(), response.status());
+        let (seconds, status) = (started.elapsed().as_secs_f64(), response.status());
         // Clients choose the method of a 405. It must not become a label.
         self.metrics.record(if status == StatusCode::METHOD_NOT_ALLOWED { "other" } else { verb }, route, status, seconds);
         let detail = response.extensions_mut().remove::<LogDetail>().map_or_else(String::new, |detail| detail.0);
