@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use tonic::{Request, Response, Status};
+use tonic::{Request, Response};
 
 use super::GrpcResult;
 use crate::api::convert::environments::{create, environment_state, is_large};
