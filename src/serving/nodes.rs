@@ -169,12 +169,9 @@ impl Builder {
             if let Some(value) = node.aoi {
                 self.set_aoi(user, value, || format!("{}.aoi", path()))?;
             }
-            if node.position.is_some() {
-                return Err(Invalid::new(
-                    format!("{}.position", path()),
-                    "a position",
-                    "no value, because only UAVs have positions in a graph",
-                ));
+            if let Some([x, y]) = node.position {
+                let expected = "no value, because only UAVs have positions in a graph";
+                return Err(Invalid::new(format!("{}.position", path()), format!("({x}, {y})"), expected));
             }
             self.graph.left_out[user] = node.detections.len() == 0;
         } else {
@@ -207,7 +204,8 @@ impl Builder {
         list.sort_by_key(|s| s.target);
         if let Some(pair) = list.windows(2).find(|pair| pair[0].target == pair[1].target) {
             let field = format!("{}.detections[{}].target_id", path(), pair[1].place);
-            return Err(Invalid::new(field, format!("node {} twice", pair[1].target), "one detection per target"));
+            let id = indices.iter().find(|(_, target)| **target == pair[1].target).map_or("", |(id, _)| id);
+            return Err(Invalid::new(field, format!("{id:?}"), "one detection per target"));
         }
         self.graph.detections.push(list);
         Ok(())

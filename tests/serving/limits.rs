@@ -87,7 +87,7 @@ async fn errors_of_invalid_scenes_name_the_field() {
     let cases: &[(&str, &str, Change)] = &[
         ("observation", "", |r| r.observation = None),
         ("scene", "no UAV", |r| in_scene(r).uavs.clear()),
-        ("scene", "20001 nodes", |r| in_scene(r).users = scene(1, 19_998, 0).users),
+        ("scene", "20001 UAVs and users", |r| in_scene(r).users = scene(1, 19_998, 0).users),
         ("users", "0", |r| in_scene(r).users.clear()),
         ("scene.uavs[1].x", "NaN", |r| in_scene(r).uavs[1].x = f64::NAN),
         ("scene.uavs[0].y", "inf", |r| in_scene(r).uavs[0].y = f64::INFINITY),

@@ -278,7 +278,7 @@ async fn the_command_line_does_all_of_it() {
     assert_eq!(second["ref"]["version"], 2);
     assert_eq!(
         qedgix(&server, &["alias", "set", "mine", "live", "2", "--expected", "1"]).await,
-        "mine@live is mine:2 (before: mine:1)\n"
+        "mine@live points to mine:2 (previously mine:1)\n"
     );
     let (code, _, err) = run(&server, &["alias", "set", "mine", "live", "1", "--expected", "1"]).await;
     assert_eq!((code, err.contains("(alias_moved)")), (Some(1), true), "{err}");
