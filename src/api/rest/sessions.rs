@@ -56,7 +56,8 @@ struct OpenSessionRequest {
 
 #[derive(Debug, Serialize, ToSchema)]
 struct Session {
-    session_id: String,
+    #[serde(rename = "session_id")]
+    id: String,
     policy: PolicyRef,
     /// Slots answered in the current run.
     steps: u64,
@@ -68,7 +69,7 @@ struct Session {
 impl From<SessionInfo> for Session {
     fn from(session: SessionInfo) -> Self {
         Self {
-            session_id: session.id,
+            id: session.id,
             policy: (&session.policy).into(),
             steps: session.steps,
             opened_at: session.opened_at,

@@ -229,7 +229,8 @@ impl From<store::Checkpoint> for Checkpoint {
 /// An attempt at a job by one worker process.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Attempt {
-    attempt: u32,
+    #[serde(rename = "attempt")]
+    number: u32,
     started_at: Timestamp,
     #[schema(required = true)]
     ended_at: Option<Timestamp>,
@@ -244,6 +245,6 @@ pub(super) struct Attempt {
 impl From<store::Attempt> for Attempt {
     fn from(attempt: store::Attempt) -> Self {
         let store::Attempt { number, started_at, ended_at, outcome, reason, log } = attempt;
-        Self { attempt: number, started_at, ended_at, outcome, reason, log }
+        Self { number, started_at, ended_at, outcome, reason, log }
     }
 }
