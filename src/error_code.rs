@@ -71,7 +71,7 @@ error_codes! {
     TooLarge = "too_large",
     /// The API key is missing, unknown, revoked or expired.
     Unauthenticated = "unauthenticated",
-    /// The server is not ready: the database does not answer, or no policy is loaded.
+    /// The server is not ready: the database does not respond, or there is no policy.
     Unavailable = "unavailable",
     /// The body has a media type that the server does not read.
     UnsupportedMediaType = "unsupported_media_type",

@@ -10,7 +10,7 @@ use std::fmt::{self, Display};
 pub struct Invalid {
     /// Path of the field as the caller wrote it: `environment.uavs`, `graph.nodes[2].id`.
     pub field: String,
-    /// The value received, cut to [`Invalid::LONGEST_VALUE`] characters; none where the field is missing.
+    /// The value received, cut to [`Invalid::MAX_VALUE_LEN`] characters; none where the field is missing.
     pub value: Option<String>,
     /// What is accepted: `a number from 1 to 4096`, `one of qmix, vdn`.
     pub expected: String,
@@ -30,26 +30,27 @@ pub enum InvalidKind {
 }
 
 impl Invalid {
-    /// Most characters of a value that an error repeats.
-    pub const LONGEST_VALUE: usize = 120;
+    /// Maximum number of characters of a value that an error contains.
+    pub const MAX_VALUE_LEN: usize = 120;
 
-    /// `field` has a `value` that is not accepted.
+    /// `field` has a `value` of the right type that is not accepted: HTTP status 400, code `invalid_argument`.
     pub fn new(field: impl Into<String>, value: impl Display, expected: impl Into<String>) -> Self {
         let value = Some(cut(value.to_string()));
         Self { field: field.into(), value, expected: expected.into(), kind: InvalidKind::Value }
     }
 
-    /// `field` is required and missing.
+    /// `field` is missing, and its absence is found by a check of values, not by the schema: HTTP status 400, code
+    /// `invalid_argument`.
     pub fn missing(field: impl Into<String>, expected: impl Into<String>) -> Self {
         Self { field: field.into(), value: None, expected: expected.into(), kind: InvalidKind::Value }
     }
 
-    /// `field` has a `value` of the wrong type.
+    /// `field` has a `value` of the wrong type: HTTP status 422, code `invalid_schema`.
     pub fn schema(field: impl Into<String>, value: impl Display, expected: impl Into<String>) -> Self {
         Self { kind: InvalidKind::Schema, ..Self::new(field, value, expected) }
     }
 
-    /// The schema requires `field`.
+    /// `field` is missing, and the schema requires it: HTTP status 422, code `invalid_schema`.
     pub fn missing_field(field: impl Into<String>, expected: impl Into<String>) -> Self {
         Self { kind: InvalidKind::Schema, ..Self::missing(field, expected) }
     }
@@ -89,7 +90,7 @@ impl Invalid {
 
     /// The same error with `prefix.` in front of the field.
     #[must_use]
-    pub fn within(mut self, prefix: &str) -> Self {
+    pub fn with_prefix(mut self, prefix: &str) -> Self {
         self.field = format!("{prefix}.{}", self.field);
         self
     }
@@ -109,10 +110,10 @@ impl Display for Invalid {
 impl std::error::Error for Invalid {}
 
 fn cut(value: String) -> String {
-    if value.chars().count() <= Invalid::LONGEST_VALUE {
+    if value.chars().count() <= Invalid::MAX_VALUE_LEN {
         return value;
     }
-    value.chars().take(Invalid::LONGEST_VALUE).chain("...".chars()).collect()
+    value.chars().take(Invalid::MAX_VALUE_LEN).chain("...".chars()).collect()
 }
 
 /// The value in a serde message such as ``invalid type: integer `3` ``.
@@ -146,7 +147,7 @@ pub fn expectation(error: &impl Display) -> String {
 /// Checks that `value` lies in `range`. NaN lies in no range.
 ///
 /// # Errors
-/// [`Invalid`] where `value` lies outside of `range`.
+/// [`Invalid`] if `value` is outside of `range`.
 pub fn in_range<T>(field: &str, value: T, range: std::ops::RangeInclusive<T>) -> Result<(), Invalid>
 where
     T: PartialOrd + Display,
@@ -205,7 +206,7 @@ mod tests {
     #[test]
     fn long_values_are_cut() {
         let value = Invalid::new("f", "x".repeat(1000), "less").value.unwrap();
-        assert_eq!(value.len(), Invalid::LONGEST_VALUE + 3);
+        assert_eq!(value.len(), Invalid::MAX_VALUE_LEN + 3);
     }
 
     #[test]

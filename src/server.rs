@@ -35,7 +35,7 @@ use crate::invalid::Invalid;
 use crate::jobs::{LocalProcess, Scheduler, SchedulerConfig};
 use crate::service::keys::{Keyring, Rate};
 use crate::service::policies::UploadLimit;
-use crate::service::{App, Watchers, operations, policies};
+use crate::service::{App, WatchLimit, operations, policies};
 use crate::serving::{Engine, Environments, EnvironmentsConfig, Limits, Sessions};
 use crate::store::{self, Store};
 use crate::telemetry;
@@ -215,11 +215,11 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         sessions: Sessions::new(sessions, clock.clone()),
         environments: Environments::new(environments, clock.clone()),
         engine: Engine::start(config.engine).map_err(Error::Engine)?,
-        watchers: Watchers::new(config.max_watchers, config.event_heartbeat),
+        watchers: WatchLimit::new(config.max_watchers, config.event_heartbeat),
         clock,
         draining,
     };
-    policies::load(&app).await.map_err(Error::Policies)?;
+    policies::fill_registry(&app).await.map_err(Error::Policies)?;
     Ok(Arc::new(app))
 }
 
@@ -307,8 +307,8 @@ async fn housekeeping(app: Arc<App>, ttl: Duration) {
     loop {
         tokio::select! {
             _ = sweep.tick() => {
-                app.sessions.sweep();
-                app.environments.table().sweep();
+                app.sessions.remove_expired();
+                app.environments.table().remove_expired();
             }
             _ = upkeep.tick() => telemetry::install_metrics().run_upkeep(),
         }

@@ -270,8 +270,8 @@ impl TrainConfig {
     pub fn validate(&self) -> Result<(), Invalid> {
         /// Largest size of replay in bytes.
         const LIMIT: usize = 8 << 30;
-        self.environment.validate().map_err(|e| e.within("environment"))?;
-        self.training.validate().map_err(|e| e.within("training"))?;
+        self.environment.validate().map_err(|e| e.with_prefix("environment"))?;
+        self.training.validate().map_err(|e| e.with_prefix("training"))?;
         let mixes = self.training.mixer != MixerKind::None;
         if mixes == (self.algorithm == Algorithm::Iql) {
             let expected = if mixes { "none, because iql has no mixer" } else { "qmix, invariant or vdn" };
@@ -358,7 +358,7 @@ pub fn environment(mut document: Value) -> Result<EnvConfig, Invalid> {
         return Err(Invalid::schema("environment", &document, "an object"));
     };
     let mut config = overridden("environment", &EnvConfig::default(), fields)?;
-    config.validate().map_err(|e| e.within("environment"))?;
+    config.validate().map_err(|e| e.with_prefix("environment"))?;
     config.reward_scale = Some(config.reward_factor());
     Ok(config)
 }

@@ -33,7 +33,7 @@ fn slot(fleet: usize, step: usize) -> Slot {
 
 /// Runs `fleets` fleets concurrently for `steps` slots. Returns the number of allocations of each slot.
 fn allocations_per_slot(engine: &Engine, policy: &Arc<LoadedPolicy>, fleets: usize, steps: usize) -> Vec<u64> {
-    let fresh = || TaskOutput { memory: vec![0.0; policy.policy.memory_len(UAVS, USERS)], decision: Decision::default() };
+    let fresh = || TaskOutput { memory: vec![0.0; policy.implementation.memory_len(UAVS, USERS)], decision: Decision::default() };
     let mut last: Vec<TaskOutput> = (0..fleets).map(|_| fresh()).collect();
     let mut counts = Vec::new();
     for step in 0..steps {

@@ -5,8 +5,8 @@ mod auth;
 pub mod convert;
 mod errors;
 pub mod grpc;
-mod observe;
 mod oip;
+mod request_log;
 pub mod rest;
 
 pub use errors::{Problem, retry_after_seconds};

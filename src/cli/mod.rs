@@ -1,4 +1,4 @@
-//! The command line. Each command has its own file. Every flag is also an environment variable `QEDGIX_*`.
+//! The command line. Each command has its own file. Most flags are also environment variables `QEDGIX_*`; `--help` shows them.
 
 mod act_client;
 mod bench;

@@ -86,7 +86,7 @@ pub struct ServeArgs {
     /// Time that requests in flight have to complete when the server stops, at most 24 h
     #[arg(long, env = "QEDGIX_DRAIN_TIMEOUT", default_value = "20s", value_parser = duration, value_name = "TIME")]
     drain_timeout: Duration,
-    /// Allow addresses other than loopback although no API key exists. Existing keys stay mandatory
+    /// Allow addresses other than loopback without any API key. Does not switch off existing keys
     #[arg(long, help_heading = SECURITY, env = "QEDGIX_INSECURE")]
     insecure: bool,
     #[command(flatten)]

@@ -47,7 +47,7 @@ struct Tail {
 }
 
 impl LogTail {
-    /// Most bytes kept.
+    /// Maximum number of bytes kept.
     pub const LIMIT: usize = 64 << 10;
 
     /// Appends output. Beyond [`LogTail::LIMIT`] the oldest bytes are dropped.

@@ -15,7 +15,7 @@ use super::worker::{ENV_ATTEMPT, ENV_JOB, ENV_SERVER, ENV_TOKEN};
 /// Starts `PROGRAM worker` for each attempt.
 ///
 /// The worker's standard input is a pipe that the server holds. When the server ends in any way, the pipe closes and the
-/// worker ends, too. The token is passed in the environment, because other users of the machine can read command lines.
+/// worker ends, too. The token is passed in the environment, because everyone on the machine can read command lines.
 #[derive(Clone, Debug)]
 pub struct LocalProcess {
     /// The `qedgix` binary.
@@ -40,7 +40,7 @@ impl Executor for LocalProcess {
             command
                 .args(["worker", "--tethered"])
                 .env(ENV_SERVER, &launch.server)
-                .env(ENV_JOB, launch.lease.id.to_string())
+                .env(ENV_JOB, launch.lease.job_id.to_string())
                 .env(ENV_ATTEMPT, launch.lease.attempt.to_string())
                 .env(ENV_TOKEN, &launch.token)
                 .stdin(Stdio::piped())
@@ -73,7 +73,7 @@ async fn supervise(mut child: Child, launch: Launch) -> WorkerExit {
         () = launch.kill.cancelled() => {
             let killed = child.start_kill();
             if let Err(e) = killed {
-                tracing::warn!(job = %launch.lease.id, error = %e, "the worker could not be killed");
+                tracing::warn!(job = %launch.lease.job_id, error = %e, "the worker could not be killed");
             }
             child.wait().await
         }

@@ -35,9 +35,9 @@ pub struct SchedulerConfig {
     pub snapshot_every: Duration,
     /// Time without a heartbeat after which a worker is killed.
     pub heartbeat_timeout: Duration,
-    /// Time after which a worker that has not obeyed a cancel is killed.
+    /// Time after a cancel after which the worker is killed.
     pub cancel_grace: Duration,
-    /// Time after which a worker that has not obeyed a pause is killed. It has to upload a snapshot, which may be large.
+    /// Time after a pause after which the worker is killed. The worker uploads a snapshot first, which may be large.
     pub pause_grace: Duration,
 }
 
@@ -55,7 +55,7 @@ impl SchedulerConfig {
     }
 }
 
-/// What a worker is to do next.
+/// What a worker has to do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Directive {
     /// Continue training.
@@ -82,7 +82,7 @@ struct Inner {
     removed: Notify,
     /// Whether the last read of the queue succeeded.
     queue_readable: watch::Sender<bool>,
-    /// Attempts by job number. An attempt stays here until its worker process has ended, whatever the state of its job.
+    /// Attempts by row id of the job. An attempt stays here until its worker process has ended, whatever the state of its job.
     running: Mutex<HashMap<i64, RunningAttempt>>,
 }
 
@@ -147,7 +147,7 @@ impl Scheduler {
         scheduler::threads_used(&self.running())
     }
 
-    /// Notifies the scheduler that the queue, or the state or pending action of job number `job`, has changed.
+    /// Notifies the scheduler that the queue, or the state or pending action of the job with row id `job`, has changed.
     pub fn job_changed(&self, job: i64) {
         if let Some(running) = self.running().get(&job) {
             running.job_changed.notify_one();
@@ -157,7 +157,7 @@ impl Scheduler {
 
     /// Records that the worker of an attempt has called.
     pub fn record_heartbeat(&self, lease: Lease) {
-        if let Some(running) = self.running().get(&lease.job).filter(|running| running.attempt == lease.attempt) {
+        if let Some(running) = self.running().get(&lease.job_row).filter(|running| running.attempt == lease.attempt) {
             *running.last_heartbeat() = self.0.clock.monotonic();
         }
     }

@@ -13,7 +13,7 @@ use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
 use super::{Launch, LogTail, RunningAttempt, Scheduler, WorkerExit, token_digest};
-use crate::store::{AttemptResult, EndedAttempt, Job, JobState, Lease, PendingAction};
+use crate::store::{EndedAttempt, Job, JobState, Lease, PendingAction, WorkerResult};
 
 /// Why the scheduler kills a worker.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -30,8 +30,8 @@ const RETRY_DELAY: Duration = Duration::from_secs(1);
 /// Why no attempt could begin: the database, or the system's source of random numbers.
 type StartError = Box<dyn std::error::Error + Send + Sync>;
 
-fn failed(reason: String) -> AttemptResult {
-    AttemptResult::Failed { reason, permanent: false }
+fn failed(reason: String) -> WorkerResult {
+    WorkerResult::Failed { reason, permanent: false }
 }
 
 pub(super) fn threads_used(all: &HashMap<i64, RunningAttempt>) -> usize {
@@ -64,16 +64,16 @@ impl Scheduler {
             let begun = self.begin(&job).await;
             let Ok(Some((lease, token))) = begun else {
                 // Cancelled or paused in the meantime, or an error.
-                self.release(job.number);
+                self.release(job.row_id);
                 begun?;
                 continue;
             };
-            let (scheduler, span) = (self.clone(), tracing::info_span!("attempt", job = %lease.id, attempt = lease.attempt));
+            let (scheduler, span) = (self.clone(), tracing::info_span!("attempt", job = %lease.job_id, attempt = lease.attempt));
             let server = server.to_owned();
             let attempt = async move {
                 let (log, kill) = (running.log.clone(), CancellationToken::new());
                 scheduler.supervise(Launch { lease, token, server, log, kill }, &running).await;
-                scheduler.release(lease.job);
+                scheduler.release(lease.job_row);
             };
             tokio::spawn(attempt.instrument(span));
         }
@@ -90,7 +90,7 @@ impl Scheduler {
         let budget = self.0.config.cpu_budget;
         let threads = job.spec.threads.min(budget);
         // The worker of the previous attempt may not have ended yet.
-        if self.0.draining.begun() || threads_used(&all) + threads > budget || all.contains_key(&job.number) {
+        if self.0.draining.begun() || threads_used(&all) + threads > budget || all.contains_key(&job.row_id) {
             return None;
         }
         let running = RunningAttempt {
@@ -100,7 +100,7 @@ impl Scheduler {
             job_changed: Arc::new(Notify::new()),
             last_heartbeat: Arc::new(Mutex::new(self.0.clock.monotonic())),
         };
-        all.insert(job.number, running.clone());
+        all.insert(job.row_id, running.clone());
         Some(running)
     }
 
@@ -129,14 +129,15 @@ impl Scheduler {
         self.end(lease, &result, &running.log).await;
     }
 
-    /// Waits for the worker process, and kills it when needed. The result is for a worker that has not reported its own.
+    /// Waits for the end of the worker process, and kills it if it does not stop in time. Returns the result of an attempt whose
+    /// worker has reported none.
     async fn wait(
         &self,
         lease: Lease,
         mut exit: BoxFuture<'_, WorkerExit>,
         kill: &CancellationToken,
         running: &RunningAttempt,
-    ) -> AttemptResult {
+    ) -> WorkerResult {
         let force = async {
             let reason = self.kill_reason(lease, running).await;
             tracing::warn!(?reason, "killing the worker");
@@ -148,7 +149,7 @@ impl Scheduler {
             reason = force => {
                 exit.await;
                 match reason {
-                    KillReason::GraceExpired => AttemptResult::Stopped,
+                    KillReason::GraceExpired => WorkerResult::Stopped,
                     KillReason::HeartbeatLost => {
                         let timeout = self.0.config.heartbeat_timeout.as_secs_f64();
                         failed(format!("no heartbeat of the worker for {timeout} s"))
@@ -181,7 +182,7 @@ impl Scheduler {
                     continue;
                 }
             }
-            let grace = match self.0.store.job(lease.id).await {
+            let grace = match self.0.store.job(lease.job_id).await {
                 Ok(Some(Job { state: JobState::Running, pending_action, .. })) => match pending_action {
                     Some(PendingAction::Cancel) => Some(config.cancel_grace),
                     Some(PendingAction::Pause) => Some(config.pause_grace),
@@ -201,12 +202,12 @@ impl Scheduler {
         }
     }
 
-    /// Records the end of the process. An attempt that the worker has ended itself stays as it is.
-    async fn end(&self, lease: Lease, result: &AttemptResult, log: &LogTail) {
+    /// Stores the log of the worker, and ends the attempt unless the worker has ended it. Retries until the database works.
+    async fn end(&self, lease: Lease, result: &WorkerResult, log: &LogTail) {
         let text = log.text();
         loop {
             let ended = async {
-                self.0.store.keep_log(lease, &text).await?;
+                self.0.store.store_log(lease, &text).await?;
                 let (max_attempts, now) = (self.0.config.max_attempts, self.0.clock.now());
                 self.0.store.end_attempt(EndedAttempt { lease, result, policy: None, max_attempts, now }).await
             };
@@ -279,7 +280,7 @@ mod tests {
         scheduler.reserve(&job).unwrap();
         let mut drain = std::pin::pin!(scheduler.drain(Duration::from_secs(3600)));
         assert!(futures::poll!(&mut drain).is_pending());
-        scheduler.release(job.number);
+        scheduler.release(job.row_id);
         assert!(futures::poll!(&mut drain).is_ready());
     }
 

@@ -9,7 +9,7 @@ use crate::train_config;
 
 /// A request to create an environment.
 #[derive(Clone, Debug)]
-pub struct Create {
+pub struct NewEnvironment {
     /// The environment's name; generated if absent.
     pub id: Option<String>,
     /// Fields of the configuration that differ from the defaults.
@@ -27,9 +27,9 @@ pub struct Create {
 /// # Errors
 /// [`Error::Draining`]; [`Error::Invalid`] for unknown fields and values out of range; [`Error::Conflict`] if the name is
 /// taken; [`Error::Busy`] if the number or the memory of environments is exhausted.
-pub async fn create(app: &App, create: Create) -> Result<EnvironmentInfo, Error> {
+pub async fn create(app: &App, new: NewEnvironment) -> Result<EnvironmentInfo, Error> {
     app.admit()?;
-    let Create { id, environment, seed, count, auto_reset } = create;
+    let NewEnvironment { id, environment, seed, count, auto_reset } = new;
     let spec = EnvironmentSpec::new(train_config::environment(environment)?, count, seed, auto_reset)?;
     Ok(app.environments.create(id, spec).await?)
 }

@@ -60,7 +60,7 @@ pub enum Error {
     /// The server is shutting down.
     #[error("the server is shutting down; retry later or on another server")]
     Draining,
-    /// The server is not ready: the database does not answer, or no policy is loaded.
+    /// The server is not ready: the database does not respond, or there is no policy.
     #[error("{0}")]
     Unavailable(&'static str),
     /// The API key is missing, unknown, revoked or expired.

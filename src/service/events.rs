@@ -13,15 +13,15 @@ use super::{App, Error, jobs};
 use crate::invalid::in_range;
 use crate::store::{Job, JobEvent, JobEventKind};
 
-/// Limits of watches.
+/// The limit of open watches, and their heartbeat.
 #[derive(Debug)]
-pub struct Watchers {
+pub struct WatchLimit {
     permits: Arc<Semaphore>,
     max: usize,
     heartbeat: Duration,
 }
 
-impl Watchers {
+impl WatchLimit {
     /// At most `max` watches at a time. A watch without events sends a heartbeat every `heartbeat` on transports that have
     /// none of their own.
     pub fn new(max: usize, heartbeat: Duration) -> Self {
@@ -57,12 +57,12 @@ pub struct Watch {
 /// open, [`Error::Draining`].
 pub async fn watch(app: &Arc<App>, id: &str, after: u64) -> Result<Watch, Error> {
     app.admit()?;
-    let Watchers { permits, max, .. } = &app.watchers;
+    let WatchLimit { permits, max, .. } = &app.watchers;
     let permit = permits.clone().try_acquire_owned().map_err(|_| Error::Busy {
         message: format!("{max} watches are open, which is the limit"),
         retry_after: Duration::from_secs(5),
     })?;
-    let Job { number: job, state, last_event, .. } = jobs::get(app, id).await?;
+    let Job { row_id: job, state, last_event, .. } = jobs::get(app, id).await?;
     in_range("after", after, 0..=last_event)?;
     let ended = state.ended() && after == last_event;
     Ok(Watch { app: app.clone(), id: id.to_owned(), job, after, ended, changes: app.store.changes(job), _permit: permit })

@@ -2,7 +2,7 @@
 
 use uuid::Uuid;
 
-use super::paging::{self, number};
+use super::paging::{self, parse_number};
 use super::{App, Error, Page, PageRequest, policies};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
@@ -12,14 +12,15 @@ use crate::store::{
     PendingAction, SubmitResult, is_metric_name,
 };
 
-/// Puts a job into the queue and returns it and whether it is new: the same `key` with the same request returns the existing job.
-/// A returned job is on the disk.
+/// Puts a job into the queue. Returns the job, which is in the database, and whether it is new: the same `idempotency_key` with
+/// the same request returns the existing job.
 ///
 /// # Errors
-/// [`Error::Invalid`]: a field of the request, or the key. [`Error::Conflict`]: the key was used with another request.
+/// [`Error::Invalid`]: a field of the request, or the idempotency key. [`Error::Conflict`]: the key was used with another
+/// request.
 /// [`Error::Draining`].
-pub async fn submit(app: &App, request: JobRequest, key: Option<String>) -> Result<(Job, bool), Error> {
-    if let Some(key) = &key {
+pub async fn submit(app: &App, request: JobRequest, idempotency_key: Option<String>) -> Result<(Job, bool), Error> {
+    if let Some(key) = &idempotency_key {
         let printable = key.bytes().all(|b| (b' '..=b'~').contains(&b));
         if key.is_empty() || key.len() > 255 || !printable {
             return Err(Invalid::new("idempotency_key", format!("{key:?}"), "1 to 255 printable ASCII characters").into());
@@ -33,13 +34,13 @@ pub async fn submit(app: &App, request: JobRequest, key: Option<String>) -> Resu
     }
     app.admit()?;
     let id = JobId(Uuid::now_v7());
-    let idempotency = key.map(|key| (key, digest));
+    let idempotency = idempotency_key.map(|key| (key, digest));
     let new = NewJob { id, spec, now: app.clock.now(), idempotency };
     match app.store.submit_job(new).await? {
         SubmitResult::Created(job) => {
             tracing::info!(job = %job.id, algorithm = ?job.spec.config.algorithm, threads = job.spec.threads, "job submitted");
             metrics::counter!("qedgix_jobs_submitted_total").increment(1);
-            app.scheduler.job_changed(job.number);
+            app.scheduler.job_changed(job.row_id);
             Ok((job, true))
         }
         SubmitResult::Existing(job) => Ok((job, false)),
@@ -67,9 +68,9 @@ pub async fn get(app: &App, id: &str) -> Result<Job, Error> {
 /// # Errors
 /// [`Error::Invalid`]: the page size is over 1000, or the token is invalid.
 pub async fn list(app: &App, state: Option<JobState>, page: &PageRequest) -> Result<Page<JobSummary>, Error> {
-    let (limit, before) = (page.usual_limit()?, page.position(number)?);
+    let (limit, before) = (page.usual_limit()?, page.parse_token(parse_number)?);
     let (jobs, more) = app.store.job_summaries(state, before, limit, paging::MAX_BYTES).await?;
-    Ok(Page::new(jobs, more, |job| job.number.to_string()))
+    Ok(Page::new(jobs, more, |job| job.row_id.to_string()))
 }
 
 /// Applies `action` to the job `id`. A running job gets a pending action and changes when its worker has stopped.
@@ -83,7 +84,7 @@ pub async fn change(app: &App, id: &str, action: JobAction) -> Result<Job, Error
     match app.store.change_job(parse_id(id)?, action, app.clock.now()).await? {
         ActionResult::Accepted(job) => {
             tracing::info!(job = %job.id, state = %job.state, ?action, "job changed");
-            app.scheduler.job_changed(job.number);
+            app.scheduler.job_changed(job.row_id);
             Ok(*job)
         }
         ActionResult::NotFound => Err(Error::not_found("job", id)),
@@ -110,7 +111,7 @@ pub async fn change(app: &App, id: &str, action: JobAction) -> Result<Job, Error
 /// # Errors
 /// [`Error::NotFound`]: there is no such job. [`Error::Invalid`]: the page size is over 100 000, or the token is invalid.
 pub async fn metrics(app: &App, id: &str, name: Option<&str>, page: &PageRequest) -> Result<Page<MetricRow>, Error> {
-    let (limit, after) = (page.limit(10_000, 100_000)?, page.position(parse_metric_cursor)?);
+    let (limit, after) = (page.limit(10_000, 100_000)?, page.parse_token(parse_metric_cursor)?);
     let job = get(app, id).await?;
     let mut rows = app.store.metrics(job.id, name, after.as_ref(), limit as u32 + 1).await?;
     let more = rows.len() > limit;
@@ -120,7 +121,7 @@ pub async fn metrics(app: &App, id: &str, name: Option<&str>, page: &PageRequest
 
 fn parse_metric_cursor(cursor: &str) -> Option<MetricCursor> {
     let (name, step) = cursor.rsplit_once('@')?;
-    let step = number(step)? as u64;
+    let step = parse_number(step)? as u64;
     Some(MetricCursor { name: name.to_owned(), step }).filter(|_| is_metric_name(name))
 }
 
@@ -141,7 +142,7 @@ pub async fn logs(app: &App, id: &str) -> Result<Vec<Attempt>, Error> {
     let job = get(app, id).await?;
     let mut attempts = app.store.attempts(job.id).await?;
     for attempt in &mut attempts {
-        if let Some(log) = app.scheduler.live_log(job.number, attempt.number) {
+        if let Some(log) = app.scheduler.live_log(job.row_id, attempt.number) {
             attempt.log = log;
         }
     }

@@ -16,7 +16,7 @@ pub mod worker;
 use std::sync::Arc;
 
 pub use error::Error;
-pub use events::Watchers;
+pub use events::WatchLimit;
 pub use paging::{Page, PageRequest};
 
 use crate::clock::Clock;
@@ -45,7 +45,7 @@ pub struct App {
     /// The limit of uploads of checkpoints.
     pub uploads: policies::UploadLimit,
     /// Limits of watches of jobs.
-    pub watchers: Watchers,
+    pub watchers: WatchLimit,
     /// Wall time and monotonic time.
     pub clock: Clock,
     /// Whether the server is shutting down.
@@ -67,12 +67,12 @@ impl From<crate::serving::Error> for Error {
         use crate::serving::Error as E;
         match error {
             E::Invalid(e) => Self::Invalid(e),
-            E::Unknown { what, id } => Self::NotFound { what, id },
+            E::NotFound { what, id } => Self::NotFound { what, id },
             E::Precondition { code, message } => Self::Precondition { code, message },
-            E::Exists(message) => Self::Conflict { code: ErrorCode::AlreadyExists, message },
+            E::Conflict(message) => Self::Conflict { code: ErrorCode::AlreadyExists, message },
             E::Busy(message) => Self::busy(message),
             E::Deadline(place) => Self::Deadline(place),
-            E::Fault(cause) => Self::internal(cause),
+            E::Internal(cause) => Self::internal(cause),
         }
     }
 }

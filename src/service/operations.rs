@@ -1,4 +1,4 @@
-//! State of the server for operators: health of its components, readiness, and metrics of its present load.
+//! State of the server for operators: health of its components, readiness, and gauges of the current load.
 
 use std::time::Duration;
 
@@ -11,9 +11,9 @@ const DATABASE_TIMEOUT: Duration = Duration::from_secs(2);
 /// Health of the server's components.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ServerHealth {
-    /// The database answers.
+    /// The database responds.
     pub database: bool,
-    /// There is a policy.
+    /// At least one policy version exists, loaded or not.
     pub policies: bool,
     /// The queue of jobs is readable, so jobs are started.
     pub scheduler: bool,
@@ -47,14 +47,14 @@ async fn ping_database(app: &App) -> Result<(), String> {
 }
 
 impl App {
-    /// Checks that the server is ready: it is not draining, a policy is loaded, and the database answers.
+    /// Checks that the server is ready: it is not draining, a policy exists, and the database responds.
     ///
     /// # Errors
     /// [`Error::Draining`], or [`Error::Unavailable`] with what is missing.
     pub async fn ready(&self) -> Result<(), Error> {
         self.admit()?;
         if self.registry.is_empty() {
-            return Err(Error::Unavailable("no policy is loaded"));
+            return Err(Error::Unavailable("there is no policy"));
         }
         ping_database(self).await.map_err(|reason| {
             tracing::warn!(reason, "the database does not answer");
@@ -70,7 +70,7 @@ pub struct ServerMetrics {
     pub sessions: usize,
     /// Hosted environments.
     pub environments: usize,
-    /// Policy versions.
+    /// Policy versions, loaded or not.
     pub policy_versions: usize,
     /// Fleets in the engine's queue.
     pub engine_queue: usize,

@@ -12,7 +12,7 @@ pub(super) const MAX_BYTES: usize = 1 << 20;
 /// The page of a list to return.
 #[derive(Clone, Debug, Default)]
 pub struct PageRequest {
-    /// At most this many items; 0: the default of the list.
+    /// Maximum number of items; 0: the default of the list.
     pub size: u32,
     /// The token that the previous page returned; empty: the first page.
     pub token: String,
@@ -39,21 +39,24 @@ impl PageRequest {
         self.limit(100, 1000)
     }
 
-    /// The token, read by `parse`; absent for the first page.
-    pub(super) fn position<T>(&self, parse: impl FnOnce(&str) -> Option<T>) -> Result<Option<T>, Invalid> {
+    /// Parses the token with `parse`. Returns `None` for the first page.
+    ///
+    /// # Errors
+    /// [`Invalid`] if `parse` rejects the token.
+    pub(super) fn parse_token<T>(&self, parse: impl FnOnce(&str) -> Option<T>) -> Result<Option<T>, Invalid> {
         let invalid = || Invalid::new("page_token", format!("{:?}", self.token), "the next_page_token of the previous page");
         if self.token.is_empty() { Ok(None) } else { parse(&self.token).ok_or_else(invalid).map(Some) }
     }
 }
 
 impl<T> Page<T> {
-    /// A page of `items`; `more` tells whether the list continues after them, `token` names the last item.
+    /// A page of `items`. `more`: whether the list continues after them. `token` returns the token of the page after an item.
     pub(super) fn new(items: Vec<T>, more: bool, token: impl Fn(&T) -> String) -> Self {
         let next_token = items.last().filter(|_| more).map(token).unwrap_or_default();
         Self { items, next_token }
     }
 
-    /// The same of items of any size: the page ends before it exceeds [`MAX_BYTES`].
+    /// As [`Page::new`], for items whose sizes differ: the page ends before it exceeds [`MAX_BYTES`].
     pub(super) fn bounded(mut items: Vec<T>, more: bool, bytes: impl Fn(&T) -> usize, token: impl Fn(&T) -> String) -> Self {
         let mut total = 0;
         let excess = items.iter().position(|item| {
@@ -72,8 +75,8 @@ impl<T> Page<T> {
     }
 }
 
-/// The position that digits stand for.
-pub(super) fn number(text: &str) -> Option<i64> {
+/// Parses a row id, or another number of digits alone.
+pub(super) fn parse_number(text: &str) -> Option<i64> {
     let digits = text.bytes().all(|b| b.is_ascii_digit());
     text.parse().ok().filter(|_| digits)
 }
@@ -94,7 +97,7 @@ pub(super) fn json_bytes(document: &impl Serialize) -> usize {
     }
 
     let mut counter = Counter(0);
-    // A counter accepts everything; a document that is no JSON is not sent either.
+    // The counter never fails. A document that cannot be serialized cannot be sent either.
     let _ = serde_json::to_writer(&mut counter, document);
     counter.0
 }

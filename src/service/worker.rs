@@ -9,15 +9,15 @@ use crate::error_code::ErrorCode;
 use crate::invalid::{Invalid, in_range};
 use crate::jobs::{Directive, equal_secrets, token_digest};
 use crate::store::{
-    AttemptResult, EndedAttempt, JobId, Lease, Metric, NewCheckpoint, PartialSnapshot, PendingAction, Snapshot, is_metric_name,
+    EndedAttempt, JobId, Lease, Metric, NewCheckpoint, PartialSnapshot, PendingAction, Snapshot, WorkerResult, is_metric_name,
 };
 use crate::train_config::TrainConfig;
 
-/// Largest chunk of an upload, in bytes.
+/// Maximum size of a chunk of an upload, in bytes.
 pub const MAX_CHUNK: usize = 1 << 20;
-/// Largest checkpoint, in bytes.
+/// Maximum size of a checkpoint, in bytes.
 const MAX_CHECKPOINT: u64 = 256 << 20;
-/// Most metrics in one report.
+/// Maximum number of metrics in one report.
 const MAX_METRICS: usize = 10_000;
 
 /// The credentials in the metadata of a call.
@@ -56,19 +56,19 @@ pub async fn authenticate(app: &App, credentials: &Credentials) -> Result<Lease,
         return Err(WRONG);
     }
     if !record.active {
-        return Err(fenced(record.lease));
+        return Err(attempt_ended(record.lease));
     }
     app.scheduler.record_heartbeat(record.lease);
     Ok(record.lease)
 }
 
-fn fenced(lease: Lease) -> Error {
-    let message = format!("attempt {} of job {} has ended", lease.attempt, lease.id);
+fn attempt_ended(lease: Lease) -> Error {
+    let message = format!("attempt {} of job {} has ended", lease.attempt, lease.job_id);
     Error::Precondition { code: ErrorCode::AttemptOver, message }
 }
 
 fn require_active(active: bool, lease: Lease) -> Result<(), Error> {
-    if active { Ok(()) } else { Err(fenced(lease)) }
+    if active { Ok(()) } else { Err(attempt_ended(lease)) }
 }
 
 /// The task of an attempt.
@@ -76,12 +76,12 @@ fn require_active(active: bool, lease: Lease) -> Result<(), Error> {
 /// # Errors
 /// [`Error::Precondition`] when the job was deleted.
 pub async fn fetch(app: &App, lease: Lease) -> Result<AttemptTask, Error> {
-    let job = app.store.job(lease.id).await?.ok_or_else(|| fenced(lease))?;
+    let job = app.store.job(lease.job_id).await?.ok_or_else(|| attempt_ended(lease))?;
     let config = app.scheduler.config();
     Ok(AttemptTask {
         threads: job.spec.threads.min(config.cpu_budget),
         config: job.spec.config,
-        snapshot: app.store.snapshot(lease.id).await?,
+        snapshot: app.store.snapshot(lease.job_id).await?,
         snapshot_every: config.snapshot_every,
     })
 }
@@ -91,15 +91,15 @@ pub async fn fetch(app: &App, lease: Lease) -> Result<AttemptTask, Error> {
 /// # Errors
 /// [`Error::NotFound`] when the job has none.
 pub async fn snapshot(app: &App, lease: Lease) -> Result<Snapshot, Error> {
-    app.store.snapshot(lease.id).await?.ok_or_else(|| Error::not_found("snapshot", lease.id.to_string()))
+    app.store.snapshot(lease.job_id).await?.ok_or_else(|| Error::not_found("snapshot", lease.job_id.to_string()))
 }
 
-/// Chunk `number` of a snapshot; `None` after the last.
+/// Chunk `index` of a snapshot; `None` after the last.
 ///
 /// # Errors
 /// [`Error::Internal`] when the database fails.
-pub async fn snapshot_chunk(app: &App, snapshot: &Snapshot, number: u32) -> Result<Option<Vec<u8>>, Error> {
-    Ok(app.store.snapshot_chunk(snapshot.id, number).await?)
+pub async fn snapshot_chunk(app: &App, snapshot: &Snapshot, index: u32) -> Result<Option<Vec<u8>>, Error> {
+    Ok(app.store.snapshot_chunk(snapshot.id, index).await?)
 }
 
 /// Stores metrics and progress in one transaction.
@@ -128,7 +128,7 @@ fn check_step(field: &str, step: u64) -> Result<(), Invalid> {
 /// # Errors
 /// [`Error::Precondition`] when the job was deleted.
 pub async fn heartbeat(app: &App, lease: Lease) -> Result<Directive, Error> {
-    let job = app.store.job(lease.id).await?.ok_or_else(|| fenced(lease))?;
+    let job = app.store.job(lease.job_id).await?.ok_or_else(|| attempt_ended(lease))?;
     Ok(app.scheduler.directive(job.pending_action))
 }
 
@@ -136,39 +136,39 @@ pub async fn heartbeat(app: &App, lease: Lease) -> Result<Directive, Error> {
 ///
 /// # Errors
 /// [`Error::Precondition`] when the attempt has ended, [`Error::Internal`] when the database fails.
-pub async fn finish(app: &App, lease: Lease, result: AttemptResult) -> Result<(), Error> {
+pub async fn finish(app: &App, lease: Lease, result: WorkerResult) -> Result<(), Error> {
     let (result, policy) = match result {
-        AttemptResult::Succeeded => publish_best(app, lease).await?,
-        AttemptResult::Stopped => (AttemptResult::Stopped, None),
-        AttemptResult::Failed { reason, permanent } => {
-            (AttemptResult::Failed { reason: reason.chars().take(2000).collect(), permanent }, None)
+        WorkerResult::Succeeded => publish_best(app, lease).await?,
+        WorkerResult::Stopped => (WorkerResult::Stopped, None),
+        WorkerResult::Failed { reason, permanent } => {
+            (WorkerResult::Failed { reason: reason.chars().take(2000).collect(), permanent }, None)
         }
     };
     let max_attempts = app.scheduler.config().max_attempts;
     let ended = EndedAttempt { lease, result: &result, policy: policy.as_deref(), max_attempts, now: app.clock.now() };
-    let job = app.store.end_attempt(ended).await?.ok_or_else(|| fenced(lease))?;
+    let job = app.store.end_attempt(ended).await?.ok_or_else(|| attempt_ended(lease))?;
     tracing::info!(job = %job.id, attempt = lease.attempt, state = %job.state, reason = job.reason, "attempt ended");
-    app.scheduler.job_changed(lease.job);
+    app.scheduler.job_changed(lease.job_row);
     Ok(())
 }
 
 /// Publishes the best policy of a job, unless the job is being cancelled. Publishing the same policy again changes nothing,
 /// so a server that stops between publishing and ending the attempt loses nothing.
-async fn publish_best(app: &App, lease: Lease) -> Result<(AttemptResult, Option<String>), Error> {
-    let job = app.store.job(lease.id).await?.ok_or_else(|| fenced(lease))?;
+async fn publish_best(app: &App, lease: Lease) -> Result<(WorkerResult, Option<String>), Error> {
+    let job = app.store.job(lease.job_id).await?.ok_or_else(|| attempt_ended(lease))?;
     if job.pending_action == Some(PendingAction::Cancel) {
-        return Ok((AttemptResult::Stopped, None));
+        return Ok((WorkerResult::Stopped, None));
     }
-    let Some(checkpoint) = app.store.best_checkpoint(lease.id).await? else { return Ok((AttemptResult::Succeeded, None)) };
+    let Some(checkpoint) = app.store.best_checkpoint(lease.job_id).await? else { return Ok((WorkerResult::Succeeded, None)) };
     // The end of an id is random. Its beginning is the time, which jobs submitted together share.
-    let id = lease.id.to_string();
+    let id = lease.job_id.to_string();
     let name = job.spec.name.unwrap_or_else(|| format!("job-{}", &id[id.len() - 8..]));
-    match policies::publish(app, &name, checkpoint).await {
-        Ok(policy) => Ok((AttemptResult::Succeeded, Some(policy.to_string()))),
+    match policies::publish_bytes(app, &name, checkpoint).await {
+        Ok(policy) => Ok((WorkerResult::Succeeded, Some(policy.to_string()))),
         // Another attempt would fail with the same checkpoint.
         Err(Error::Invalid(e)) => {
             let reason = format!("the policy cannot be published: {e}");
-            Ok((AttemptResult::Failed { reason, permanent: true }, None))
+            Ok((WorkerResult::Failed { reason, permanent: true }, None))
         }
         Err(e) => Err(e),
     }
@@ -251,7 +251,7 @@ impl SnapshotUpload {
     pub async fn begin(app: &App, lease: Lease, step: u64, header: UploadHeader) -> Result<Self, Error> {
         check_step("header.step", step)?;
         in_range("header.size", header.size, 1..=i64::MAX as u64)?;
-        let partial = app.store.begin_snapshot(lease, step, app.clock.now()).await?.ok_or_else(|| fenced(lease))?;
+        let partial = app.store.begin_snapshot(lease, step, app.clock.now()).await?.ok_or_else(|| attempt_ended(lease))?;
         Ok(Self { lease, partial, digest: UploadDigest::new(header) })
     }
 
@@ -311,6 +311,6 @@ impl CheckpointUpload {
     /// [`Error::Invalid`] when size or digest differ from the header, [`Error::Precondition`] when the attempt has ended.
     pub async fn complete(self, app: &App) -> Result<Uuid, Error> {
         self.digest.verify()?;
-        app.store.keep_checkpoint(self.lease, self.new, app.clock.now()).await?.ok_or_else(|| fenced(self.lease))
+        app.store.store_checkpoint(self.lease, self.new, app.clock.now()).await?.ok_or_else(|| attempt_ended(self.lease))
     }
 }

@@ -1,4 +1,4 @@
-//! The errors of `serving`. `service::Error` has a variant for each.
+//! The errors of `serving`. `service::Error` has variants of the same names.
 
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
@@ -11,7 +11,7 @@ pub enum Error {
     Invalid(#[from] Invalid),
     /// The resource does not exist and did not expire recently.
     #[error("no {what} {id:?}")]
-    Unknown {
+    NotFound {
         /// `policy`, `session`, ...
         what: &'static str,
         /// The name requested.
@@ -27,7 +27,7 @@ pub enum Error {
     },
     /// The resource exists and differs from the requested one.
     #[error("{0}")]
-    Exists(String),
+    Conflict(String),
     /// A limit is reached; the caller may retry later.
     #[error("{0}")]
     Busy(String),
@@ -36,13 +36,13 @@ pub enum Error {
     Deadline(&'static str),
     /// The server failed: a policy panicked, or the engine lost a request.
     #[error("{0}")]
-    Fault(String),
+    Internal(String),
 }
 
 impl Error {
     /// There is no `what` with this `id`.
-    pub fn unknown(what: &'static str, id: impl Into<String>) -> Self {
-        Self::Unknown { what, id: id.into() }
+    pub fn not_found(what: &'static str, id: impl Into<String>) -> Self {
+        Self::NotFound { what, id: id.into() }
     }
 
     /// The resource is in a state that does not allow the operation.

@@ -6,10 +6,10 @@ pub mod bundled;
 mod engine;
 mod environments;
 mod error;
-mod fleet;
+mod fleet_ids;
+mod fleet_input;
 pub(crate) mod ids;
 pub(crate) mod nodes;
-mod observation;
 mod recurrent_state;
 mod reference;
 mod registry;
@@ -22,9 +22,9 @@ pub use environments::{
     EnvironmentStep, Environments, EnvironmentsConfig, EpisodeCursor, FinishedEpisode,
 };
 pub use error::Error;
-pub use fleet::Fleet;
+pub use fleet_ids::FleetIds;
+pub use fleet_input::{FleetInput, Graph, GraphForm, MAX_DETECTIONS, MAX_NODES, ReportedDetection, Scene, SceneOrGraph};
 pub use nodes::{Node, NodeDetection};
-pub use observation::{Graph, GraphForm, MAX_DETECTIONS, MAX_NODES, Observation, ReportedDetection, Scene, SceneOrGraph};
 pub use recurrent_state::RecurrentState;
 pub use reference::{PolicyRef, PolicySpec, VersionSelector, check_name};
 pub use registry::{LoadedPolicy, PolicyDetails, PolicyInfo, PolicyKind, Registry};

@@ -1,22 +1,22 @@
-//! Nodes and scenes as callers describe them, whatever the transport, to an [`Observation`]: ids resolved, AoI gathered, detections
-//! made symmetric.
+//! Converts nodes and scenes of all transports to a [`FleetInput`]: resolves ids, collects the AoI of users, and makes detections
+//! symmetric.
 //!
 //! The adjacency matrix is symmetric (docs/model.md, "Graph"): a detection that one side reports is mirrored; the reports of both
 //! sides have to be each other's negation.
 
 use std::collections::HashMap;
 
-use super::ids::{Ids, check_counts, check_distinct, check_nodes, node_indices, request_order};
-use super::{Fleet, Graph, GraphForm, Observation, ReportedDetection, Scene, SceneOrGraph};
+use super::ids::{Ids, canonical_of_request, check_counts, check_distinct, check_nodes, node_indices};
+use super::{FleetIds, FleetInput, Graph, GraphForm, ReportedDetection, Scene, SceneOrGraph};
 use crate::env::Point;
 use crate::invalid::{Invalid, in_range};
 
-/// Largest coordinate of an absolute position, in units of the square's side.
+/// Maximum coordinate of an absolute position, in units of the square's side.
 const MAX_COORDINATE: f64 = 1e4;
-/// Largest AoI, in slots.
+/// Maximum AoI, in slots.
 const MAX_AOI: f64 = 1e6;
-/// Two reports of one pair may differ by this much, because callers may compute in f32.
-const AGREEMENT: f64 = 1e-5;
+/// Maximum difference of the two reports of one pair of nodes, because callers may compute in f32.
+const REPORT_TOLERANCE: f64 = 1e-5;
 
 /// A node of a graph, with an iterator of its detections.
 #[derive(Clone, Debug)]
@@ -45,15 +45,15 @@ pub struct NodeDetection {
 }
 
 /// Checks a number.
-pub(crate) fn finite(field: impl FnOnce() -> String, value: f64) -> Result<f64, Invalid> {
+pub(crate) fn check_finite(field: impl FnOnce() -> String, value: f64) -> Result<f64, Invalid> {
     if value.is_finite() { Ok(value) } else { Err(Invalid::new(field(), value, "a finite number")) }
 }
 
 /// Checks an absolute position.
-pub(crate) fn point(field: impl Fn() -> String, [x, y]: Point) -> Result<Point, Invalid> {
+pub(crate) fn check_point(field: impl Fn() -> String, [x, y]: Point) -> Result<Point, Invalid> {
     for (axis, value) in [("x", x), ("y", y)] {
         if !(-MAX_COORDINATE..=MAX_COORDINATE).contains(&value) {
-            finite(|| format!("{}.{axis}", field()), value)?;
+            check_finite(|| format!("{}.{axis}", field()), value)?;
             in_range(&format!("{}.{axis}", field()), value, -MAX_COORDINATE..=MAX_COORDINATE)?;
         }
     }
@@ -61,16 +61,16 @@ pub(crate) fn point(field: impl Fn() -> String, [x, y]: Point) -> Result<Point, 
 }
 
 /// Checks an AoI.
-pub(crate) fn aoi(field: impl Fn() -> String, value: f64) -> Result<f32, Invalid> {
+pub(crate) fn check_aoi(field: impl Fn() -> String, value: f64) -> Result<f32, Invalid> {
     if !(0.0..=MAX_AOI).contains(&value) {
-        finite(&field, value)?;
+        check_finite(&field, value)?;
         in_range(&field(), value, 0.0..=MAX_AOI)?;
     }
     Ok(value as f32)
 }
 
-impl Observation {
-    /// The observation of a scene: id and position of each UAV; id, position and AoI of each user.
+impl FleetInput {
+    /// The input of a scene: id and position of each UAV; id, position and AoI of each user.
     ///
     /// # Errors
     /// A field that is not valid, named as `scene.users[2].aoi`.
@@ -82,15 +82,15 @@ impl Observation {
         let mut positions = Vec::with_capacity(uavs.len());
         let mut ids = Ids::with_capacity(uavs.len());
         for (i, (id, position)) in uavs.enumerate() {
-            positions.push(point(|| format!("scene.uavs[{i}]"), position)?);
+            positions.push(check_point(|| format!("scene.uavs[{i}]"), position)?);
             ids.push(|| format!("scene.uavs[{i}].id"), id, i)?;
         }
         let (uav_ids, uav_places) = ids.sorted();
         let mut states = Vec::with_capacity(users.len());
         let mut ids = Ids::with_capacity(users.len());
         for (i, (id, position, age)) in users.enumerate() {
-            let position = point(|| format!("scene.users[{i}]"), position)?;
-            states.push((position, aoi(|| format!("scene.users[{i}].aoi"), age)?));
+            let position = check_point(|| format!("scene.users[{i}]"), position)?;
+            states.push((position, check_aoi(|| format!("scene.users[{i}].aoi"), age)?));
             ids.push(|| format!("scene.users[{i}].id"), id, i)?;
         }
         let (user_ids, user_places) = ids.sorted();
@@ -98,17 +98,17 @@ impl Observation {
             format!("scene.{}[{place}].id", if is_uav { "uavs" } else { "users" })
         })?;
         Ok(Self {
-            uav_order: request_order(&uav_places),
+            canonical_of_request: canonical_of_request(&uav_places),
             content: SceneOrGraph::Scene(Scene {
                 uavs: uav_places.iter().map(|&place| positions[place as usize]).collect(),
                 users: user_places.iter().map(|&place| states[place as usize].0).collect(),
                 aoi: user_places.iter().map(|&place| states[place as usize].1).collect(),
             }),
-            fleet: Fleet { uavs: uav_ids, users: user_ids },
+            fleet: FleetIds { uavs: uav_ids, users: user_ids },
         })
     }
 
-    /// The observation of a graph.
+    /// The input of a graph.
     ///
     /// # Errors
     /// A field that is not valid, named as `graph.nodes[2].id`; detections that contradict each other.
@@ -131,7 +131,11 @@ impl Observation {
             }
         }
         let graph = mirror(builder.graph)?;
-        Ok(Self { uav_order: request_order(&uav_places), content: SceneOrGraph::Graph(graph), fleet: Fleet { uavs, users } })
+        Ok(Self {
+            canonical_of_request: canonical_of_request(&uav_places),
+            content: SceneOrGraph::Graph(graph),
+            fleet: FleetIds { uavs, users },
+        })
     }
 }
 
@@ -147,8 +151,8 @@ impl Builder {
             positions: vec![None; uavs],
             aoi: vec![0.0; users],
             detections: Vec::with_capacity(uavs + users),
-            left_out: vec![false; users],
-            places: Vec::with_capacity(uavs + users),
+            without_detections: vec![false; users],
+            request_of_canonical: Vec::with_capacity(uavs + users),
             form: GraphForm::Nodes,
         };
         Self { graph, has_aoi: vec![false; users] }
@@ -162,7 +166,7 @@ impl Builder {
         node: Node<D>,
         indices: &HashMap<&str, u32>,
     ) -> Result<(), Invalid> {
-        self.graph.places.push(place);
+        self.graph.request_of_canonical.push(place);
         let uavs = self.graph.positions.len();
         let path = || format!("graph.nodes[{place}]");
         if let Some(user) = index.checked_sub(uavs) {
@@ -173,13 +177,13 @@ impl Builder {
                 let expected = "no value, because only UAVs have positions in a graph";
                 return Err(Invalid::new(format!("{}.position", path()), format!("({x}, {y})"), expected));
             }
-            self.graph.left_out[user] = node.detections.len() == 0;
+            self.graph.without_detections[user] = node.detections.len() == 0;
         } else {
             if let Some(value) = node.aoi {
                 return Err(Invalid::new(format!("{}.aoi", path()), value, "no value, because only users have an AoI"));
             }
             if let Some(position) = node.position {
-                self.graph.positions[index] = Some(point(|| format!("{}.position", path()), position)?);
+                self.graph.positions[index] = Some(check_point(|| format!("{}.position", path()), position)?);
             }
         }
         let mut list = Vec::with_capacity(node.detections.len());
@@ -192,18 +196,18 @@ impl Builder {
             if target as usize == index {
                 return Err(Invalid::new(field("target_id"), format!("{target_id:?}"), "the id of another node"));
             }
-            let rel = [finite(|| field("rel_x"), rel[0])?, finite(|| field("rel_y"), rel[1])?];
+            let rel = [check_finite(|| field("rel_x"), rel[0])?, check_finite(|| field("rel_y"), rel[1])?];
             match ((target as usize).checked_sub(uavs), aoi) {
                 (Some(user), Some(value)) => self.set_aoi(user, value, || field("aoi"))?,
                 (Some(_), None) => return Err(Invalid::missing(field("aoi"), "the AoI of the user in slots")),
                 (None, Some(value)) => return Err(Invalid::new(field("aoi"), value, "no value, because the target is a UAV")),
                 (None, None) => {}
             }
-            list.push(ReportedDetection { target, rel, place: i as u32, mirrored: false });
+            list.push(ReportedDetection { target, rel, request_index: i as u32, mirrored: false });
         }
         list.sort_by_key(|s| s.target);
         if let Some(pair) = list.windows(2).find(|pair| pair[0].target == pair[1].target) {
-            let field = format!("{}.detections[{}].target_id", path(), pair[1].place);
+            let field = format!("{}.detections[{}].target_id", path(), pair[1].request_index);
             let id = indices.iter().find(|(_, target)| **target == pair[1].target).map_or("", |(id, _)| id);
             return Err(Invalid::new(field, format!("{id:?}"), "one detection per target"));
         }
@@ -212,7 +216,7 @@ impl Builder {
     }
 
     fn set_aoi(&mut self, user: usize, value: f64, field: impl Fn() -> String) -> Result<(), Invalid> {
-        let value = aoi(&field, value)?;
+        let value = check_aoi(&field, value)?;
         let known = self.graph.aoi[user];
         if self.has_aoi[user] && known.to_bits() != value.to_bits() {
             return Err(Invalid::new(field(), value, format!("{known}, the AoI of the same user elsewhere in the graph")));
@@ -231,13 +235,13 @@ pub(crate) fn mirror(mut graph: Graph) -> Result<Graph, Invalid> {
             let back = [-detection.rel[0], -detection.rel[1]];
             let other = &graph.detections[detection.target as usize];
             let Ok(at) = other.binary_search_by_key(&(node as u32), |s| s.target) else {
-                let back = ReportedDetection { target: node as u32, rel: back, place: 0, mirrored: true };
+                let back = ReportedDetection { target: node as u32, rel: back, request_index: 0, mirrored: true };
                 mirrored.push((detection.target as usize, back));
                 continue;
             };
             let [x, y] = other[at].rel;
-            if (x - back[0]).abs() > AGREEMENT || (y - back[1]).abs() > AGREEMENT {
-                let field = graph.rel_field(detection.target as usize, other[at].place);
+            if (x - back[0]).abs() > REPORT_TOLERANCE || (y - back[1]).abs() > REPORT_TOLERANCE {
+                let field = graph.rel_field(detection.target as usize, other[at].request_index);
                 let expected =
                     format!("about ({}, {}), the negation of the position that the other node reports", back[0], back[1]);
                 return Err(Invalid::new(field, format!("({x}, {y})"), expected));

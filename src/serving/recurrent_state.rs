@@ -7,7 +7,7 @@
 use bytes::{Buf, BufMut, Bytes, BytesMut};
 use sha2::{Digest, Sha256};
 
-use super::Fleet;
+use super::FleetIds;
 use crate::invalid::Invalid;
 
 const MAGIC: &[u8; 4] = b"QXRS";
@@ -26,7 +26,7 @@ pub struct RecurrentState {
     pub uavs: u32,
     /// N, the number of users.
     pub users: u32,
-    /// Fingerprint of the ids ([`Fleet::fingerprint`]).
+    /// Fingerprint of the ids ([`FleetIds::fingerprint`]).
     pub fleet: [u8; 16],
     /// The policy's memory.
     pub memory: Vec<f32>,
@@ -34,7 +34,7 @@ pub struct RecurrentState {
 
 impl RecurrentState {
     /// The memory of `fleet` before `step`.
-    pub fn new(digest: [u8; 32], step: u64, fleet: &Fleet, memory: Vec<f32>) -> Self {
+    pub fn new(digest: [u8; 32], step: u64, fleet: &FleetIds, memory: Vec<f32>) -> Self {
         let (uavs, users) = (fleet.uavs.len() as u32, fleet.users.len() as u32);
         Self { digest, step, uavs, users, fleet: fleet.fingerprint(), memory }
     }
@@ -94,7 +94,7 @@ mod tests {
 
     #[test]
     fn changed_or_missing_byte_is_rejected() {
-        let fleet = Fleet { uavs: vec!["a".into(), "b".into()], users: vec!["u".into()] };
+        let fleet = FleetIds { uavs: vec!["a".into(), "b".into()], users: vec!["u".into()] };
         let state = RecurrentState::new([7; 32], 3, &fleet, vec![0.5, -1.0, f32::NAN]);
         let bytes = state.encode();
         let back = RecurrentState::decode(&bytes).unwrap();

@@ -5,7 +5,7 @@ use std::str::FromStr;
 
 use crate::invalid::Invalid;
 
-/// Longest name of a policy or alias, in characters.
+/// Maximum length of the name of a policy or alias, in characters.
 const MAX_NAME: usize = 64;
 
 /// Selects a version of a policy.

@@ -31,7 +31,7 @@ pub struct PolicyInfo {
     pub reference: PolicyRef,
     /// Origin.
     pub kind: PolicyKind,
-    /// A sentence for users of the API.
+    /// A sentence for people.
     pub description: String,
     /// M, if the policy accepts only this number of UAVs.
     pub uavs: Option<u32>,
@@ -39,7 +39,7 @@ pub struct PolicyInfo {
     pub users: Option<u32>,
     /// A, the number of headings.
     pub headings: usize,
-    /// What observations have to contain.
+    /// The input that the policy requires.
     pub needs: RequiredInput,
     /// d, the detection range.
     pub detection_range: f64,
@@ -55,8 +55,8 @@ pub struct PolicyInfo {
 pub struct LoadedPolicy {
     /// Its description.
     pub info: Arc<PolicyInfo>,
-    /// The policy.
-    pub policy: Arc<dyn Policy>,
+    /// Computes headings.
+    pub implementation: Arc<dyn Policy>,
 }
 
 impl LoadedPolicy {
@@ -75,7 +75,7 @@ impl LoadedPolicy {
             metrics: Value::Null,
             created_at,
         };
-        Self { info: Arc::new(info), policy }
+        Self { info: Arc::new(info), implementation: policy }
     }
 }
 
@@ -214,44 +214,45 @@ impl Registry {
     /// The version that `spec` resolves to.
     ///
     /// # Errors
-    /// [`Error::Unknown`], or `policy_unloaded`.
+    /// [`Error::NotFound`], or `policy_unloaded`.
     pub fn resolve(&self, spec: &PolicySpec) -> Result<Arc<LoadedPolicy>, Error> {
         let entries = self.read();
         let found = entries.get(&spec.name).and_then(|entry| entry.resolve(&spec.version));
-        found.ok_or_else(|| Error::unknown("policy", spec.to_string()))?.loaded()
+        found.ok_or_else(|| Error::not_found("policy", spec.to_string()))?.loaded()
     }
 
-    /// The version with this digest, for an episode that was begun with `spec`. Searches the version that `spec` resolves to,
-    /// and the other versions of its name unless `spec` has a version number. None if no such version has this digest.
+    /// Finds the version with this digest, so that an episode stays on the version that it began with. If `spec` has a version
+    /// number, only that version is considered. Otherwise all versions of the name are, first the one that `spec` resolves to
+    /// now. Returns `None` if none has this digest.
     ///
     /// # Errors
-    /// [`Error::Unknown`] if `spec` does not resolve, or `policy_unloaded`.
-    pub fn pinned(&self, spec: &PolicySpec, digest: &[u8; 32]) -> Result<Option<Arc<LoadedPolicy>>, Error> {
+    /// [`Error::NotFound`] if `spec` does not resolve, or `policy_unloaded`.
+    pub fn find_by_digest(&self, spec: &PolicySpec, digest: &[u8; 32]) -> Result<Option<Arc<LoadedPolicy>>, Error> {
         let matches = |version: &&VersionEntry| version.info.reference.digest == *digest;
         let entries = self.read();
         let found = entries.get(&spec.name).and_then(|entry| Some((entry, entry.resolve(&spec.version)?)));
-        let (entry, now) = found.ok_or_else(|| Error::unknown("policy", spec.to_string()))?;
+        let (entry, current) = found.ok_or_else(|| Error::not_found("policy", spec.to_string()))?;
         let others = || entry.versions.values().filter(|_| !matches!(spec.version, VersionSelector::Version(_))).find(matches);
-        Some(now).filter(matches).or_else(others).map(VersionEntry::loaded).transpose()
+        Some(current).filter(matches).or_else(others).map(VersionEntry::loaded).transpose()
     }
 
     /// Describes the version that `spec` resolves to.
     ///
     /// # Errors
-    /// [`Error::Unknown`].
+    /// [`Error::NotFound`].
     pub fn describe(&self, spec: &PolicySpec) -> Result<PolicyDetails, Error> {
         let entries = self.read();
         let found = entries.get(&spec.name).and_then(|entry| Some(entry.describe(entry.resolve(&spec.version)?)));
-        found.ok_or_else(|| Error::unknown("policy", spec.to_string()))
+        found.ok_or_else(|| Error::not_found("policy", spec.to_string()))
     }
 
     /// Aliases of `name`, with the versions that they point to.
     ///
     /// # Errors
-    /// [`Error::Unknown`].
+    /// [`Error::NotFound`].
     pub fn aliases(&self, name: &str) -> Result<BTreeMap<String, u64>, Error> {
         let entries = self.read();
-        entries.get(name).map(|entry| entry.aliases.clone()).ok_or_else(|| Error::unknown("policy", name))
+        entries.get(name).map(|entry| entry.aliases.clone()).ok_or_else(|| Error::not_found("policy", name))
     }
 
     /// The newest versions of at most `limit` names after `after`, in order of names, and whether there are more.

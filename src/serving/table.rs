@@ -2,8 +2,8 @@
 //! the requests to them.
 //!
 //! The table's lock is held for look-ups, never during computations. An entry that has been idle for longer than the time to
-//! live expires at the next look-up or at the next [`Table::sweep`]. The table remembers a bounded number of expired names,
-//! so that a late request for one is answered with "expired" instead of "unknown".
+//! live expires at the next look-up or at the next [`Table::remove_expired`]. The table remembers a bounded number of expired
+//! names, so that a late request for one fails with "expired" instead of "not found".
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -21,7 +21,7 @@ use crate::error_code::ErrorCode;
 pub struct Limits {
     /// Idle time after which entries expire.
     pub ttl: Duration,
-    /// Most entries, and most expired names that are remembered.
+    /// Maximum number of entries, and of expired names that are remembered.
     pub max: usize,
 }
 
@@ -78,10 +78,12 @@ pub(super) enum Lookup<T> {
 #[derive(Debug)]
 struct Names<T> {
     open: HashMap<String, Arc<T>>,
-    /// Names of expired entries, each with the number of its expiry.
+    /// Names of expired entries. A name can expire several times, so its latest expiry is identified by a serial number.
     expired: HashMap<String, u64>,
-    /// Expiries in order of their numbers.
+    /// The last expiries, oldest first: serial number and name. When an expiry leaves this queue, its name is forgotten unless
+    /// `expired` has a later one.
     expiries: VecDeque<(u64, String)>,
+    /// Serial number of the last expiry.
     expiry_count: u64,
 }
 
@@ -93,8 +95,8 @@ impl<T> Names<T> {
         self.expired.insert(id.clone(), self.expiry_count);
         self.expiries.push_back((self.expiry_count, id));
         while self.expiries.len() > capacity {
-            if let Some((number, id)) = self.expiries.pop_front()
-                && self.expired.get(&id) == Some(&number)
+            if let Some((serial, id)) = self.expiries.pop_front()
+                && self.expired.get(&id) == Some(&serial)
             {
                 self.expired.remove(&id);
             }
@@ -170,7 +172,7 @@ impl<T: TableEntry> Table<T> {
     fn insert(&self, names: &mut Names<T>, id: &str, now: Duration, make: impl FnOnce() -> T) -> Result<Arc<T>, Error> {
         let full = |names: &Names<T>| names.open.len() >= self.limits.max && !names.open.contains_key(id);
         if full(names) {
-            self.sweep_names(names, now, Duration::ZERO);
+            self.remove_expired_names(names, now, Duration::ZERO);
         }
         if full(names) {
             return Err(Error::Busy(format!("{} {}s are open, the limit of this server", self.limits.max, T::KIND)));
@@ -184,7 +186,7 @@ impl<T: TableEntry> Table<T> {
     /// Returns entry `id`, and counts as a use of it.
     ///
     /// # Errors
-    /// [`TableEntry::EXPIRED`] if it has expired, [`Error::Unknown`] if there is none.
+    /// [`TableEntry::EXPIRED`] if it has expired, [`Error::NotFound`] if there is none.
     pub fn get(&self, id: &str) -> Result<Arc<T>, Error> {
         let now = self.clock.monotonic();
         {
@@ -194,7 +196,7 @@ impl<T: TableEntry> Table<T> {
                     entry.last_use().touch(now);
                     return Ok(entry.clone());
                 }
-                None if !names.expired.contains_key(id) => return Err(Error::unknown(T::KIND, id)),
+                None if !names.expired.contains_key(id) => return Err(Error::not_found(T::KIND, id)),
                 _ => {}
             }
         }
@@ -237,12 +239,12 @@ impl<T: TableEntry> Table<T> {
     }
 
     /// Removes entries that have been idle for too long.
-    pub fn sweep(&self) {
+    pub fn remove_expired(&self) {
         let now = self.clock.monotonic();
-        self.sweep_names(&mut self.write(), now, REPEAT_WINDOW);
+        self.remove_expired_names(&mut self.write(), now, REPEAT_WINDOW);
     }
 
-    fn sweep_names(&self, names: &mut Names<T>, now: Duration, repeat_window: Duration) {
+    fn remove_expired_names(&self, names: &mut Names<T>, now: Duration, repeat_window: Duration) {
         names.open.retain(|_, entry| !entry.is_ended() || entry.last_use().idle(now) < repeat_window);
         // An entry that a request holds is in use, however long the request takes.
         let expired = |entry: &Arc<T>| Arc::strong_count(entry) == 1 && self.is_idle(entry, now);

@@ -1,5 +1,5 @@
 //! Attempts: one worker process working on a job each, from its token to its outcome. Only the newest attempt of a job may
-//! write, and only until it has ended; workers of older attempts are fenced.
+//! write, and only until it has ended. The store refuses writes of all other attempts.
 
 use jiff::Timestamp;
 use sqlx::{FromRow, SqliteConnection};
@@ -9,15 +9,15 @@ use super::named_enum::named_enum;
 use super::{Job, JobId, JobState, PendingAction, Result, Store, corrupt, timestamp};
 
 named_enum! {
-    /// How an attempt ended, as the database records it.
+    /// How an attempt ended, as stored. It follows from the [`WorkerResult`] and the pending action of the job.
     AttemptOutcome {
         /// All steps are done.
         Succeeded = "succeeded",
         /// The worker died or gave up.
         Failed = "failed",
-        /// A user cancelled the job.
+        /// A caller cancelled the job.
         Cancelled = "cancelled",
-        /// A user paused the job.
+        /// A caller paused the job.
         Paused = "paused",
         /// The server or the worker was stopped. Not a failure.
         Interrupted = "interrupted",
@@ -28,9 +28,9 @@ named_enum! {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Lease {
     /// Id of the job.
-    pub id: JobId,
-    /// Number of the job.
-    pub job: i64,
+    pub job_id: JobId,
+    /// Row id of the job ([`Job::row_id`]).
+    pub job_row: i64,
     /// Number of the attempt, from 1.
     pub attempt: u32,
 }
@@ -46,12 +46,13 @@ pub struct LeaseRecord {
     pub active: bool,
 }
 
-/// How a worker ends its attempt. The scheduler reports it for a worker that cannot.
+/// The result of an attempt as its worker reports it, or the scheduler for a worker that did not.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum AttemptResult {
-    /// All steps are done.
+pub enum WorkerResult {
+    /// All environment steps are completed.
     Succeeded,
-    /// The worker stopped early, as requested. The pending action is applied; without one the job is queued again.
+    /// The worker stopped early because of a directive. The pending action of the job is applied; without one the job is queued
+    /// again.
     Stopped,
     /// The worker died or gave up.
     Failed {
@@ -68,7 +69,7 @@ pub struct EndedAttempt<'a> {
     /// The attempt.
     pub lease: Lease,
     /// How it ended.
-    pub result: &'a AttemptResult,
+    pub result: &'a WorkerResult,
     /// `NAME:VERSION` under which its policy was published.
     pub policy: Option<&'a str>,
     /// Failed attempts after which the job has failed.
@@ -108,7 +109,7 @@ struct AttemptRow {
 pub(super) async fn is_active(db: &mut SqliteConnection, lease: Lease) -> Result<bool> {
     let sql = "SELECT 1 FROM attempts a JOIN jobs j ON j.number = a.job
                WHERE a.job = ? AND a.number = ? AND a.number = j.attempts AND a.ended_at IS NULL";
-    Ok(sqlx::query(sql).bind(lease.job).bind(lease.attempt).fetch_optional(&mut *db).await?.is_some())
+    Ok(sqlx::query(sql).bind(lease.job_row).bind(lease.attempt).fetch_optional(&mut *db).await?.is_some())
 }
 
 /// Ends an attempt and changes the state of its job. Does nothing if the attempt has already ended.
@@ -117,17 +118,17 @@ async fn end(db: &mut SqliteConnection, ended: EndedAttempt<'_>) -> Result<Optio
     if !is_active(db, lease).await? {
         return Ok(None);
     }
-    let job = find(db, lease.id).await?.ok_or_else(|| corrupt("job", lease.id, "deleted within a transaction"))?;
+    let job = find(db, lease.job_id).await?.ok_or_else(|| corrupt("job", lease.job_id, "deleted within a transaction"))?;
     // An acknowledged cancel wins, even over a worker that succeeded before it noticed.
     let (outcome, state) = match (result, job.pending_action) {
-        (AttemptResult::Succeeded | AttemptResult::Stopped, Some(PendingAction::Cancel)) => {
+        (WorkerResult::Succeeded | WorkerResult::Stopped, Some(PendingAction::Cancel)) => {
             (AttemptOutcome::Cancelled, JobState::Cancelled)
         }
-        (AttemptResult::Succeeded, _) => (AttemptOutcome::Succeeded, JobState::Succeeded),
-        (AttemptResult::Stopped, Some(PendingAction::Pause)) => (AttemptOutcome::Paused, JobState::Paused),
-        (AttemptResult::Stopped, None) => (AttemptOutcome::Interrupted, JobState::Queued),
-        (AttemptResult::Failed { .. }, Some(PendingAction::Cancel)) => (AttemptOutcome::Failed, JobState::Cancelled),
-        (AttemptResult::Failed { permanent, .. }, pending) => {
+        (WorkerResult::Succeeded, _) => (AttemptOutcome::Succeeded, JobState::Succeeded),
+        (WorkerResult::Stopped, Some(PendingAction::Pause)) => (AttemptOutcome::Paused, JobState::Paused),
+        (WorkerResult::Stopped, None) => (AttemptOutcome::Interrupted, JobState::Queued),
+        (WorkerResult::Failed { .. }, Some(PendingAction::Cancel)) => (AttemptOutcome::Failed, JobState::Cancelled),
+        (WorkerResult::Failed { permanent, .. }, pending) => {
             let state = match pending {
                 _ if *permanent || job.failures + 1 >= max_attempts => JobState::Failed,
                 Some(_) => JobState::Paused,
@@ -136,10 +137,10 @@ async fn end(db: &mut SqliteConnection, ended: EndedAttempt<'_>) -> Result<Optio
             (AttemptOutcome::Failed, state)
         }
     };
-    let reason = if let AttemptResult::Failed { reason, .. } = result { Some(reason.as_str()) } else { None };
+    let reason = if let WorkerResult::Failed { reason, .. } = result { Some(reason.as_str()) } else { None };
     let sql = "UPDATE attempts SET ended_at = ?3, outcome = ?4, reason = ?5 WHERE job = ?1 AND number = ?2";
     sqlx::query(sql)
-        .bind(lease.job)
+        .bind(lease.job_row)
         .bind(lease.attempt)
         .bind(now.as_millisecond())
         .bind(outcome.as_str())
@@ -149,9 +150,9 @@ async fn end(db: &mut SqliteConnection, ended: EndedAttempt<'_>) -> Result<Optio
     let failed = i64::from(outcome == AttemptOutcome::Failed);
     let policy = policy.filter(|_| state == JobState::Succeeded);
     let sql = "UPDATE jobs SET failures = failures + ?2, policy = coalesce(?3, policy) WHERE number = ?1";
-    sqlx::query(sql).bind(lease.job).bind(failed).bind(policy).execute(&mut *db).await?;
-    transition(db, Transition { job: lease.job, to: state, attempt: lease.attempt, reason, now }).await?;
-    find(db, lease.id).await
+    sqlx::query(sql).bind(lease.job_row).bind(failed).bind(policy).execute(&mut *db).await?;
+    transition(db, Transition { job: lease.job_row, to: state, attempt: lease.attempt, reason, now }).await?;
+    find(db, lease.job_id).await
 }
 
 impl Store {
@@ -163,21 +164,21 @@ impl Store {
     pub async fn begin_attempt(&self, id: JobId, token: [u8; 32], now: Timestamp) -> Result<Option<Lease>> {
         let mut tx = self.begin().await?;
         let Some(job) = find(&mut tx, id).await?.filter(|job| job.state == JobState::Queued) else { return Ok(None) };
-        let lease = Lease { id, job: job.number, attempt: job.attempts + 1 };
+        let lease = Lease { job_id: id, job_row: job.row_id, attempt: job.attempts + 1 };
         let sql = "INSERT INTO attempts (job, number, token, started_at) VALUES (?, ?, ?, ?)";
         sqlx::query(sql)
-            .bind(lease.job)
+            .bind(lease.job_row)
             .bind(lease.attempt)
             .bind(token.as_slice())
             .bind(now.as_millisecond())
             .execute(&mut *tx)
             .await?;
         let sql = "UPDATE jobs SET attempts = ? WHERE number = ?";
-        sqlx::query(sql).bind(lease.attempt).bind(lease.job).execute(&mut *tx).await?;
+        sqlx::query(sql).bind(lease.attempt).bind(lease.job_row).execute(&mut *tx).await?;
         let to = JobState::Running;
-        transition(&mut tx, Transition { job: lease.job, to, attempt: lease.attempt, reason: None, now }).await?;
+        transition(&mut tx, Transition { job: lease.job_row, to, attempt: lease.attempt, reason: None, now }).await?;
         tx.commit().await?;
-        self.notify(lease.job);
+        self.notify(lease.job_row);
         Ok(Some(lease))
     }
 
@@ -187,10 +188,10 @@ impl Store {
     /// [`Error`](super::Error) when the database fails.
     pub async fn end_attempt(&self, ended: EndedAttempt<'_>) -> Result<Option<Job>> {
         let mut tx = self.begin().await?;
-        let number = ended.lease.job;
+        let job_row = ended.lease.job_row;
         let job = end(&mut tx, ended).await?;
         tx.commit().await?;
-        self.notify(number);
+        self.notify(job_row);
         Ok(job)
     }
 
@@ -198,9 +199,9 @@ impl Store {
     ///
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
-    pub async fn keep_log(&self, lease: Lease, log: &str) -> Result<()> {
+    pub async fn store_log(&self, lease: Lease, log: &str) -> Result<()> {
         let sql = "UPDATE attempts SET log = ?3 WHERE job = ?1 AND number = ?2";
-        sqlx::query(sql).bind(lease.job).bind(lease.attempt).bind(log).execute(&self.write).await?;
+        sqlx::query(sql).bind(lease.job_row).bind(lease.attempt).bind(log).execute(&self.write).await?;
         Ok(())
     }
 
@@ -215,9 +216,9 @@ impl Store {
         let mut jobs = Vec::with_capacity(rows.len());
         for (id, job, attempt) in rows {
             let id = JobId::parse(&id).ok_or_else(|| corrupt("job", &id, "not an id"))?;
-            let lease = Lease { id, job, attempt: attempt as u32 };
+            let lease = Lease { job_id: id, job_row: job, attempt: attempt as u32 };
             // A stopped attempt is not a failure, so the limit has no effect.
-            let ended = EndedAttempt { lease, result: &AttemptResult::Stopped, policy: None, max_attempts: u32::MAX, now };
+            let ended = EndedAttempt { lease, result: &WorkerResult::Stopped, policy: None, max_attempts: u32::MAX, now };
             jobs.extend(end(&mut tx, ended).await?);
         }
         sqlx::query("DELETE FROM snapshots WHERE sha256 IS NULL").execute(&mut *tx).await?;
@@ -234,7 +235,7 @@ impl Store {
                    JOIN attempts a ON a.job = j.number WHERE j.id = ? AND a.number = ?";
         let row: Option<(i64, Vec<u8>, bool)> =
             sqlx::query_as(sql).bind(id.to_string()).bind(attempt).fetch_optional(&self.read).await?;
-        Ok(row.map(|(job, token, active)| LeaseRecord { lease: Lease { id, job, attempt }, token, active }))
+        Ok(row.map(|(job, token, active)| LeaseRecord { lease: Lease { job_id: id, job_row: job, attempt }, token, active }))
     }
 
     /// All attempts of a job, oldest first.

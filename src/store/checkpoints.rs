@@ -104,7 +104,7 @@ impl Store {
     ///
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
-    pub async fn keep_checkpoint(&self, lease: Lease, new: NewCheckpoint, now: Timestamp) -> Result<Option<Uuid>> {
+    pub async fn store_checkpoint(&self, lease: Lease, new: NewCheckpoint, now: Timestamp) -> Result<Option<Uuid>> {
         let metrics = serde_json::to_string(&new.metrics).map_err(|e| corrupt("checkpoint", new.kind, e))?;
         let mut tx = self.begin().await?;
         if !is_active(&mut tx, lease).await? {
@@ -112,7 +112,7 @@ impl Store {
         }
         let sql = "SELECT id FROM checkpoints WHERE job = ? AND kind = ? AND sha256 = ? AND step = ?";
         let same: Option<String> = sqlx::query_scalar(sql)
-            .bind(lease.job)
+            .bind(lease.job_row)
             .bind(new.kind.as_str())
             .bind(&new.sha256)
             .bind(new.step as i64)
@@ -134,7 +134,7 @@ impl Store {
             .bind(now.as_millisecond())
             .bind(new.bytes.len() as i64)
             .bind(new.bytes)
-            .bind(lease.job)
+            .bind(lease.job_row)
             .execute(&mut *tx)
             .await?;
         tx.commit().await?;

@@ -30,7 +30,7 @@ pub enum JobEventKind {
         /// When the state changed.
         at: Timestamp,
     },
-    /// Metrics of one report. A metric that was reported again with another value belongs to its last report.
+    /// Metrics of one report. A metric that is reported again with another value moves to the event of the later report.
     Metrics(Vec<MetricRow>),
 }
 
@@ -52,7 +52,7 @@ const PAGE: i64 = 1000;
 /// Number of channels. Jobs that share a channel wake each other's listeners, which then find no event.
 const CHANNELS: usize = 64;
 
-/// Notifies listeners of new events, in one channel per job number modulo [`CHANNELS`].
+/// Notifies listeners of new events, in one channel per row id modulo [`CHANNELS`].
 #[derive(Debug)]
 pub(super) struct Notifier([watch::Sender<()>; CHANNELS]);
 
@@ -67,17 +67,17 @@ impl Notifier {
 }
 
 impl Store {
-    /// Notifies listeners that an event of job number `job` was committed.
+    /// Notifies listeners that an event of the job with row id `job` was committed.
     pub(super) fn notify(&self, job: i64) {
         self.notifier.channel(job).send_replace(());
     }
 
-    /// A receiver that changes whenever an event of job number `job` was committed, and sometimes without one.
+    /// A receiver that changes whenever an event of the job with row id `job` was committed, and sometimes without one.
     pub fn changes(&self, job: i64) -> watch::Receiver<()> {
         self.notifier.channel(job).subscribe()
     }
 
-    /// A page of the events of job number `job` after event `after`, oldest first. Every event is complete.
+    /// A page of the events of the job with row id `job` after event `after`, oldest first. Every event is complete.
     ///
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
@@ -92,10 +92,15 @@ impl Store {
             let rows: Vec<Row> = sqlx::query_as(sql).bind(job).bind(after as i64).bind(limit).fetch_all(&self.read).await?;
             let full = rows.len() as i64 == limit;
             let mut events = group_rows(rows)?;
-            // The last event of a full page may have more rows, so it belongs to the next page.
-            if !full || events.pop().is_some_and(|_| !events.is_empty()) {
+            if !full {
                 return Ok(events);
             }
+            // The last event of a full page may have more rows, so it belongs to the next page.
+            events.pop();
+            if !events.is_empty() {
+                return Ok(events);
+            }
+            // One event fills the whole page.
             limit *= 8;
         }
     }

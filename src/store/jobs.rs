@@ -147,8 +147,8 @@ pub type JobSummary = Job<SpecSummary>;
 pub struct Job<S = JobSpec> {
     /// The id.
     pub id: JobId,
-    /// Key of the record; jobs submitted later have larger numbers.
-    pub number: i64,
+    /// Key of the row. Jobs submitted later have larger keys.
+    pub row_id: i64,
     /// The state.
     pub state: JobState,
     /// Action that the worker has not carried out yet.
@@ -179,11 +179,11 @@ impl Job {
     /// The job as returned by lists, and the configuration that lists omit.
     pub fn split(self) -> (JobSummary, TrainConfig) {
         let spec = SpecSummary::from(&self.spec);
-        let Self { spec: JobSpec { config, .. }, id, number, state, pending_action, reason, attempts, failures, .. } = self;
+        let Self { spec: JobSpec { config, .. }, id, row_id, state, pending_action, reason, attempts, failures, .. } = self;
         let Self { step, policy, last_event, created_at, started_at, ended_at, .. } = self;
         let summary = Job {
             id,
-            number,
+            row_id,
             state,
             pending_action,
             reason,
@@ -206,6 +206,7 @@ struct JobRow {
     number: i64,
     id: String,
     state: String,
+    /// The pending action.
     wanted: Option<String>,
     reason: Option<String>,
     spec: String,
@@ -225,7 +226,7 @@ impl<S: DeserializeOwned> TryFrom<JobRow> for Job<S> {
     fn try_from(row: JobRow) -> Result<Self> {
         Ok(Self {
             id: JobId::parse(&row.id).ok_or_else(|| corrupt("job", &row.id, "not an id"))?,
-            number: row.number,
+            row_id: row.number,
             state: JobState::from_column(&row.state)?,
             pending_action: row.wanted.as_deref().map(PendingAction::from_column).transpose()?,
             reason: row.reason,
@@ -266,7 +267,7 @@ pub enum SubmitResult {
     Conflict,
 }
 
-/// An action of a user on a job.
+/// An action of a caller on a job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum JobAction {
     /// End the job.
@@ -359,7 +360,7 @@ impl Store {
         find(&mut *self.read.acquire().await?, id).await
     }
 
-    /// Summaries of jobs, newest first: those in `state`, with numbers below `before`; and whether there are more. At most
+    /// Summaries of jobs, newest first: those in `state`, with row ids below `before`; and whether there are more. At most
     /// `limit` summaries of together about `max_bytes` bytes, but at least one.
     ///
     /// # Errors
@@ -434,16 +435,16 @@ impl Store {
             (JobAction::Cancel, Running, _) => set_pending_action(&mut tx, &job, PendingAction::Cancel).await?,
             (JobAction::Pause, Running, None) => set_pending_action(&mut tx, &job, PendingAction::Pause).await?,
             (JobAction::Delete, state, _) if state.ended() => {
-                sqlx::query("DELETE FROM jobs WHERE number = ?").bind(job.number).execute(&mut *tx).await?;
+                sqlx::query("DELETE FROM jobs WHERE number = ?").bind(job.row_id).execute(&mut *tx).await?;
                 tx.commit().await?;
-                self.notify(job.number);
+                self.notify(job.row_id);
                 return Ok(ActionResult::Accepted(Box::new(job)));
             }
             _ => return Ok(ActionResult::WrongState(Box::new(job))),
         }
         let job = get_existing(&mut tx, id).await?;
         tx.commit().await?;
-        self.notify(job.number);
+        self.notify(job.row_id);
         Ok(ActionResult::Accepted(Box::new(job)))
     }
 }
@@ -452,7 +453,7 @@ async fn insert(tx: &mut Transaction<'_, Sqlite>, new: &NewJob) -> Result<Job> {
     let spec = serde_json::to_string(&new.spec).map_err(|e| corrupt("job", new.id, e))?;
     let now = new.now.as_millisecond();
     let sql = "INSERT INTO jobs (id, state, spec, threads, priority, created_at) VALUES (?, 'queued', ?, ?, ?, ?)";
-    let number = sqlx::query(sql)
+    let row_id = sqlx::query(sql)
         .bind(new.id.to_string())
         .bind(spec)
         .bind(new.spec.threads as i64)
@@ -461,20 +462,20 @@ async fn insert(tx: &mut Transaction<'_, Sqlite>, new: &NewJob) -> Result<Job> {
         .execute(&mut **tx)
         .await?
         .last_insert_rowid();
-    transition(tx, Transition { job: number, to: JobState::Queued, attempt: 0, reason: None, now: new.now }).await?;
+    transition(tx, Transition { job: row_id, to: JobState::Queued, attempt: 0, reason: None, now: new.now }).await?;
     if let Some((key, body)) = &new.idempotency {
         let sql = "INSERT INTO idempotency_keys (key, body, job, created_at) VALUES (?, ?, ?, ?)";
-        sqlx::query(sql).bind(key).bind(body.as_slice()).bind(number).bind(now).execute(&mut **tx).await?;
+        sqlx::query(sql).bind(key).bind(body.as_slice()).bind(row_id).bind(now).execute(&mut **tx).await?;
     }
     get_existing(tx, new.id).await
 }
 
 async fn transition_now(tx: &mut Transaction<'_, Sqlite>, job: &Job, to: JobState, now: Timestamp) -> Result<()> {
-    transition(tx, Transition { job: job.number, to, attempt: job.attempts, reason: None, now }).await
+    transition(tx, Transition { job: job.row_id, to, attempt: job.attempts, reason: None, now }).await
 }
 
 async fn set_pending_action(tx: &mut Transaction<'_, Sqlite>, job: &Job, action: PendingAction) -> Result<()> {
     let sql = "UPDATE jobs SET wanted = ? WHERE number = ?";
-    sqlx::query(sql).bind(action.as_str()).bind(job.number).execute(&mut **tx).await?;
+    sqlx::query(sql).bind(action.as_str()).bind(job.row_id).execute(&mut **tx).await?;
     Ok(())
 }

@@ -26,7 +26,7 @@ pub struct MetricRow {
     pub step: u64,
     /// The value; `None` if it was not finite.
     pub value: Option<f64>,
-    /// When the value was reported first.
+    /// When this value was first reported.
     pub at: Timestamp,
 }
 
@@ -56,14 +56,14 @@ impl Store {
             return Ok(false);
         }
         let sql = "UPDATE jobs SET step = ?, seq = seq + 1 WHERE number = ? RETURNING seq";
-        let seq: i64 = sqlx::query_scalar(sql).bind(step as i64).bind(lease.job).fetch_one(&mut *tx).await?;
+        let seq: i64 = sqlx::query_scalar(sql).bind(step as i64).bind(lease.job_row).fetch_one(&mut *tx).await?;
         // A repeated value keeps the event of its first report.
         let sql = "INSERT INTO metrics (job, name, step, value, at, seq) VALUES (?, ?, ?, ?, ?, ?)
                    ON CONFLICT (job, name, step) DO UPDATE SET value = excluded.value, at = excluded.at, seq = excluded.seq
                    WHERE value IS NOT excluded.value";
         for metric in metrics {
             sqlx::query(sql)
-                .bind(lease.job)
+                .bind(lease.job_row)
                 .bind(&metric.name)
                 .bind(metric.step as i64)
                 .bind(metric.value.is_finite().then_some(metric.value))
@@ -73,7 +73,7 @@ impl Store {
                 .await?;
         }
         tx.commit().await?;
-        self.notify(lease.job);
+        self.notify(lease.job_row);
         Ok(true)
     }
 

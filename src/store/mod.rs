@@ -1,6 +1,7 @@
 //! The database: all SQL of the program. One SQLite file in WAL mode, one writer, embedded migrations. Every method returns
 //! after its change is on the disk, so acknowledged changes survive `kill -9`.
 
+mod aliases;
 mod attempts;
 mod checkpoints;
 mod events;
@@ -9,10 +10,10 @@ mod keys;
 mod metrics;
 mod named_enum;
 mod policies;
-mod promotions;
 mod snapshots;
 
-pub use attempts::{Attempt, AttemptOutcome, AttemptResult, EndedAttempt, Lease, LeaseRecord};
+pub use aliases::{AliasHistoryEntry, AliasHistoryFilter, AliasMove, PolicyAlias};
+pub use attempts::{Attempt, AttemptOutcome, EndedAttempt, Lease, LeaseRecord, WorkerResult};
 pub use checkpoints::{Checkpoint, CheckpointKind, NewCheckpoint};
 pub use events::{JobEvent, JobEventKind};
 pub use jobs::{
@@ -21,7 +22,6 @@ pub use jobs::{
 pub use keys::KeyRecord;
 pub use metrics::{Metric, MetricCursor, MetricRow, is_metric_name};
 pub use policies::{NewPolicyVersion, PolicyVersion, PublishedPolicy};
-pub use promotions::{AliasMove, PolicyAlias, Promotion, PromotionFilter};
 pub use snapshots::{PartialSnapshot, Snapshot};
 
 use std::path::Path;

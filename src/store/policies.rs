@@ -1,10 +1,10 @@
-//! Published policies: names, and immutable versions with their checkpoints.
+//! Published policies: names, immutable versions with their checkpoints, and which versions are unloaded.
 
 use jiff::Timestamp;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
-use super::promotions::{AliasMove, move_alias};
+use super::aliases::{AliasMove, move_alias};
 use super::{Error, Store};
 
 /// A published version with its checkpoint.
@@ -98,6 +98,41 @@ impl Store {
         let query = "SELECT name, version, digest, checkpoint, created_at FROM policy_versions WHERE name = ? AND version = ?";
         let row = sqlx::query(query).bind(name).bind(version as i64).fetch_optional(&self.read).await?;
         row.as_ref().map(read_version).transpose()
+    }
+
+    /// Marks versions of a policy as loaded or unloaded.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn set_policy_versions_loaded(
+        &self,
+        name: &str,
+        versions: &[u64],
+        loaded: bool,
+        now: Timestamp,
+    ) -> Result<(), Error> {
+        let mut tx = self.begin().await?;
+        for &version in versions {
+            let query = if loaded {
+                sqlx::query("DELETE FROM policies_unloaded WHERE name = ? AND version = ?").bind(name).bind(version as i64)
+            } else {
+                let sql = "INSERT INTO policies_unloaded (name, version, at) VALUES (?, ?, ?) ON CONFLICT DO NOTHING";
+                sqlx::query(sql).bind(name).bind(version as i64).bind(now.as_millisecond())
+            };
+            query.execute(&mut *tx).await?;
+        }
+        tx.commit().await?;
+        Ok(())
+    }
+
+    /// Names and numbers of the unloaded versions.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn unloaded_policies(&self) -> Result<Vec<(String, u64)>, Error> {
+        let sql = "SELECT name, version FROM policies_unloaded ORDER BY name, version";
+        let rows: Vec<(String, i64)> = sqlx::query_as(sql).fetch_all(&self.read).await?;
+        Ok(rows.into_iter().map(|(name, version)| (name, version as u64)).collect())
     }
 }
 

@@ -52,10 +52,10 @@ impl Store {
         if !is_active(&mut tx, lease).await? {
             return Ok(None);
         }
-        discard_incomplete(&mut tx, lease.job).await?;
+        discard_incomplete(&mut tx, lease.job_row).await?;
         let sql = "INSERT INTO snapshots (job, attempt, step, created_at) VALUES (?, ?, ?, ?)";
         let id = sqlx::query(sql)
-            .bind(lease.job)
+            .bind(lease.job_row)
             .bind(lease.attempt)
             .bind(step as i64)
             .bind(now.as_millisecond())
@@ -95,7 +95,7 @@ impl Store {
         let sql = "UPDATE snapshots SET size = ?, sha256 = ? WHERE id = ?";
         sqlx::query(sql).bind(partial.size as i64).bind(sha256).bind(partial.id).execute(&mut *tx).await?;
         let sql = "DELETE FROM snapshots WHERE job = ? AND id <> ?";
-        sqlx::query(sql).bind(partial.lease.job).bind(partial.id).execute(&mut *tx).await?;
+        sqlx::query(sql).bind(partial.lease.job_row).bind(partial.id).execute(&mut *tx).await?;
         tx.commit().await?;
         Ok(true)
     }

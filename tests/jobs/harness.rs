@@ -16,7 +16,7 @@ use qedgix::jobs::{Executor, Launch, Scheduler, SchedulerConfig, WorkerExit};
 use qedgix::server::{self, DataDir, Listeners};
 use qedgix::service::keys::Keyring;
 use qedgix::service::policies::UploadLimit;
-use qedgix::service::{App, Watchers};
+use qedgix::service::{App, WatchLimit};
 use qedgix::serving::{Engine, EngineConfig, Environments, EnvironmentsConfig, Limits, Sessions};
 use qedgix::store::Store;
 use qedgix::wire::v1::job_service_client::JobServiceClient;
@@ -53,7 +53,7 @@ impl Worker {
     }
 
     pub fn job(&self) -> String {
-        self.launch.lease.id.to_string()
+        self.launch.lease.job_id.to_string()
     }
 }
 
@@ -172,7 +172,7 @@ impl Server {
             engine: Engine::start(EngineConfig { threads: 1, queue: 1, max_batch: 1, max_batch_delay: Duration::ZERO }).unwrap(),
             keys: Keyring::new(None),
             uploads: UploadLimit::default(),
-            watchers: Watchers::new(config.max_watchers, config.event_heartbeat),
+            watchers: WatchLimit::new(config.max_watchers, config.event_heartbeat),
             clock,
             draining,
         });
@@ -236,7 +236,7 @@ pub fn signed<T>(launch: &Launch, token: &str, message: T) -> tonic::Request<T> 
     let mut request = tonic::Request::new(message);
     let metadata = request.metadata_mut();
     let text = |text: String| -> MetadataValue<_> { text.parse().unwrap() };
-    metadata.insert("qedgix-job", text(launch.lease.id.to_string()));
+    metadata.insert("qedgix-job", text(launch.lease.job_id.to_string()));
     metadata.insert("qedgix-attempt", text(launch.lease.attempt.to_string()));
     metadata.insert("authorization", text(format!("Bearer {token}")));
     request

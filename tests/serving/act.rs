@@ -5,7 +5,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use qedgix::policy::FleetStep;
 use qedgix::policy::baselines::{EnvParams, LIST, by_name};
-use qedgix::serving::Observation;
+use qedgix::serving::FleetInput;
 use qedgix::wire::v1;
 use tonic::Code;
 
@@ -49,7 +49,7 @@ fn offline(name: &str, slots: u64, seed: u64) -> Vec<Vec<u8>> {
     let mut memory = vec![0.0; policy.memory_len(3, 5)];
     policy.start(3, 5, seed, &mut memory);
     let decide = |step| {
-        let slot = Observation::try_from(scene(3, 5, step)).unwrap().into_slot(&*policy).unwrap();
+        let slot = FleetInput::try_from(scene(3, 5, step)).unwrap().into_slot(&*policy).unwrap();
         let mut headings = vec![0; 3];
         policy.act(&mut [FleetStep { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
         headings

@@ -4,13 +4,13 @@ use proptest::prelude::*;
 use qedgix::policy::baselines::{EnvParams, LIST, by_name};
 use qedgix::policy::{FleetStep, Policy, RequiredInput, Slot};
 use qedgix::service::act;
-use qedgix::serving::Observation;
+use qedgix::serving::FleetInput;
 use qedgix::wire::v1;
 
 use super::harness::*;
 
-fn slot_of(observation: Observation, policy: &dyn Policy) -> Slot {
-    observation.into_slot(policy).unwrap()
+fn slot_of(input: FleetInput, policy: &dyn Policy) -> Slot {
+    input.into_slot(policy).unwrap()
 }
 
 fn decide(policy: &dyn Policy, slot: &Slot) -> Vec<u8> {
@@ -47,9 +47,9 @@ fn a_graph_and_a_scene_of_the_same_slot_are_the_same_slot() {
             assert_eq!(decide(&*policy, &by_graph), decide(&*policy, &by_scene), "seed {seed}, {}", baseline.name);
             seen += detections(&by_scene).iter().map(Vec::len).sum::<usize>();
 
-            let left_out = slot_of(graph(&scene, range, false).try_into().unwrap(), &*policy);
-            assert_eq!(decide(&*policy, &left_out), decide(&*policy, &by_scene), "seed {seed}, {}", baseline.name);
-            check_derived(&left_out, &by_scene);
+            let without_detections = slot_of(graph(&scene, range, false).try_into().unwrap(), &*policy);
+            assert_eq!(decide(&*policy, &without_detections), decide(&*policy, &by_scene), "seed {seed}, {}", baseline.name);
+            check_derived(&without_detections, &by_scene);
         }
     }
     assert!(seen > 10_000, "the slots are not empty");
@@ -161,8 +161,8 @@ proptest! {
             Err(e) => prop_assert!(!e.field.is_empty() && !e.expected.is_empty()),
             Ok(request) => for baseline in &LIST {
                 let policy = by_name(baseline.name, EnvParams::default()).unwrap();
-                let (uavs, users) = (request.observation.uavs(), request.observation.users());
-                if let Ok(slot) = request.observation.clone().into_slot(&*policy) {
+                let (uavs, users) = (request.input.uavs(), request.input.users());
+                if let Ok(slot) = request.input.clone().into_slot(&*policy) {
                     prop_assert_eq!((slot.uavs(), slot.users()), (uavs, users));
                     let headings = decide(&*policy, &slot);
                     prop_assert!(headings.iter().all(|&h| usize::from(h) < policy.actions()));
@@ -174,7 +174,7 @@ proptest! {
     /// Callers may forge the memory that they keep.
     #[test]
     fn arbitrary_memory_is_flown(values in prop::collection::vec(number(), 400), step in any::<u64>(), seed in 0..50_u64) {
-        let sent: Observation = scene(3, 5, seed).try_into().unwrap();
+        let sent: FleetInput = scene(3, 5, seed).try_into().unwrap();
         for baseline in &LIST {
             let policy = by_name(baseline.name, EnvParams::default()).unwrap();
             let slot = slot_of(sent.clone(), &*policy);

@@ -14,7 +14,7 @@ use proptest::test_runner::TestRunner;
 use qedgix::invalid::Invalid;
 use qedgix::policy::{FleetStep, Policy, RequiredInput};
 use qedgix::service::{App, Error, act, sessions};
-use qedgix::serving::{Observation, SessionOptions};
+use qedgix::serving::{FleetInput, SessionOptions};
 
 use super::harness::{Server, scene};
 
@@ -222,8 +222,8 @@ impl Model {
         };
         let request = act::Request {
             policy: None,
-            observation: Observation::try_from(scene(2, 3, self.now + steps)).unwrap(),
-            memory: act::Memory::Session(self.session(name)),
+            input: FleetInput::try_from(scene(2, 3, self.now + steps)).unwrap(),
+            memory: act::MemoryLocation::Session(self.session(name)),
             step,
             run_id: run.map(|run| run.to_string()),
             seed: None,

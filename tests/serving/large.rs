@@ -2,7 +2,7 @@
 
 use bytes::Bytes;
 use qedgix::policy::FleetStep;
-use qedgix::serving::Observation;
+use qedgix::serving::FleetInput;
 use qedgix::wire::v1;
 
 use super::harness::*;
@@ -25,12 +25,12 @@ fn wide_scene(uavs: usize, users: usize, range: f64) -> v1::Scene {
 async fn thousand_uavs_and_ten_thousand_users_are_answered() {
     let server = Server::start().await;
     let loaded = server.app.registry.resolve(&"qedgix".parse().unwrap()).unwrap();
-    let policy = &loaded.policy;
+    let policy = &loaded.implementation;
     let (uavs, users) = (1000, 10_000);
     let scene = wide_scene(uavs, users, policy.detection_range());
     let graph = graph(&scene, policy.detection_range(), false);
-    let slot = Observation::try_from(graph.clone()).unwrap().into_slot(&**policy).unwrap();
-    let whole = Observation::try_from(scene.clone()).unwrap().into_slot(&**policy).unwrap();
+    let slot = FleetInput::try_from(graph.clone()).unwrap().into_slot(&**policy).unwrap();
+    let whole = FleetInput::try_from(scene.clone()).unwrap().into_slot(&**policy).unwrap();
     // UAVs have the same detections in both forms. Users detect the nodes that the detections of UAVs imply.
     for uav in 0..uavs {
         assert_eq!(slot.detections(uav), whole.detections(uav), "UAV {uav}");

@@ -7,7 +7,7 @@ use jiff::Timestamp;
 use qedgix::checkpoint::{Checkpoint, digest};
 use qedgix::service::policies::{IndexEntry, index};
 use qedgix::store::{
-    AttemptResult, CheckpointKind, EndedAttempt, JobId, JobKind, JobSpec, NewCheckpoint, NewJob, Store, SubmitResult,
+    CheckpointKind, EndedAttempt, JobId, JobKind, JobSpec, NewCheckpoint, NewJob, Store, SubmitResult, WorkerResult,
 };
 use qedgix::train_config::{Algorithm, Preset};
 use qedgix::wire::v1;
@@ -113,8 +113,8 @@ async fn a_checkpoint_of_a_job_is_published_by_its_id() {
     let lease = store.begin_attempt(job.id, [0; 32], now).await.unwrap().unwrap();
     let bytes = mine.to_bytes();
     let new = NewCheckpoint { kind: CheckpointKind::Best, step: 1234, sha256: digest(&bytes), metrics: BTreeMap::new(), bytes };
-    let id = store.keep_checkpoint(lease, new, now).await.unwrap().unwrap();
-    let ended = EndedAttempt { lease, result: &AttemptResult::Succeeded, policy: None, max_attempts: 1, now };
+    let id = store.store_checkpoint(lease, new, now).await.unwrap().unwrap();
+    let ended = EndedAttempt { lease, result: &WorkerResult::Succeeded, policy: None, max_attempts: 1, now };
     store.end_attempt(ended).await.unwrap().unwrap();
     drop(store);
 
@@ -203,12 +203,12 @@ async fn an_unloaded_version_serves_nobody_new_and_those_that_fly_it_go_on() {
     let server = with_timeout(server.restarted()).await;
     let rest = Rest::new(&server);
     let of = |name: &str| index(&server.app).into_iter().filter(|entry| entry.name == name).collect::<Vec<_>>();
-    let entry = |version, ready| {
-        let reason = if ready { String::new() } else { "unloaded".into() };
-        IndexEntry { name: "mine".into(), version, ready, reason }
+    let entry = |version, loaded| {
+        let reason = if loaded { String::new() } else { "unloaded".into() };
+        IndexEntry { name: "mine".into(), version, loaded, reason }
     };
     assert_eq!(of("mine"), [entry(1, true), entry(2, false)]);
-    assert!(!of("sweep")[0].ready && of("nearest")[0].ready);
+    assert!(!of("sweep")[0].loaded && of("nearest")[0].loaded);
     let mut client = server.grpc().await;
     assert_eq!(refused(client.act(held("sweep", Bytes::new(), scene(3, 5, 0))).await).1, "policy_unloaded");
 
@@ -293,7 +293,7 @@ async fn the_command_line_does_all_of_it() {
     let list: Value = serde_json::from_str(&qedgix(&server, &["list", "--json"]).await).unwrap();
     assert_eq!(list["policies"].as_array().unwrap().len(), server.app.registry.list("", 1000).0.len());
     assert!(qedgix(&server, &["unload", "mine:1"]).await.contains("loaded"));
-    assert!(!index(&server.app).iter().any(|entry| entry.name == "mine" && entry.version == 1 && entry.ready));
+    assert!(!index(&server.app).iter().any(|entry| entry.name == "mine" && entry.version == 1 && entry.loaded));
     qedgix(&server, &["load", "mine"]).await;
     assert!(qedgix(&server, &["get", "mine:1"]).await.contains(&digest(&numbered(1).to_bytes())));
     let out = server.dir.path().join("out");

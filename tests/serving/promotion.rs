@@ -11,8 +11,8 @@ use qedgix::error_code::ErrorCode;
 use qedgix::policy::FleetStep;
 use qedgix::service::policies::{self, AliasChange};
 use qedgix::service::{App, PageRequest};
-use qedgix::serving::Observation;
-use qedgix::store::{Promotion, PromotionFilter};
+use qedgix::serving::FleetInput;
+use qedgix::store::{AliasHistoryEntry, AliasHistoryFilter};
 use qedgix::wire::v1;
 use rand::RngExt;
 use reqwest::{Method, StatusCode};
@@ -130,7 +130,7 @@ fn offline() -> [Vec<Vec<u8>>; 2] {
         let mut memory = vec![0.0; policy.memory_len(3, 5)];
         policy.start(3, 5, 0, &mut memory);
         let flown = (0..SLOTS).map(|step| {
-            let slot = Observation::try_from(scene(3, 5, step)).unwrap().into_slot(policy).unwrap();
+            let slot = FleetInput::try_from(scene(3, 5, step)).unwrap().into_slot(policy).unwrap();
             let mut headings = vec![0; 3];
             policy.act(&mut [FleetStep { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
             headings
@@ -216,9 +216,9 @@ async fn episode_of(
 }
 
 /// All moves of the aliases of `name`, oldest first.
-async fn moves(app: &App, name: &str) -> Vec<Promotion> {
-    let filter = PromotionFilter { name, alias: None, before: None };
-    let mut moves = app.store.promotions(filter, 1_000_000).await.unwrap();
+async fn moves(app: &App, name: &str) -> Vec<AliasHistoryEntry> {
+    let filter = AliasHistoryFilter { name, alias: None, before: None };
+    let mut moves = app.store.alias_history(filter, 1_000_000).await.unwrap();
     moves.reverse();
     moves
 }

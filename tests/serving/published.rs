@@ -4,7 +4,7 @@ use bytes::Bytes;
 use qedgix::checkpoint::{Checkpoint, layout};
 use qedgix::policy::FleetStep;
 use qedgix::service::{Error, policies};
-use qedgix::serving::{Observation, PolicyRef};
+use qedgix::serving::{FleetInput, PolicyRef};
 use qedgix::train_config::{Algorithm, Preset, TrainConfig};
 use qedgix::wire::v1;
 use rand::RngExt;
@@ -21,7 +21,7 @@ pub fn checkpoint(algorithm: Algorithm, preset: Preset, seed: u64) -> Checkpoint
 }
 
 pub async fn publish(server: &Server, name: &str, checkpoint: &Checkpoint) -> PolicyRef {
-    policies::publish(&server.app, name, checkpoint.to_bytes()).await.unwrap()
+    policies::publish_bytes(&server.app, name, checkpoint.to_bytes()).await.unwrap()
 }
 
 #[tokio::test]
@@ -77,7 +77,7 @@ async fn what_is_no_checkpoint_is_refused() {
         ("sweep", good, "name"),
     ];
     for (name, bytes, field) in cases {
-        let refused = policies::publish(&server.app, name, bytes).await.unwrap_err();
+        let refused = policies::publish_bytes(&server.app, name, bytes).await.unwrap_err();
         assert!(matches!(&refused, Error::Invalid(e) if e.field == field), "{refused}");
     }
     assert_eq!(server.app.store.policy_versions().await.unwrap().iter().filter(|(name, _)| name == "mine").count(), 0);
@@ -97,7 +97,7 @@ async fn a_learned_policy_flies_like_all_others() {
         let mut state = Bytes::new();
         for step in 0..20 {
             let sent = scene(3, 5, step);
-            let slot = Observation::try_from(sent.clone()).unwrap().into_slot(policy).unwrap();
+            let slot = FleetInput::try_from(sent.clone()).unwrap().into_slot(policy).unwrap();
             let (mut expected, mut q) = (vec![0; 3], vec![0.0; 3 * policy.actions()]);
             let (memory, headings) = (&mut memory[..], &mut expected[..]);
             policy.act(&mut [FleetStep { slot: &slot, step, memory, headings, q_values: Some(&mut q) }]);

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use qedgix::checkpoint::{Checkpoint, digest, layout};
 use qedgix::policy::{FleetStep, LearnedPolicy, Policy};
-use qedgix::serving::Observation;
+use qedgix::serving::FleetInput;
 use qedgix::train_config::{Algorithm, Preset, TrainConfig};
 use qedgix::wire::v1;
 use qedgix::wire::v1::act_request::Observation as WireObservation;
@@ -123,8 +123,8 @@ impl Reference {
     /// The expected heading and Q-values of every UAV in the next slot.
     fn decide(&mut self, observation: &WireObservation) -> BTreeMap<String, (u32, Vec<f32>)> {
         let observation = match observation.clone() {
-            WireObservation::Scene(scene) => Observation::try_from(scene).unwrap(),
-            WireObservation::Graph(graph) => Observation::try_from(graph).unwrap(),
+            WireObservation::Scene(scene) => FleetInput::try_from(scene).unwrap(),
+            WireObservation::Graph(graph) => FleetInput::try_from(graph).unwrap(),
         };
         let ids = observation.fleet.uavs.clone();
         let slot = observation.into_slot(&*self.policy).unwrap();

@@ -6,15 +6,17 @@ use super::response::{duration, timestamp};
 use super::structs::{from_struct, to_struct};
 use crate::env::EpisodeMetrics;
 use crate::invalid::Invalid;
-use crate::service::environments::Create;
-use crate::serving::{CopyState, EnvironmentInfo, EnvironmentReset, EnvironmentState, EnvironmentStep, FinishedEpisode, Fleet};
+use crate::service::environments::NewEnvironment;
+use crate::serving::{
+    CopyState, EnvironmentInfo, EnvironmentReset, EnvironmentState, EnvironmentStep, FinishedEpisode, FleetIds,
+};
 use crate::wire::v1;
 
 /// The environment that a message of `CreateEnvironment` describes.
 ///
 /// # Errors
 /// A name that is not valid, or a number that JSON or a `Struct` cannot hold.
-pub fn create(request: v1::CreateEnvironmentRequest) -> Result<Create, Invalid> {
+pub fn create(request: v1::CreateEnvironmentRequest) -> Result<NewEnvironment, Invalid> {
     let v1::CreateEnvironmentRequest { environment, seed, count, auto_reset, environment_id } = request;
     let environment = from_struct("environment", environment.unwrap_or_default())?;
     create_environment(environment_id, environment, seed, count, auto_reset)
@@ -30,10 +32,10 @@ pub fn create_environment(
     seed: u64,
     count: Option<u32>,
     auto_reset: bool,
-) -> Result<Create, Invalid> {
+) -> Result<NewEnvironment, Invalid> {
     let id = Some(id).filter(|id| !id.is_empty());
-    id.as_deref().map_or(Ok(()), |id| Fleet::check_id("environment_id", id))?;
-    Ok(Create { id, environment, seed, count: count.unwrap_or(1) as usize, auto_reset })
+    id.as_deref().map_or(Ok(()), |id| FleetIds::check_id("environment_id", id))?;
+    Ok(NewEnvironment { id, environment, seed, count: count.unwrap_or(1) as usize, auto_reset })
 }
 
 impl From<v1::ResetRequest> for EnvironmentReset {

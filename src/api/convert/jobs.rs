@@ -7,7 +7,7 @@ use super::structs::to_struct;
 use crate::invalid::Invalid;
 use crate::jobs::Directive;
 use crate::store::{
-    AttemptResult, CheckpointKind, Job, JobEvent, JobEventKind, JobState, JobSummary, Metric, MetricRow, NewCheckpoint,
+    CheckpointKind, Job, JobEvent, JobEventKind, JobState, JobSummary, Metric, MetricRow, NewCheckpoint, WorkerResult,
 };
 use crate::train_config::TrainConfig;
 use crate::wire::v1;
@@ -25,10 +25,10 @@ impl From<JobState> for v1::JobState {
     }
 }
 
-/// A filter: absent where unspecified.
+/// The state to filter by; `None` for `UNSPECIFIED`.
 ///
 /// # Errors
-/// A number that names no state.
+/// [`Invalid`] for a number without a state.
 pub fn state_filter(state: i32) -> Result<Option<JobState>, Invalid> {
     let known = v1::JobState::try_from(state);
     Ok(Some(match known.map_err(|_| Invalid::new("state", state, "the number of a JobState"))? {
@@ -54,7 +54,7 @@ impl From<JobSummary> for v1::Job {
             steps: job.spec.steps,
             attempts: job.attempts,
             failures: job.failures,
-            wanted: job.pending_action.map(|w| w.to_string()).unwrap_or_default(),
+            wanted: job.pending_action.map(|action| action.to_string()).unwrap_or_default(),
             policy: job.policy.unwrap_or_default(),
             created_at: Some(timestamp(job.created_at)),
             started_at: job.started_at.map(timestamp),
@@ -112,7 +112,7 @@ impl From<Directive> for v1::Directive {
     }
 }
 
-impl TryFrom<v1::FinishRequest> for AttemptResult {
+impl TryFrom<v1::FinishRequest> for WorkerResult {
     type Error = Invalid;
 
     fn try_from(request: v1::FinishRequest) -> Result<Self, Invalid> {
@@ -127,7 +127,7 @@ impl TryFrom<v1::FinishRequest> for AttemptResult {
     }
 }
 
-/// The checkpoint that a header announces, its bytes still to come.
+/// A checkpoint with the properties in the header, and no bytes yet.
 impl TryFrom<v1::CheckpointHeader> for NewCheckpoint {
     type Error = Invalid;
 

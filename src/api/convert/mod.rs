@@ -1,10 +1,10 @@
-//! Wire types to domain types and back. Wire types stop here; what can be wrong with a request and does not depend on the policy
-//! is reported with the path of the field.
+//! Converts wire types to domain types and back. Every check of a request that does not depend on the policy is made here and reports
+//! the path of the field.
 
 pub mod environments;
 pub mod jobs;
-pub mod observation;
 pub mod request;
 pub mod response;
+pub mod scene_graph;
 pub mod structs;
 pub mod tensors;

@@ -4,17 +4,17 @@ use bytes::Bytes;
 
 use crate::invalid::Invalid;
 use crate::service::act;
-use crate::serving::{Fleet, Observation, PolicySpec, SessionOptions};
+use crate::serving::{FleetIds, FleetInput, PolicySpec, SessionOptions};
 use crate::wire::v1;
 
-/// A request of one slot but for its observation, not checked yet.
+/// An `Act` request without its scene or graph, not checked yet.
 #[derive(Debug)]
 pub struct ActFields {
     /// Empty: the policy of the session.
     pub policy: String,
     /// The session that keeps the memory.
     pub session_id: Option<String>,
-    /// The memory, where there is no session.
+    /// The recurrent state that the caller keeps; empty with a session.
     pub recurrent_state: Bytes,
     /// The step, if the caller sends it.
     pub step: Option<u64>,
@@ -28,20 +28,20 @@ impl ActFields {
     /// The checked request.
     ///
     /// # Errors
-    /// A name that is not valid, or no observation.
-    pub fn request(self, observation: Option<Observation>) -> Result<act::Request, Invalid> {
+    /// [`Invalid`] for an invalid name, or if there is neither a scene nor a graph.
+    pub fn request(self, input: Option<FleetInput>) -> Result<act::Request, Invalid> {
         let Self { policy, session_id, recurrent_state, step, run_id, seed } = self;
         let policy = if policy.is_empty() { None } else { Some(policy.parse()?) };
         check_ids(session_id.as_deref(), run_id.as_deref())?;
-        let memory = session_id.map_or(act::Memory::RecurrentState(recurrent_state), act::Memory::Session);
-        let observation = observation.ok_or_else(|| Invalid::missing("observation", "a graph or a scene"))?;
-        Ok(act::Request { policy, observation, memory, step, run_id, seed })
+        let memory = session_id.map_or(act::MemoryLocation::RecurrentState(recurrent_state), act::MemoryLocation::Session);
+        let input = input.ok_or_else(|| Invalid::missing("observation", "a graph or a scene"))?;
+        Ok(act::Request { policy, input, memory, step, run_id, seed })
     }
 }
 
 fn check_ids(session_id: Option<&str>, run_id: Option<&str>) -> Result<(), Invalid> {
-    session_id.map_or(Ok(()), |id| Fleet::check_id("session_id", id))?;
-    run_id.map_or(Ok(()), |id| Fleet::check_id("run_id", id))
+    session_id.map_or(Ok(()), |id| FleetIds::check_id("session_id", id))?;
+    run_id.map_or(Ok(()), |id| FleetIds::check_id("run_id", id))
 }
 
 impl TryFrom<v1::ActRequest> for act::Request {
@@ -55,19 +55,19 @@ impl TryFrom<v1::ActRequest> for act::Request {
             Some(Memory::RecurrentState(state)) => (None, state),
             None => (None, Bytes::new()),
         };
-        let observation = match observation {
+        let input = match observation {
             Some(Sent::Graph(graph)) => Some(graph.try_into()?),
             Some(Sent::Scene(scene)) => Some(scene.try_into()?),
             None => None,
         };
-        ActFields { policy, session_id, recurrent_state, step, run_id, seed }.request(observation)
+        ActFields { policy, session_id, recurrent_state, step, run_id, seed }.request(input)
     }
 }
 
-/// The policy and the options of a session to open; an empty `session_id` lets the server choose one.
+/// The policy and the options of a session to open. With an empty `session_id` the server generates an id.
 ///
 /// # Errors
-/// A name that is not valid.
+/// [`Invalid`] for an invalid name.
 pub fn open_session(
     policy: &str,
     session_id: String,

@@ -18,22 +18,22 @@ pub struct Action {
     pub uav_id: String,
     /// Heading index.
     pub heading: u8,
-    /// Value of each heading; empty where not requested, or where the policy has none.
+    /// Q-value of each heading; empty if not requested, or if the policy has none.
     pub q_values: Vec<f32>,
 }
 
-/// The direction of a heading, in degrees counter-clockwise from +x; none when hovering.
+/// The direction of a heading in degrees, counter-clockwise from +x; `None` for hover.
 pub fn degrees(heading: u8) -> Option<f64> {
-    /// Headings of the compass; the ninth hovers.
+    /// Number of headings with a direction; the next index is hover.
     const COMPASS: u8 = EnvConfig::COMPASS as u8;
     (heading < COMPASS).then(|| 360.0 / f64::from(COMPASS) * f64::from(heading))
 }
 
 /// Takes the actions of all UAVs out of `response`, in the order of the request.
 pub fn actions(response: &mut act::Response, q_values: bool) -> impl Iterator<Item = Action> {
-    let width = response.policy.policy.actions();
-    let act::Response { order, uavs, decision: Decision { headings, q_values: values, .. }, .. } = response;
-    order.iter().map(move |&uav| {
+    let width = response.policy.implementation.actions();
+    let act::Response { canonical_of_request, uavs, decision: Decision { headings, q_values: values, .. }, .. } = response;
+    canonical_of_request.iter().map(move |&uav| {
         let uav = uav as usize;
         let q = values.get(uav * width..(uav + 1) * width).unwrap_or_default();
         Action {

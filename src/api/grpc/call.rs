@@ -1,4 +1,4 @@
-//! One gRPC call: its request and response bodies, whose messages are counted as they pass, and its end, which is logged once.
+//! One gRPC call: counts the messages of its request and response bodies, and logs its end once.
 
 use std::fmt::Display;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -17,7 +17,7 @@ use tracing::Span;
 
 use super::metrics::{MessageCounter, Method, Methods, code_name};
 use crate::api::errors::CODE_METADATA;
-use crate::api::observe::{Completion, LogLimiter, RequestId, RequestIds, Severity, log_request};
+use crate::api::request_log::{Completion, LogLimiter, RequestId, RequestIds, Severity, log_request};
 use crate::invalid::Invalid;
 use crate::service::Error;
 
@@ -58,15 +58,15 @@ impl Call {
         self.context.methods.get(self.method)
     }
 
-    /// Counts and logs the call, the first time it is called.
+    /// Counts and logs the call. Later calls of this function do nothing.
     pub(super) fn end(&mut self, code: Code, detail: &dyn Display) {
         if std::mem::replace(&mut self.ended, true) {
             return;
         }
         let method = self.method();
         let seconds = self.started.elapsed().as_secs_f64();
-        method.handled(code).increment(1);
-        method.handles().seconds.record(seconds);
+        method.completed(code).increment(1);
+        method.metrics().seconds.record(seconds);
         let severity = match code {
             Code::Internal | Code::Unknown | Code::DataLoss => Severity::Failed,
             Code::ResourceExhausted | Code::DeadlineExceeded | Code::Unauthenticated | Code::PermissionDenied => {
@@ -85,8 +85,8 @@ impl Drop for Call {
     }
 }
 
-/// The replacement for a status that tonic made and that has no code of the product: a message that is too large or does
-/// not decode.
+/// The replacement for a status that tonic created and that therefore has no [`ErrorCode`](crate::error_code::ErrorCode): the
+/// message is too large or cannot be decoded. `None` if the status needs no replacement.
 pub(super) fn with_code(status: &Status) -> Option<Status> {
     if status.metadata().contains_key(CODE_METADATA) {
         return None;
@@ -98,7 +98,7 @@ pub(super) fn with_code(status: &Status) -> Option<Status> {
     }))
 }
 
-/// The body of a stream from the client. It ends when the server closes, even if the client would continue; then the
+/// The body of a stream from the client. It ends when the server closes, even if the client has not ended it, so that the
 /// response ends, too.
 pub(super) struct RequestBody {
     body: Body,
@@ -127,7 +127,7 @@ impl http_body::Body for RequestBody {
         };
         if let Some(piece) = frame.as_ref().and_then(|frame| frame.as_ref().ok()?.data_ref()) {
             let messages = self.messages.count(piece);
-            self.context.methods.get(self.method).handles().received.increment(messages);
+            self.context.methods.get(self.method).metrics().received.increment(messages);
         }
         Poll::Ready(frame)
     }
@@ -156,10 +156,10 @@ impl ResponseBody {
     fn sent(&mut self, piece: &Bytes) {
         let method = self.call.method();
         let messages = if method.streams.server { self.messages.count(piece) } else { 1 };
-        method.handles().sent.increment(messages);
+        method.metrics().sent.increment(messages);
     }
 
-    /// Ends the call with the status in the trailers, and adds the code of the product where it is missing.
+    /// Ends the call with the status in the trailers, and adds the error code if it is missing.
     fn ended(&mut self, trailers: HeaderMap) -> HeaderMap {
         if trailers.get(Status::GRPC_STATUS).is_some_and(|code| code == "0") {
             self.call.end(Code::Ok, &"");

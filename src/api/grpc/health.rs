@@ -1,7 +1,7 @@
 //! `grpc.health.v1.Health`: a status for each service.
 //!
-//! As the protocol requires, and unlike the service of `tonic-health`: a watch of an unknown service stays open until the service
-//! becomes known, and setting the same status again sends nothing. While the server drains, every service is `NOT_SERVING`.
+//! Replaces the service of `tonic-health`, which violates the protocol in two ways. Here, the watch of an unknown service stays
+//! open, and setting a status again without a change sends nothing. While the server drains, every service is `NOT_SERVING`.
 //! Watches end when the server closes, so that they do not delay the shutdown.
 
 use std::collections::BTreeMap;
@@ -24,7 +24,7 @@ use crate::wire::v1;
 /// The statuses of all services. Cheap to clone.
 #[derive(Clone, Debug)]
 pub struct Health {
-    /// Whether each service answers, unless the server drains.
+    /// Whether each service is available, unless the server drains.
     serving: Arc<watch::Sender<BTreeMap<String, bool>>>,
     draining: Draining,
     closing: CancellationToken,
@@ -36,13 +36,13 @@ fn status(serving: &BTreeMap<String, bool>, service: &str, draining: bool) -> Op
 }
 
 impl Health {
-    /// Knows no service yet. Once `draining` has begun, every service is `NOT_SERVING`. Watches end when `closing` is
-    /// cancelled.
+    /// Statuses without a service; [`Health::report`] adds them. Once `draining` has begun, every service is `NOT_SERVING`.
+    /// Watches end when `closing` is cancelled.
     pub fn new(draining: Draining, closing: CancellationToken) -> Self {
         Self { serving: Arc::default(), draining, closing }
     }
 
-    /// Sets whether `service` answers; the server as a whole is `""`.
+    /// Sets whether `service` is available; `""` is the server as a whole.
     pub fn set(&self, service: &str, serving: bool) {
         self.serving.send_if_modified(|services| services.insert(service.to_owned(), serving) != Some(serving));
     }

@@ -1,7 +1,7 @@
 //! Metrics of gRPC calls, under the names that gRPC middlewares share (`grpc_server_handled_total`, ...).
 //!
 //! The metric handles of a method are created at its first call and kept, so that counting neither allocates nor locks.
-//! Paths that are no known method share one set of handles, because clients choose them.
+//! Unknown paths share one set of handles, because clients choose them and labels must be bounded.
 
 use std::collections::HashMap;
 use std::sync::OnceLock;
@@ -11,7 +11,7 @@ use prost::Message;
 use prost_types::FileDescriptorSet;
 use tonic::Code;
 
-use crate::api::observe::is_quiet;
+use crate::api::request_log::has_debug_span;
 
 /// Whether client and server send a stream of messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,14 +37,14 @@ pub(super) struct Method {
     pub(super) path: String,
     pub(super) streams: Streams,
     /// Whether its spans have level DEBUG.
-    pub(super) quiet: bool,
-    handles: OnceLock<Handles>,
-    /// Finished calls by code.
-    handled: [OnceLock<Counter>; 17],
+    pub(super) debug_span: bool,
+    metrics: OnceLock<MethodMetrics>,
+    /// Completed calls by code.
+    completed: [OnceLock<Counter>; 17],
 }
 
 /// The metrics of a method that do not depend on the code.
-pub(super) struct Handles {
+pub(super) struct MethodMetrics {
     pub(super) started: Counter,
     pub(super) seconds: Histogram,
     pub(super) received: Counter,
@@ -53,8 +53,8 @@ pub(super) struct Handles {
 
 impl Method {
     fn new(path: String, streams: Streams) -> Self {
-        let quiet = path.rsplit_once('/').is_some_and(|(_, name)| is_quiet(name));
-        Self { path, streams, quiet, handles: OnceLock::new(), handled: Default::default() }
+        let debug_span = path.rsplit_once('/').is_some_and(|(_, name)| has_debug_span(name));
+        Self { path, streams, debug_span, metrics: OnceLock::new(), completed: Default::default() }
     }
 
     fn labels(&self) -> [(&'static str, String); 3] {
@@ -63,8 +63,8 @@ impl Method {
         [("grpc_type", kind), ("grpc_service", service.to_owned()), ("grpc_method", method.to_owned())]
     }
 
-    pub(super) fn handles(&self) -> &Handles {
-        self.handles.get_or_init(|| Handles {
+    pub(super) fn metrics(&self) -> &MethodMetrics {
+        self.metrics.get_or_init(|| MethodMetrics {
             started: metrics::counter!("grpc_server_started_total", &self.labels()),
             seconds: metrics::histogram!("grpc_server_handling_seconds", &self.labels()),
             received: metrics::counter!("grpc_server_msg_received_total", &self.labels()),
@@ -72,8 +72,9 @@ impl Method {
         })
     }
 
-    pub(super) fn handled(&self, code: Code) -> &Counter {
-        self.handled[code as usize].get_or_init(|| {
+    /// The counter of calls that completed with `code`.
+    pub(super) fn completed(&self, code: Code) -> &Counter {
+        self.completed[code as usize].get_or_init(|| {
             let [kind, service, method] = self.labels();
             let labels = [kind, service, method, ("grpc_code", code_name(code).to_owned())];
             metrics::counter!("grpc_server_handled_total", &labels)
@@ -164,7 +165,7 @@ impl MessageCounter {
             let Some((&byte, after)) = piece.split_first() else { return messages };
             piece = after;
             let (have, length) = self.head;
-            // The first byte says whether the message is compressed.
+            // The first byte is the compression flag.
             let length = if have == 0 { 0 } else { length << 8 | u32::from(byte) };
             self.head = (have + 1, length);
             if have == 4 {

@@ -1,7 +1,7 @@
 //! The outermost middleware of gRPC. It applies the caller's deadline, assigns the request id, opens the span, catches
-//! panics, gives every error status a code of the product, and logs and counts the call.
+//! panics, adds an error code to statuses that have none, and logs and counts the call.
 //!
-//! A call ends when its last byte is sent, with the status in its trailers, or as cancelled if the client leaves before.
+//! A call ends when its last byte is sent, with the status in its trailers, or as cancelled if the client disconnects before.
 
 use std::convert::Infallible;
 use std::error::Error as _;
@@ -22,7 +22,7 @@ use tower::Service;
 use super::call::{Call, CallContext, RequestBody, ResponseBody, with_code};
 use super::deadline::{Deadline, read_deadline};
 use super::metrics::Methods;
-use crate::api::observe::{LogLimiter, REQUEST_ID, RequestIds, span};
+use crate::api::request_log::{LogLimiter, REQUEST_ID, RequestIds, span};
 use crate::service::Error;
 
 /// Services with this middleware.
@@ -58,13 +58,13 @@ where
         let number = self.context.methods.find(request.uri().path());
         let method = self.context.methods.get(number);
         let id = self.context.ids.for_request(request.headers());
-        let span = span(&method.path, method.quiet, &id, request.headers());
+        let span = span(&method.path, method.debug_span, &id, request.headers());
         let call = Call::begin(self.context.clone(), number, id, span);
-        method.handles().started.increment(1);
+        method.metrics().started.increment(1);
         if method.streams.client {
             request = request.map(|body| Body::new(RequestBody::new(body, self.context.clone(), number)));
         } else {
-            method.handles().received.increment(1);
+            method.metrics().received.increment(1);
         }
         let work = call.span().in_scope(|| self.inner.call(request));
         ResponseFuture { work, deadline, sleep: None, call: Some(call) }
@@ -122,7 +122,7 @@ fn deadline_exceeded() -> Response<Body> {
     Status::from(Error::Deadline("before the response was ready")).into_http()
 }
 
-/// The response as it is sent. A response that is only a status ends the call; any other ends it with its last byte.
+/// Completes the response. If it is only a status, the call ends here; otherwise it ends with the last byte of the body.
 fn respond(response: Response<Body>, call: &mut Option<Call>) -> Response<ResponseBody> {
     let mut call = call.take().expect("a future that is ready is not polled again");
     // tonic reports an unknown method in the headers only.

@@ -75,7 +75,7 @@ pub fn worker_services(app: &Arc<App>, max_message: usize, closing: Cancellation
 }
 
 fn workers(app: &Arc<App>, max_message: usize) -> WorkerServiceServer<impl WorkerService> {
-    worker::service(app.clone()).max_decoding_message_size(max_message.max(worker::LARGEST_MESSAGE))
+    worker::service(app.clone()).max_decoding_message_size(max_message.max(worker::MAX_WORKER_MESSAGE))
 }
 
 fn wrap(app: &Arc<App>, routes: Routes, closing: CancellationToken) -> Services {

@@ -23,7 +23,7 @@ pub fn service(app: Arc<App>) -> PolicyServiceServer<impl PolicyService> {
     PolicyServiceServer::new(Handlers(app))
 }
 
-/// Most requests in one `ActBatch`.
+/// Maximum number of requests in one `ActBatch`.
 const MAX_BATCH: usize = 1024;
 /// Requests of one `ActStream` that are processed concurrently. Flow control delays further ones.
 const MAX_IN_FLIGHT: usize = 64;
@@ -32,12 +32,12 @@ struct Handlers(Arc<App>);
 
 /// Handles one `ActRequest` of any method.
 async fn act_one(app: &App, request: v1::ActRequest, deadline: Option<Instant>) -> Result<v1::ActResponse, Error> {
-    let values = request.return_q_values;
-    let request = offload(node_count(&request) >= act::INLINE_NODES, || act::Request::try_from(request)).await??;
-    Ok(act_response(act::act(app, request, deadline).await?, values))
+    let return_q_values = request.return_q_values;
+    let request = offload(node_count(&request) >= act::OFFLOAD_NODES, || act::Request::try_from(request)).await??;
+    Ok(act_response(act::act(app, request, deadline).await?, return_q_values))
 }
 
-/// Number of UAVs and users in the observation.
+/// Number of UAVs and users in the request.
 fn node_count(request: &v1::ActRequest) -> usize {
     use v1::act_request::Observation;
     match &request.observation {
@@ -91,8 +91,8 @@ impl PolicyService for Handlers {
 
     async fn open_session(&self, request: Request<v1::OpenSessionRequest>) -> Result<Response<v1::Session>, Status> {
         let v1::OpenSessionRequest { policy, session_id, run_id, seed } = request.into_inner();
-        let (policy, how) = open_session(&policy, session_id, run_id, seed).map_err(Error::from)?;
-        Ok(Response::new(sessions::open(&self.0, &policy, how).await?.into()))
+        let (policy, options) = open_session(&policy, session_id, run_id, seed).map_err(Error::from)?;
+        Ok(Response::new(sessions::open(&self.0, &policy, options).await?.into()))
     }
 
     async fn get_session(&self, request: Request<v1::GetSessionRequest>) -> Result<Response<v1::Session>, Status> {

@@ -1,4 +1,4 @@
-//! Streams of messages from clients.
+//! Streams of requests from clients.
 
 use std::future::ready;
 use std::sync::Arc;
@@ -9,8 +9,8 @@ use tonic::{Status, Streaming};
 use super::call::with_code;
 use crate::service::App;
 
-/// The messages of a stream until the server drains. Messages received before are answered; then the stream ends, so that it
-/// does not delay the shutdown. The stream also ends after the first error, because tonic would repeat the error for ever.
+/// The messages of a stream. The stream ends when the server drains, after the messages already received, so that it does not
+/// delay the shutdown. It also ends after the first error, because tonic would repeat that error without end.
 pub(super) fn requests<T: Send + 'static>(app: Arc<App>, messages: Streaming<T>) -> impl Stream<Item = Result<T, Status>> {
     let until_drained = messages.take_until(async move { app.draining.wait().await });
     until_drained.scan(false, |over, message| {

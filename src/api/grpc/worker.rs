@@ -15,8 +15,8 @@ use crate::store::{Lease, Metric};
 use crate::wire::v1;
 use crate::wire::v1::worker_service_server::{WorkerService, WorkerServiceServer};
 
-/// Largest message of a worker in bytes, independent of the limit for other messages: a chunk with its framing.
-pub const LARGEST_MESSAGE: usize = 4 << 20;
+/// Maximum size of a message of a worker in bytes, independent of the limit for other messages: a chunk with its framing.
+pub const MAX_WORKER_MESSAGE: usize = 4 << 20;
 
 /// The service.
 pub fn service(app: Arc<App>) -> WorkerServiceServer<impl WorkerService> {
@@ -28,7 +28,7 @@ struct Service(Arc<App>);
 impl Service {
     async fn lease(&self, metadata: &MetadataMap) -> Result<Lease, Error> {
         const MISSING: Error =
-            Error::Unauthenticated("a worker must send qedgix-job, qedgix-attempt and authorization: Bearer TOKEN");
+            Error::Unauthenticated("missing metadata: a worker sends qedgix-job, qedgix-attempt and authorization: Bearer TOKEN");
         let text = |key| metadata.get(key).and_then(|value| value.to_str().ok()).ok_or(MISSING);
         let token = text("authorization")?.strip_prefix("Bearer ").ok_or(MISSING)?;
         let (job, attempt) = (text("qedgix-job")?.to_owned(), text("qedgix-attempt")?.to_owned());
@@ -55,11 +55,11 @@ impl WorkerService for Service {
         let lease = self.lease(request.metadata()).await?;
         let snapshot = worker::snapshot(&self.0, lease).await?;
         let app = Arc::clone(&self.0);
-        let chunks = futures::stream::try_unfold(0, move |number| {
+        let chunks = futures::stream::try_unfold(0, move |index| {
             let (app, snapshot) = (Arc::clone(&app), snapshot.clone());
             async move {
-                let chunk = worker::snapshot_chunk(&app, &snapshot, number).await.map_err(stream_status)?;
-                Ok(chunk.map(|data| (v1::Chunk { data: data.into() }, number + 1)))
+                let chunk = worker::snapshot_chunk(&app, &snapshot, index).await.map_err(stream_status)?;
+                Ok(chunk.map(|data| (v1::Chunk { data: data.into() }, index + 1)))
             }
         });
         Ok(Response::new(Box::pin(chunks)))

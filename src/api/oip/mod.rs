@@ -17,9 +17,9 @@ pub use parameters::Parameter;
 use self::model::{model_error, policy_spec};
 use self::outputs::OutputSelection;
 use self::parameters::Parameters;
-use super::convert::tensors::{INPUTS, Tensor, element_count, observation};
+use super::convert::tensors::{INPUTS, Tensor, element_count, fleet_input};
 use crate::invalid::Invalid;
-use crate::service::act::{self, Memory};
+use crate::service::act::{self, MemoryLocation};
 use crate::service::{App, Error};
 
 /// Name of the server in its metadata.
@@ -41,7 +41,7 @@ pub struct InferRequest {
     pub model: String,
     /// The version of `NAME`; empty for the newest.
     pub version: String,
-    /// Repeated in the response.
+    /// Returned in the response.
     pub id: String,
     /// Parameters of the whole request.
     pub parameters: Vec<(String, Parameter)>,
@@ -56,7 +56,7 @@ pub struct InferRequest {
 pub struct InferResponse {
     /// The model as the request names it.
     pub model: String,
-    /// The version that was run.
+    /// The version that computed the outputs.
     pub version: u64,
     /// The id of the request.
     pub id: String,
@@ -79,14 +79,14 @@ pub async fn infer(app: &App, request: InferRequest, deadline: Option<Instant>) 
     let Parameters { sequence, step, seed, timeout } = Parameters::read(parameters)?;
     let outputs = OutputSelection::new(outputs, sequence.is_none())?;
     check_names(&inputs)?;
-    let (state, observation) = if element_count(&inputs) < LARGE {
+    let (state, input) = if element_count(&inputs) < LARGE {
         read(inputs)?
     } else {
         tokio::task::spawn_blocking(|| read(inputs)).await.map_err(Error::internal)??
     };
     let memory = match (sequence, state) {
-        (None, state) => Memory::RecurrentState(state.unwrap_or_default()),
-        (Some(sequence), None) => Memory::Sequence(sequence),
+        (None, state) => MemoryLocation::RecurrentState(state.unwrap_or_default()),
+        (Some(sequence), None) => MemoryLocation::Sequence(sequence),
         (Some(_), Some(_)) => {
             let expected = "no value beside sequence_id, because the server keeps the state of a sequence";
             return Err(Invalid::new(STATE, "a tensor", expected).into());
@@ -94,7 +94,7 @@ pub async fn infer(app: &App, request: InferRequest, deadline: Option<Instant>) 
     };
     let timeout = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
     let deadline = deadline.into_iter().chain(timeout).min();
-    let request = act::Request { policy: Some(spec.clone()), observation, memory, step, run_id: None, seed };
+    let request = act::Request { policy: Some(spec.clone()), input, memory, step, run_id: None, seed };
     let response = act::act(app, request, deadline).await.map_err(|error| model_error(&spec, error))?;
     let reference = &response.policy.reference;
     let (version, digest, step) = (reference.version, reference.digest_hex(), response.decision.step);
@@ -131,15 +131,15 @@ fn check_names(inputs: &[Tensor]) -> Result<(), Invalid> {
     Ok(())
 }
 
-/// The recurrent state, if there is one, and the observation.
-fn read(mut inputs: Vec<Tensor>) -> Result<(Option<Bytes>, crate::serving::Observation), Invalid> {
-    let observation = observation(&mut inputs)?;
+/// The recurrent state, if there is one, and the input of the fleet.
+fn read(mut inputs: Vec<Tensor>) -> Result<(Option<Bytes>, crate::serving::FleetInput), Invalid> {
+    let input = fleet_input(&mut inputs)?;
     let state = inputs.into_iter().find(|tensor| tensor.name == STATE);
-    Ok((state.map(|state| decode_state(&state)).transpose()?, observation))
+    Ok((state.map(|state| decode_state(&state)).transpose()?, input))
 }
 
-/// The bytes of a `recurrent_state`. JSON responses have it in base64, and a client may send this text on another transport.
-/// The bytes themselves are never valid base64, because the fifth byte is no letter of it.
+/// The bytes of a `recurrent_state`. JSON responses contain the state in base64, and a client may send this text over gRPC, too.
+/// The state itself is never valid base64, because its fifth byte, the format version, is not in the base64 alphabet.
 fn decode_state(state: &Tensor) -> Result<Bytes, Invalid> {
     let bytes = state.one_byte_string()?;
     Ok(BASE64_STANDARD.decode(&bytes).map_or(bytes, Bytes::from))

@@ -122,7 +122,7 @@ pub fn is_ready(app: &App, name: &str, version: &str) -> Result<bool, Error> {
 /// [`Error::Invalid`] if `repository` is not empty: the only repository has no name.
 pub fn index(app: &App, repository: &str, ready: bool) -> Result<Vec<IndexEntry>, Error> {
     check_repository(repository)?;
-    Ok(policies::index(app).into_iter().filter(|entry| entry.ready || !ready).collect())
+    Ok(policies::index(app).into_iter().filter(|entry| entry.loaded || !ready).collect())
 }
 
 /// Loads all versions of a model.

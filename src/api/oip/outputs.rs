@@ -49,16 +49,19 @@ impl OutputSelection {
 }
 
 fn output(name: String, response: &Response) -> Tensor {
-    let uavs = response.order.len() as i64;
-    let order = response.order.iter().map(|&uav| uav as usize);
+    let uavs = response.canonical_of_request.len() as i64;
+    let uav_indices = response.canonical_of_request.iter().map(|&uav| uav as usize);
     let heading = |uav: usize| response.decision.headings[uav];
-    let actions = response.policy.policy.actions();
+    let actions = response.policy.implementation.actions();
     let (shape, data) = match name.as_str() {
-        INDEX => (vec![uavs], Data::Int32(order.map(|uav| i32::from(heading(uav))).collect())),
+        INDEX => (vec![uavs], Data::Int32(uav_indices.map(|uav| i32::from(heading(uav))).collect())),
         // Hovering has no direction.
-        DEGREES => (vec![uavs], Data::Fp32(order.map(|uav| degrees(heading(uav)).map_or(f32::NAN, |x| x as f32)).collect())),
+        DEGREES => {
+            (vec![uavs], Data::Fp32(uav_indices.map(|uav| degrees(heading(uav)).map_or(f32::NAN, |x| x as f32)).collect()))
+        }
         Q_VALUES => {
-            let values = order.flat_map(|uav| response.decision.q_values[uav * actions..(uav + 1) * actions].iter().copied());
+            let values =
+                uav_indices.flat_map(|uav| response.decision.q_values[uav * actions..(uav + 1) * actions].iter().copied());
             (vec![uavs, actions as i64], Data::Fp32(values.collect()))
         }
         _ => (vec![1], Data::Bytes(vec![response.recurrent_state.clone().unwrap_or_default()])),

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use crate::invalid::Invalid;
 use crate::service::act::{Sequence, SequenceId};
-use crate::serving::Fleet;
+use crate::serving::FleetIds;
 
 /// The value of a parameter.
 #[derive(Clone, Debug, PartialEq)]
@@ -87,9 +87,10 @@ fn whole(name: &str, value: &Parameter) -> Result<u64, Invalid> {
     }
 }
 
-/// Clients send 0 or an empty string for no sequence. A negative number is the same 64 bits as an unsigned one.
+/// Parses a sequence id. Clients send 0 or an empty string if there is no sequence. A negative number is read as the unsigned
+/// number with the same 64 bits.
 fn sequence_id(value: Parameter) -> Result<Option<SequenceId>, Invalid> {
-    let longest = Fleet::LONGEST_ID;
+    let longest = FleetIds::MAX_ID_LEN;
     match value {
         Parameter::Uint(0) | Parameter::Int(0) => Ok(None),
         Parameter::Uint(number) => Ok(Some(SequenceId::Number(number))),

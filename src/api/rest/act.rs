@@ -12,29 +12,30 @@ use utoipa_axum::routes;
 
 use super::extract;
 use super::json;
-use super::observation::{Graph, Scene};
 use super::openapi::{BadBody, Conflict, Draining, NotFound};
 use super::policies::PolicyRef;
+use super::scene_graph::{Graph, Scene};
 use super::schemas::{self, Base64, Seconds};
 use crate::api::convert::request::ActFields;
 use crate::api::convert::response::{self, actions, degrees};
 use crate::api::offload;
 use crate::invalid::Invalid;
 use crate::service::{App, Error, act};
-use crate::serving::{Decision, Observation, Timings};
+use crate::serving::{self, Decision, FleetInput};
 
 /// The routes.
 pub(super) fn router() -> OpenApiRouter<Arc<App>> {
     OpenApiRouter::new().routes(routes!(decide))
 }
 
-/// What the fleet observes in a slot, as `graph` or as `scene`, and its memory: a session, the `recurrent_state` of the previous
-/// response, or nothing in slot 0.
+/// The scene or the graph of a fleet in one slot, and its recurrent state: a session, the `recurrent_state` of the previous
+/// response, or neither in slot 0.
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 #[schema(example = example)]
 struct ActRequest {
-    /// NAME (its newest version), NAME@ALIAS or NAME:VERSION. May be empty with a session.
+    /// NAME (its newest version), NAME@ALIAS or NAME:VERSION. Optional with a session; if set, it must name the policy of the
+    /// session.
     #[serde(default)]
     #[schema(schema_with = schemas::optional_policy_spec)]
     policy: String,
@@ -43,16 +44,19 @@ struct ActRequest {
     #[schema(min_length = 1, max_length = 128)]
     session_id: Option<String>,
     recurrent_state: Option<Base64>,
-    /// Slots since the episode began, from 0. Repeating the last step returns the same response.
+    /// Index of the slot in the session or episode, from 0. Default: the next step. In a session, repeating the last step
+    /// returns the same response.
     #[serde(default, deserialize_with = "json::optional_integer")]
     step: Option<u64>,
-    /// Identifies one run of a simulator. A new one resets the session; an old one is refused.
+    /// Identifies one run of a simulator. A new `run_id` restarts the session; an earlier `run_id` is rejected (`run_fenced`).
+    /// Ignored without a session.
     #[schema(min_length = 1, max_length = 128)]
     run_id: Option<String>,
-    /// Also return Q-values.
+    /// Whether to return Q-values.
     #[serde(default)]
     return_q_values: bool,
-    /// Fixes what is random about the policy, in slot 0 of memory that the caller keeps.
+    /// Seed of the random choices of the policy; used in slot 0 if the caller keeps the state. Default: 0. Not accepted with a
+    /// session.
     #[serde(default, deserialize_with = "json::optional_integer")]
     seed: Option<u64>,
 }
@@ -73,7 +77,7 @@ fn example() -> serde_json::Value {
 
 impl ActRequest {
     fn is_large(&self) -> bool {
-        self.graph.as_ref().map_or(0, Graph::len) + self.scene.as_ref().map_or(0, Scene::len) >= act::INLINE_NODES
+        self.graph.as_ref().map_or(0, Graph::len) + self.scene.as_ref().map_or(0, Scene::len) >= act::OFFLOAD_NODES
     }
 }
 
@@ -83,8 +87,8 @@ impl TryFrom<ActRequest> for act::Request {
     fn try_from(request: ActRequest) -> Result<Self, Invalid> {
         let ActRequest { policy, graph, scene, session_id, recurrent_state, step, run_id, return_q_values: _, seed } = request;
         let observation = match (graph, scene) {
-            (Some(graph), None) => Some(Observation::try_from(graph)?),
-            (None, Some(scene)) => Some(Observation::try_from(scene)?),
+            (Some(graph), None) => Some(FleetInput::try_from(graph)?),
+            (None, Some(scene)) => Some(FleetInput::try_from(scene)?),
             (None, None) => None,
             _ => return Err(Invalid::schema("graph", "graph and scene", "one of graph and scene")),
         };
@@ -97,47 +101,45 @@ impl TryFrom<ActRequest> for act::Request {
 }
 
 #[derive(Debug, Serialize, ToSchema)]
-struct ActReply {
+struct ActResponse {
     /// One per UAV, in the order of the request.
     actions: Vec<Action>,
     policy: PolicyRef,
-    /// The step that was answered.
+    /// Index of the slot that the actions are for.
     step: u64,
-    /// Memory for the next slot, for callers that keep it.
+    /// The recurrent state for the next request, if the caller keeps it.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
     recurrent_state: Option<Base64>,
-    #[schema(value_type = Durations)]
-    timings: Durations,
+    timings: Timings,
 }
 
 #[derive(Debug, Serialize, ToSchema)]
 struct Action {
     uav_id: String,
-    /// Heading h of 45 h degrees; 8 hovers, where the policy allows it.
+    /// Heading index h: direction 45*h degrees counter-clockwise from +x; 8 = hover, if the policy supports it.
     #[schema(maximum = 8)]
     heading_index: u8,
-    /// Degrees counter-clockwise from +x; absent when hovering.
+    /// Direction in degrees, counter-clockwise from +x; absent for hover.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
     heading_deg: Option<f64>,
-    /// Value of each heading, if requested and if the policy has values.
+    /// Q-value of each heading, if requested and if the policy has Q-values.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     q_values: Vec<f32>,
 }
 
 #[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Timings)]
-struct Durations {
-    /// Waiting for the engine.
+struct Timings {
+    /// Time that the fleet waited in the queue of the engine.
     queue: Seconds,
-    /// Computing.
+    /// Duration of the forward pass.
     compute: Seconds,
-    /// Fleets computed together.
+    /// Number of fleets in the forward pass.
     batch_size: u32,
 }
 
-impl ActReply {
+impl ActResponse {
     fn new(mut response: act::Response, q_values: bool) -> Self {
         let action = |action: response::Action| Action {
             heading_index: action.heading,
@@ -146,13 +148,13 @@ impl ActReply {
             q_values: action.q_values,
         };
         let actions = actions(&mut response, q_values).map(action).collect();
-        let Decision { step, timings: Timings { queue, compute, batch_size, .. }, .. } = response.decision;
+        let Decision { step, timings: serving::Timings { queue, compute, batch_size, .. }, .. } = response.decision;
         Self {
             actions,
             policy: (&response.policy.reference).into(),
             step,
             recurrent_state: response.recurrent_state.filter(|state| !state.is_empty()).map(Base64),
-            timings: Durations { queue: Seconds(queue), compute: Seconds(compute), batch_size },
+            timings: Timings { queue: Seconds(queue), compute: Seconds(compute), batch_size },
         }
     }
 }
@@ -160,10 +162,13 @@ impl ActReply {
 /// Choose a heading for every UAV of a fleet in one slot
 #[utoipa::path(
     post, path = "/v1/act", operation_id = "act", tag = "act", request_body = ActRequest,
-    responses((status = 200, description = "A heading per UAV.", body = ActReply), BadBody, NotFound, Conflict, Draining)
+    responses((status = 200, description = "A heading per UAV.", body = ActResponse), BadBody, NotFound, Conflict, Draining)
 )]
-async fn decide(State(app): State<Arc<App>>, extract::Json(request): extract::Json<ActRequest>) -> Result<Json<ActReply>, Error> {
+async fn decide(
+    State(app): State<Arc<App>>,
+    extract::Json(request): extract::Json<ActRequest>,
+) -> Result<Json<ActResponse>, Error> {
     let q_values = request.return_q_values;
     let request = offload(request.is_large(), move || act::Request::try_from(request)).await??;
-    Ok(Json(ActReply::new(act::act(&app, request, None).await?, q_values)))
+    Ok(Json(ActResponse::new(act::act(&app, request, None).await?, q_values)))
 }

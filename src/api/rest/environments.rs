@@ -18,9 +18,9 @@ use utoipa_axum::routes;
 use super::config_schemas::schema;
 use super::extract::{self, Path, Query};
 use super::json::{self, objects_only};
-use super::observation::{Graph, Scene};
 use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
 use super::policies::Paging;
+use super::scene_graph::{Graph, Scene};
 use super::schemas::Seconds;
 use crate::api::convert::environments::{create_environment, is_large};
 use crate::api::offload;
@@ -47,7 +47,7 @@ struct EnvironmentPath {
 #[serde(deny_unknown_fields)]
 #[schema(example = json!({"environment_id": "env-1", "environment": {"uavs": 2, "users": 4}}))]
 struct CreateEnvironmentRequest {
-    /// Fields that replace the defaults; the letters of the paper (`M`, `N`, `K`, `v`, `t`, `d`) are accepted, too.
+    /// Fields that differ from the defaults. The symbols `M`, `N`, `K`, `v`, `t` and `d` are accepted, too.
     #[serde(default)]
     #[schema(value_type = EnvConfig)]
     environment: Map<String, Value>,
@@ -62,7 +62,8 @@ struct CreateEnvironmentRequest {
     /// Whether the last step of an episode begins the next episode.
     #[serde(default)]
     auto_reset: bool,
-    /// Empty: the server chooses a name.
+    /// Empty: the server generates an id. If an environment with this id exists: created by the same request and not used yet,
+    /// the response contains it; otherwise 409.
     #[serde(default)]
     #[schema(max_length = 128)]
     environment_id: String,
@@ -72,14 +73,14 @@ struct CreateEnvironmentRequest {
 #[serde(deny_unknown_fields)]
 #[schema(example = json!({"seed": 10_000}))]
 struct ResetRequest {
-    /// Begins episode 0 of this seed.
+    /// New seed of the environment. Default: not changed.
     #[serde(default, deserialize_with = "json::optional_integer")]
     #[schema(maximum = 9_007_199_254_740_991_u64)]
     seed: Option<u64>,
-    /// Begins the episode of this number.
+    /// Index of the episode. Default: 0 with a seed; otherwise the next episode, or the current one if it is at slot 0.
     #[serde(default, deserialize_with = "json::optional_integer")]
     episode: Option<u64>,
-    /// Also return the graph that policies observe.
+    /// Whether to return the graph of each scene.
     #[serde(default)]
     return_graph: bool,
 }
@@ -91,10 +92,10 @@ struct StepRequest {
     /// One per copy.
     #[schema(max_items = 1024)]
     actions: Vec<Headings>,
-    /// Slots since the last reset. Repeating the last step returns the same response.
+    /// Index of the step since the last reset, from 0. Default: the next step. Repeating the last step returns the same response.
     #[serde(default, deserialize_with = "json::optional_integer")]
     step: Option<u64>,
-    /// Also return the graph that policies observe.
+    /// Whether to return the graph of each scene.
     #[serde(default)]
     return_graph: bool,
 }
@@ -102,7 +103,8 @@ struct StepRequest {
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields, remote = "Self")]
 struct Headings {
-    /// One per UAV: heading h of 45 h degrees; 8 hovers, where that is allowed.
+    /// One per UAV. Heading index h: direction 45*h degrees counter-clockwise from +x; 8 = hover, if the configuration supports
+    /// it.
     #[serde(deserialize_with = "json::integers")]
     #[schema(schema_with = headings)]
     headings: Vec<u32>,
@@ -121,7 +123,7 @@ struct HostedEnvironment {
     seed: u64,
     count: usize,
     auto_reset: bool,
-    /// 8, or 9 with hovering.
+    /// 8, or 9 with hover.
     headings: usize,
     episode: u64,
     /// Slots of the current episode.
@@ -129,7 +131,7 @@ struct HostedEnvironment {
     /// Slots since the last reset.
     step: u64,
     created_at: Timestamp,
-    /// Idle time after which the environment expires.
+    /// The environment expires after this time without a request.
     ttl: Seconds,
 }
 
@@ -175,7 +177,7 @@ struct CopyState {
     #[schema(nullable = false)]
     graph: Option<Graph>,
     reward: f32,
-    /// Whether this was the last slot, which is a time limit: bootstrap through it.
+    /// Whether the last step was the last one of its episode. Episodes end at a time limit, not in a terminal state.
     truncated: bool,
     /// A reset with this seed begins the same episode.
     seed: u64,
@@ -204,7 +206,7 @@ struct EpisodeMetrics {
     peak_aoi: f64,
     /// 95th percentile of AoI over users and slots.
     p95_aoi: f64,
-    /// Share of users that were visited at least once.
+    /// Fraction of the users whose data a UAV collected at least once.
     coverage: f64,
     /// Jain's fairness index of the users' mean AoI.
     fairness: f64,
@@ -280,7 +282,7 @@ async fn get(
     Ok(Json(environments::get(&app, &id)?.into()))
 }
 
-/// Delete an environment after its step in flight
+/// Delete an environment, after a step that is in progress
 #[utoipa::path(
     delete, path = "/v1/environments/{id}", operation_id = "deleteEnvironment", tag = "environments", params(EnvironmentPath),
     responses(

@@ -33,7 +33,7 @@ pub(super) fn router() -> OpenApiRouter<Arc<App>> {
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 struct FollowQuery {
-    /// Only events after this one; 0: from the first event.
+    /// Only events with a greater id. 0: all events.
     #[serde(default)]
     after: u64,
 }
@@ -99,20 +99,20 @@ impl From<ServerSentEvent> for Event {
     }
 }
 
-/// The header with which browsers resume a stream.
+/// Header of browsers that resume a stream: the id of the last event received.
 const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
-/// Tells proxies not to buffer events.
+/// Header that disables the buffering of events in proxies.
 const UNBUFFERED: (HeaderName, HeaderValue) = (HeaderName::from_static("x-accel-buffering"), HeaderValue::from_static("no"));
 
 /// Follow a job: every change of its state and every metric, in order
 ///
-/// The stream ends when the job has ended, when the server drains, or on a fault. A caller that has received the last event of an
-/// ended job gets 204, which tells browsers not to reconnect.
+/// The stream ends when the job has ended, when the server drains, or on an internal error. If the caller has already received
+/// the last event of a job that has ended, the response is 204, so that browsers do not reconnect.
 #[utoipa::path(
     get, path = "/v1/jobs/{id}/events", operation_id = "followJob", tag = "jobs",
     params(
         JobPath, FollowQuery,
-        ("last-event-id" = Option<u64>, Header, description = "In place of `after`: the last event received.", nullable = false)
+        ("last-event-id" = Option<u64>, Header, description = "Replaces `after`: the id of the last event received.", nullable = false)
     ),
     responses(
         (status = 200, description = "Events as they happen.", content((ServerSentEvent = "text/event-stream"))),
@@ -139,7 +139,7 @@ async fn follow(
     if watch.has_ended() {
         return Ok(StatusCode::NO_CONTENT.into_response());
     }
-    // A caller that reconnects gets the error that ended its stream as the response.
+    // An error ends the stream. If the caller reconnects, the response contains the error.
     let (live, caller) = (app.clone(), StreamCaller::new(&extensions));
     let to_event = move |event| ready(caller.check(&live).and_then(|()| ServerSentEvent::try_from(event)));
     let events = watch.events().and_then(to_event).inspect_err(log_internal);

@@ -13,7 +13,7 @@ use crate::api::offload;
 use crate::invalid::Invalid;
 use crate::service::Error;
 
-/// Largest body, in bytes.
+/// Maximum size of a body, in bytes.
 #[derive(Clone, Copy, Debug)]
 pub struct MaxBody(pub usize);
 

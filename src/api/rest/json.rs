@@ -1,4 +1,5 @@
-//! JSON as JSON Schema defines it, where derived types differ: they take a list for an object, and no `3.0` for an integer.
+//! Reads JSON by the rules of JSON Schema. Derived `Deserialize` differs in two points: it accepts an array for an object, and
+//! rejects `3.0` for an integer.
 
 use std::fmt;
 use std::marker::PhantomData;
@@ -6,7 +7,7 @@ use std::marker::PhantomData;
 use serde::de::{Deserializer, Error, Unexpected, Visitor};
 use serde::{Deserialize, forward_to_deserialize_any};
 
-/// A deserializer of which a struct takes an object only, not a list of its fields.
+/// A deserializer that reads structs from objects only, not from arrays of their fields.
 pub(super) struct ObjectOnly<D>(pub(super) D);
 
 impl<'de, D: Deserializer<'de>> Deserializer<'de> for ObjectOnly<D> {
@@ -29,8 +30,8 @@ impl<'de, D: Deserializer<'de>> Deserializer<'de> for ObjectOnly<D> {
     }
 }
 
-/// Makes types that derive `Deserialize` with `#[serde(remote = "Self")]` take an object only, wherever they are in a document;
-/// `Serialize +` for those that derive `Serialize`, too.
+/// Implements `Deserialize` from objects only, at any depth of a document, for types that derive it with
+/// `#[serde(remote = "Self")]`. Write `Serialize +` for types that also derive `Serialize`.
 macro_rules! objects_only {
     (Serialize + $($type:ty),+) => {
         crate::api::rest::json::objects_only!($($type),+);
@@ -50,7 +51,7 @@ macro_rules! objects_only {
 }
 pub(super) use objects_only;
 
-/// An integer of type `T`, however it is written: `3`, `3.0`, `3e0`.
+/// An integer of type `T` in any notation: `3`, `3.0`, `3e0`.
 struct Integer<T>(T);
 
 impl<'de, T: TryFrom<i128>> Deserialize<'de> for Integer<T> {
@@ -73,7 +74,7 @@ impl<'de, T: TryFrom<i128>> Deserialize<'de> for Integer<T> {
             }
 
             fn visit_f64<E: Error>(self, value: f64) -> Result<Integer<T>, E> {
-                // The conversion saturates far beyond every `T`.
+                // The conversion saturates at bounds that no `T` contains.
                 let whole = Some(value as i128).filter(|_| value.fract() == 0.0);
                 let integer = whole.and_then(|whole| T::try_from(whole).ok());
                 integer.map(Integer).ok_or_else(|| E::invalid_value(Unexpected::Float(value), &self))

@@ -16,7 +16,7 @@ use tracing::Instrument;
 
 use super::v2;
 use crate::api::errors::LogDetail;
-use crate::api::observe::{Completion, LogLimiter, REQUEST_ID, RequestIds, Severity, is_quiet, log_request, span};
+use crate::api::request_log::{Completion, LogLimiter, REQUEST_ID, RequestIds, Severity, has_debug_span, log_request, span};
 use crate::service::Error;
 
 /// The state that all requests share.
@@ -39,7 +39,7 @@ impl Middleware {
         let route = matched.as_ref().map_or("unknown", MatchedPath::as_str);
         let id = self.ids.for_request(request.headers());
         let method = MethodName { verb, route };
-        let span = span(&method, is_quiet(route), &id, request.headers());
+        let span = span(&method, has_debug_span(route), &id, request.headers());
         let is_v2 = v2::is_v2(request.uri().path());
         let response = AssertUnwindSafe(next.run(request).instrument(span.clone())).catch_unwind().await;
         let mut response = response.unwrap_or_else(|_| Error::internal("a handler panicked").into_response());

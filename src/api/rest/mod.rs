@@ -1,5 +1,5 @@
-//! REST: JSON under `/v1`, the Open Inference Protocol under `/v2`, probes, metrics. Every error is a problem of RFC 9457,
-//! also those of paths and methods; under `/v2` it is what that protocol wants.
+//! REST: JSON under `/v1`, the Open Inference Protocol under `/v2`, probes, metrics. Every error is a problem of RFC 9457, also for
+//! unknown paths and methods; under `/v2` errors have the form of that protocol.
 
 mod act;
 mod config_schemas;
@@ -9,10 +9,10 @@ pub mod extract;
 mod jobs;
 mod json;
 mod middleware;
-mod observation;
 mod openapi;
 mod ops;
 mod policies;
+mod scene_graph;
 mod schemas;
 mod sessions;
 mod v2;
@@ -31,10 +31,10 @@ use crate::error_code::ErrorCode;
 use crate::service::{App, Error};
 use middleware::Middleware;
 
-/// All of REST. A body larger than `max_body` bytes is refused; `metrics` renders what was counted.
+/// The router with all routes. Refuses bodies larger than `max_body` bytes. `metrics` renders the Prometheus text.
 pub fn router(app: Arc<App>, metrics: fn() -> String, max_body: usize) -> Router {
     let (auth_app, middleware) = (app.clone(), Arc::new(Middleware::new()));
-    // What is not merged here is not in the document.
+    // The OpenAPI document contains the routes that are merged here.
     let (router, document) = OpenApiRouter::with_openapi(openapi::document())
         .merge(ops::router())
         .merge(act::router())
@@ -50,7 +50,7 @@ pub fn router(app: Arc<App>, metrics: fn() -> String, max_body: usize) -> Router
         .merge(v2::router())
         .fallback(|request: Request| async move { Error::not_found("endpoint", request.uri().path()).into_response() })
         .method_not_allowed_fallback(|request: Request| async move {
-            let detail = format!("{} does not answer {}", request.uri().path(), request.method());
+            let detail = format!("{} does not support {}", request.uri().path(), request.method());
             problem(StatusCode::METHOD_NOT_ALLOWED, ErrorCode::MethodNotAllowed, detail)
         })
         .layer(Extension(extract::MaxBody(max_body)))

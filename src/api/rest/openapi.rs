@@ -20,17 +20,17 @@ use crate::policy::baselines;
     info(
         title = "Qedgix",
         description = "Serves and trains policies that steer fleets of UAVs to keep data fresh (Age of Information).\n\n\
-            Every error is a problem of RFC 9457 with a stable `code`. Every response has an `x-request-id`, the one of the \
-            request if it has one. Unknown fields are errors, in bodies and queries of `/v1`. gRPC serves the same use cases as \
+            Every error is a problem of RFC 9457 with a stable `code`. Every response has an `x-request-id`; it is \
+            that of the request, if set. Unknown fields are errors, in bodies and queries of `/v1`. gRPC serves the same use cases as \
             `qedgix.v1`. `/v2` serves the Open Inference Protocol, which has a document of its own."
     ),
     tags(
-        (name = "act", description = "One slot of one fleet: an observation in, a heading per UAV out."),
-        (name = "sessions", description = "Fleets whose memory the server keeps."),
+        (name = "act", description = "Headings for the UAVs of one fleet in one slot."),
+        (name = "sessions", description = "Fleets whose recurrent state the server keeps."),
         (name = "policies", description = "Versions, aliases and checkpoints of policies."),
-        (name = "environments", description = "Hosted environments for learners elsewhere."),
+        (name = "environments", description = "Hosted environments for external learners."),
         (name = "jobs", description = "Training jobs, run by worker processes."),
-        (name = "operations", description = "Probes, metrics, this document."),
+        (name = "operations", description = "Probes, metrics, the OpenAPI document."),
     ),
     components(schemas(Problem)),
 )]
@@ -90,9 +90,9 @@ fn finished(document: &OpenApi, cpu_budget: usize) -> Value {
     schemas["JobRequest"]["properties"]["threads"]["maximum"] = cpu_budget.into();
     let taken = json!({"enum": baselines::LIST.iter().map(|baseline| baseline.name).collect::<Vec<_>>()});
     schemas["JobRequest"]["properties"]["name"]["not"] = taken.clone();
-    let one_of =
+    let requires =
         |one: &str, other: &str| json!({"required": [one], "properties": {one: {"type": "object"}, other: {"type": "null"}}});
-    schemas["ActRequest"]["oneOf"] = json!([one_of("graph", "scene"), one_of("scene", "graph")]);
+    schemas["ActRequest"]["oneOf"] = json!([requires("graph", "scene"), requires("scene", "graph")]);
     schemas["ActRequest"]["anyOf"] =
         json!(["session_id", "recurrent_state"].map(|none| json!({"properties": {none: {"type": "null"}}})));
     document["paths"]["/v1/policies/{name}/versions"]["post"]["parameters"][0]["schema"]["not"] = taken;
@@ -105,7 +105,8 @@ fn finished(document: &OpenApi, cpu_budget: usize) -> Value {
 
 /// Operations that take a value of another operation's response as a path parameter.
 struct Link {
-    of: (&'static str, &'static str, &'static str),
+    /// Path, method and status of the response.
+    response: (&'static str, &'static str, &'static str),
     /// Name of the parameter, and place of the value in the response.
     parameter: (&'static str, &'static str),
     operations: &'static [&'static str],
@@ -113,17 +114,17 @@ struct Link {
 
 const LINKS: [Link; 6] = [
     Link {
-        of: ("/v1/sessions", "post", "201"),
+        response: ("/v1/sessions", "post", "201"),
         parameter: ("id", "$response.body#/session_id"),
         operations: &["getSession", "closeSession"],
     },
     Link {
-        of: ("/v1/environments", "post", "201"),
+        response: ("/v1/environments", "post", "201"),
         parameter: ("id", "$response.body#/environment_id"),
         operations: &["getEnvironment", "resetEnvironment", "stepEnvironment", "deleteEnvironment"],
     },
     Link {
-        of: ("/v1/jobs", "post", "201"),
+        response: ("/v1/jobs", "post", "201"),
         parameter: ("id", "$response.body#/id"),
         operations: &[
             "getJob",
@@ -137,17 +138,17 @@ const LINKS: [Link; 6] = [
         ],
     },
     Link {
-        of: ("/v1/jobs/{id}/checkpoints", "get", "200"),
+        response: ("/v1/jobs/{id}/checkpoints", "get", "200"),
         parameter: ("id", "$response.body#/checkpoints/0/id"),
         operations: &["getCheckpoint"],
     },
     Link {
-        of: ("/v1/policies/{name}/versions", "post", "201"),
+        response: ("/v1/policies/{name}/versions", "post", "201"),
         parameter: ("policy", "$response.body#/ref/name"),
         operations: &["getPolicy", "exportPolicy", "unloadPolicy", "loadPolicy"],
     },
     Link {
-        of: ("/v1/policies/{name}/versions", "post", "201"),
+        response: ("/v1/policies/{name}/versions", "post", "201"),
         parameter: ("name", "$response.body#/ref/name"),
         operations: &["setAlias", "listAliases", "listAliasMoves"],
     },
@@ -155,7 +156,7 @@ const LINKS: [Link; 6] = [
 
 impl Link {
     fn add(&self, document: &mut Value) {
-        let (path, verb, status) = self.of;
+        let (path, verb, status) = self.response;
         let (parameter, source) = self.parameter;
         let link = |id: &&str| ((*id).to_owned(), json!({"operationId": id, "parameters": {parameter: source}}));
         let links = &mut document["paths"][path][verb]["responses"][status]["links"];
@@ -205,14 +206,14 @@ macro_rules! problems {
 }
 
 problems! {
-    BadRequest = 400: "Malformed or inconsistent input; `field` names the field, if one is to blame.";
+    BadRequest = 400: "Malformed or inconsistent input; `field` is the path of the invalid field, if there is one.";
     Unauthorized = 401: "The server requires an API key, and the request has none or an invalid one.";
     Forbidden = 403: "The API key lacks the required scope.";
     NotFound = 404: "The resource does not exist.";
-    Conflict = 409: "The state of the resource does not allow the operation, or it exists and differs; `code` tells which.";
+    Conflict = 409: "The state of the resource does not allow the operation, or the resource exists and differs; see `code`.";
     TooLarge = 413: "The body is larger than the limit.";
     UnsupportedMediaType = 415: "The content type of the body is not supported.";
-    Unprocessable = 422: "JSON that does not match the schema; `field` names the place.";
+    Unprocessable = 422: "The JSON does not match the schema; `field` is the path.";
     TooMany = 429 with "retry-after": "A limit is reached; retry later.";
     Fault = 500: "An internal error of the server.";
     Draining = 503 with "retry-after": "The server is shutting down or not ready; retry later.";

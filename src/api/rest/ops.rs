@@ -41,7 +41,7 @@ struct Index {
 /// Name, version and endpoints of the server
 #[utoipa::path(
     get, path = "/", operation_id = "index", tag = "operations",
-    responses((status = 200, description = "This.", body = Index))
+    responses((status = 200, description = "Name, version and endpoints.", body = Index))
 )]
 async fn index(Extension(description): Extension<Description>) -> Json<Index> {
     Json(Index { name: "qedgix", version: env!("CARGO_PKG_VERSION"), endpoints: description.operations })
@@ -50,7 +50,7 @@ async fn index(Extension(description): Extension<Description>) -> Json<Index> {
 /// Whether the process is alive
 #[utoipa::path(
     get, path = "/livez", operation_id = "live", tag = "operations",
-    responses((status = 200, description = "It is.", body = String, content_type = "text/plain"))
+    responses((status = 200, description = "The process is alive.", body = String, content_type = "text/plain"))
 )]
 async fn live() -> &'static str {
     "ok\n"
@@ -59,7 +59,7 @@ async fn live() -> &'static str {
 /// Whether the server is ready to serve
 #[utoipa::path(
     get, path = "/readyz", operation_id = "ready", tag = "operations",
-    responses((status = 200, description = "It is.", body = String, content_type = "text/plain"), Fault, Draining)
+    responses((status = 200, description = "The server is ready.", body = String, content_type = "text/plain"), Fault, Draining)
 )]
 async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Error> {
     app.ready().await?;
@@ -69,10 +69,10 @@ async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Error> {
 /// Metrics for Prometheus
 #[utoipa::path(
     get, path = "/metrics", operation_id = "metrics", tag = "operations",
-    responses((status = 200, description = "Text, version 0.0.4.", body = String, content_type = "text/plain"))
+    responses((status = 200, description = "Prometheus text, version 0.0.4.", body = String, content_type = "text/plain"))
 )]
 async fn metrics(State(app): State<Arc<App>>, Extension(render): Extension<fn() -> String>) -> impl IntoResponse {
-    // What is there is counted when it is asked for.
+    // Gauges are computed at scrape time.
     let metrics = operations::server_metrics(&app).await;
     for (name, value) in [
         ("qedgix_sessions", metrics.sessions),
@@ -91,10 +91,10 @@ async fn metrics(State(app): State<Arc<App>>, Extension(render): Extension<fn() 
     ([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], render())
 }
 
-/// This document
+/// The OpenAPI document
 #[utoipa::path(
     get, path = "/openapi.json", operation_id = "openapi", tag = "operations",
-    responses((status = 200, description = "OpenAPI 3.1.", body = Object))
+    responses((status = 200, description = "The OpenAPI 3.1 document.", body = Object))
 )]
 async fn openapi(Extension(description): Extension<Description>) -> impl IntoResponse {
     ([(header::CONTENT_TYPE, "application/json")], description.document)
@@ -115,10 +115,10 @@ const PAGE: &str = r#"<!doctype html>
 </html>
 "#;
 
-/// The viewer of this document
+/// The viewer of the OpenAPI document
 #[utoipa::path(
     get, path = "/docs", operation_id = "docs", tag = "operations",
-    responses((status = 200, description = "A page.", body = String, content_type = "text/html"))
+    responses((status = 200, description = "The viewer, as HTML.", body = String, content_type = "text/html"))
 )]
 async fn docs() -> Html<&'static str> {
     Html(PAGE)

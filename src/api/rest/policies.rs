@@ -21,11 +21,11 @@ use crate::policy::RequiredInput;
 use crate::service::keys::Caller;
 use crate::service::{App, Error, PageRequest, policies};
 use crate::serving::{self, PolicyDetails};
-use crate::store::Promotion;
+use crate::store::AliasHistoryEntry;
 
 type AppState = State<Arc<App>>;
 
-/// Largest checkpoint that is accepted, in bytes, unless the limit of bodies is higher.
+/// Maximum size of a checkpoint that is accepted, in bytes, unless the limit of bodies is higher.
 const MAX_CHECKPOINT: usize = 64 << 20;
 
 /// The routes.
@@ -46,7 +46,7 @@ pub(super) fn router() -> OpenApiRouter<Arc<App>> {
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct Paging {
-    /// At most this many items; 0: 100. A page ends early before it exceeds about 1 MiB.
+    /// Maximum number of items. 0: 100. A page has fewer items if it would exceed about 1 MiB.
     #[serde(default)]
     #[param(maximum = 1000)]
     page_size: u32,
@@ -121,15 +121,15 @@ struct Policy {
     r#ref: PolicyRef,
     kind: PolicyKind,
     description: String,
-    /// The only number of UAVs that it serves; absent: any.
+    /// The number of UAVs that the policy requires; absent: any number.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
     uavs: Option<u32>,
-    /// The only number of users that it serves; absent: any.
+    /// The number of users that the policy requires; absent: any number.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
     users: Option<u32>,
-    /// 8, or 9 with hovering.
+    /// 8, or 9 if the policy supports hover.
     #[schema(minimum = 8, maximum = 9)]
     headings: usize,
     needs: Needs,
@@ -139,7 +139,7 @@ struct Policy {
     aliases: Vec<String>,
     /// All versions of the policy.
     versions: Vec<u64>,
-    /// Whether this version is loaded.
+    /// Whether this version is loaded. If not loaded, open sessions continue and all other requests get 409 (`policy_unloaded`).
     loaded: bool,
     /// The versions that are loaded.
     loaded_versions: Vec<u64>,
@@ -163,7 +163,7 @@ enum PolicyKind {
     Baseline,
 }
 
-/// What an observation has to contain: detections; UAVs' own positions, too; a scene.
+/// The input that a policy requires: a graph; a graph with the position of every UAV; a scene.
 #[derive(Debug, Serialize, ToSchema)]
 enum Needs {
     #[serde(rename = "NEEDS_DETECTIONS")]
@@ -275,7 +275,7 @@ async fn upload(
     caller: Option<Extension<Caller>>,
     request: Request,
 ) -> Result<impl IntoResponse, Error> {
-    // Checked before a large body is read in vain.
+    // Checked before the body, which may be large, is read.
     policies::check_publishable(&name)?;
     let source = match extract::media_type(request.headers()) {
         Some(kind) if kind == "application/octet-stream" => {
@@ -288,7 +288,7 @@ async fn upload(
         }
         kind => return Err(extract::unsupported(kind, "application/octet-stream, or application/json with a checkpoint_id")),
     };
-    let (published, new) = policies::upload(&app, policies::PolicyUpload { name, source, alias, by: key_id(caller) }).await?;
+    let (published, new) = policies::publish(&app, policies::PublishRequest { name, source, alias, by: key_id(caller) }).await?;
     let location = [(header::LOCATION, format!("/v1/policies/{}", published.info.reference))];
     Ok((if new { StatusCode::CREATED } else { StatusCode::OK }, location, Json(Policy::from(published))))
 }
@@ -437,7 +437,7 @@ struct HistoryQuery {
     /// Only moves of this alias.
     #[param(schema_with = schemas::name, required = false)]
     alias: Option<String>,
-    /// At most this many moves; 0: 100.
+    /// Maximum number of moves. 0: 100.
     #[serde(default)]
     #[param(maximum = 1000)]
     page_size: u32,
@@ -463,9 +463,9 @@ struct AliasMove {
     by: Option<String>,
 }
 
-impl From<Promotion> for AliasMove {
-    fn from(promotion: Promotion) -> Self {
-        let Promotion { id: _, alias, version, previous, at, by } = promotion;
+impl From<AliasHistoryEntry> for AliasMove {
+    fn from(promotion: AliasHistoryEntry) -> Self {
+        let AliasHistoryEntry { id: _, alias, version, previous, at, by } = promotion;
         Self { alias, version, previous, at, by }
     }
 }

@@ -1,4 +1,4 @@
-//! Strings with a form of their own: their types, and schemas for `schema_with`.
+//! Schemas of strings with a pattern, for `schema_with`, and types that serialize as such strings.
 
 use std::time::Duration;
 
@@ -42,17 +42,17 @@ pub(super) fn policy_spec() -> RefOr<Schema> {
     string(concat!("^", name!(), "(@", name!(), "|:", version!(), ")?$"))
 }
 
-/// The same, or empty.
+/// NAME, NAME@ALIAS, NAME:VERSION or an empty string.
 pub(super) fn optional_policy_spec() -> RefOr<Schema> {
     string(concat!("^(", name!(), "(@", name!(), "|:", version!(), ")?)?$"))
 }
 
-/// Token of a page that begins after a number.
+/// Page token that contains a row id.
 pub(super) fn number_token() -> RefOr<Schema> {
     string("^[0-9]{0,18}$")
 }
 
-/// Token of a page that begins after a metric.
+/// Page token that contains the name and step of a metric.
 pub(super) fn metric_token() -> RefOr<Schema> {
     string("^([A-Za-z0-9_/.-]{1,63}@[0-9]{1,18})?$")
 }
@@ -68,7 +68,7 @@ impl PartialSchema for Binary {
 
 impl ToSchema for Binary {}
 
-/// A duration in seconds with an `s`: `0.000021000s`.
+/// A duration in seconds with the suffix `s`, as in the JSON form of protobuf: `0.000021000s`.
 #[derive(Debug)]
 pub(super) struct Seconds(pub(super) Duration);
 

@@ -43,13 +43,14 @@ struct OpenSessionRequest {
     /// NAME, NAME@ALIAS or NAME:VERSION; the session keeps the version that this resolves to now.
     #[schema(schema_with = schemas::policy_spec)]
     policy: String,
-    /// Empty: the server chooses a name.
+    /// Empty: the server generates an id. If the session is open: with no steps and the same options, the response contains it;
+    /// with a new `run_id` it is restarted; otherwise 409.
     #[serde(default)]
     #[schema(max_length = 128)]
     session_id: String,
     #[schema(min_length = 1, max_length = 128)]
     run_id: Option<String>,
-    /// Fixes what is random about the policy; derived from `session_id` and `run_id` when absent.
+    /// Seed of the random choices of the policy. Default: derived from `session_id` and `run_id`.
     #[serde(default, deserialize_with = "json::optional_integer")]
     seed: Option<u64>,
 }
@@ -59,10 +60,10 @@ struct Session {
     #[serde(rename = "session_id")]
     id: String,
     policy: PolicyRef,
-    /// Slots answered in the current run.
+    /// Number of steps in the current run.
     steps: u64,
     opened_at: Timestamp,
-    /// Idle time after which the session expires.
+    /// The session expires after this time without a request.
     ttl: Seconds,
 }
 
@@ -85,7 +86,7 @@ struct SessionPage {
     next_page_token: String,
 }
 
-/// Open a session: the server keeps the fleet's memory and pins the policy version
+/// Open a session: the server keeps the recurrent state of the fleet and pins the policy version
 #[utoipa::path(
     post, path = "/v1/sessions", operation_id = "openSession", tag = "sessions", request_body = OpenSessionRequest,
     responses((status = 201, description = "The open session.", body = Session), BadBody, NotFound, Conflict, Draining)
@@ -119,7 +120,7 @@ async fn get(State(app): AppState, Path(SessionPath { id }): Path<SessionPath>) 
     Ok(Json(sessions::get(&app, &id)?.into()))
 }
 
-/// Close a session after its step in flight
+/// Close a session, after a step that is in progress
 #[utoipa::path(
     delete, path = "/v1/sessions/{id}", operation_id = "closeSession", tag = "sessions", params(SessionPath),
     responses((status = 200, description = "The session as it ended.", body = Session), BadRequest, NotFound, Conflict)

@@ -20,7 +20,7 @@ use tokio::sync::{mpsc, oneshot};
 use self::client::{Client, ClientError};
 use self::training::{ReportQueue, TrainingTask};
 use super::Directive;
-use crate::store::AttemptResult;
+use crate::store::WorkerResult;
 use crate::wire::v1;
 
 /// Environment variable with the address of the server's gRPC.
@@ -32,7 +32,7 @@ pub const ENV_ATTEMPT: &str = "QEDGIX_ATTEMPT";
 /// Environment variable with the attempt's secret.
 pub const ENV_TOKEN: &str = "QEDGIX_TOKEN";
 
-/// Time between two heartbeats, and so the longest time until a cancel arrives.
+/// Time between two heartbeats, and so the maximum delay of a directive.
 const HEARTBEAT_INTERVAL: Duration = Duration::from_millis(400);
 
 /// The attempt to work on, and the server to report to.
@@ -65,7 +65,7 @@ pub enum Error {
     Training(String),
 }
 
-/// The directive for training, shared between threads: continue, until it is set to another.
+/// The directive for the training thread. Initially it is [`Directive::Continue`].
 #[derive(Debug, Default)]
 pub(crate) struct StopSignal(AtomicU8);
 
@@ -93,15 +93,16 @@ impl StopSignal {
     }
 }
 
-/// Lowers the priority of this process below that of servers on this machine, and lets the system end it first when memory
-/// runs out. Call it before starting threads, which inherit the priority.
+/// Lowers the CPU priority of this process, and makes it the first process that the system ends when memory runs out. To be
+/// called before threads start, because threads inherit the priority.
 pub fn lower_priority() {
     // Errors are ignored: training works without either.
     let _ = rustix::process::nice(10);
     let _ = std::fs::write("/proc/self/oom_score_adj", "500");
 }
 
-/// Ends this process when standard input is closed. The process that started this one holds the other end, so it has ended.
+/// Ends this process when its standard input is closed. The server that started this process holds the other end of the pipe,
+/// so the pipe closes when the server ends.
 ///
 /// # Errors
 /// [`std::io::Error`] when the system refuses a thread.
@@ -128,16 +129,16 @@ pub async fn run(assignment: Assignment) -> Result<(), Error> {
         stop.set(Directive::Pause);
         std::future::pending::<ClientError>().await
     };
-    // No heartbeat is sent beside the last call, because it would find that the attempt has ended.
+    // Heartbeats stop before `finish` is called: after it, a heartbeat would fail because the attempt has ended.
     let result = tokio::select! {
         result = train(&client, Arc::clone(&stop)) => result?,
         error = send_heartbeats(&client, &stop) => return Err(error.into()),
         error = pause => return Err(error.into()),
     };
     let (outcome, reason, permanent) = match result {
-        AttemptResult::Succeeded => (v1::Outcome::Succeeded, String::new(), false),
-        AttemptResult::Stopped => (v1::Outcome::Stopped, String::new(), false),
-        AttemptResult::Failed { reason, permanent } => (v1::Outcome::Failed, reason, permanent),
+        WorkerResult::Succeeded => (v1::Outcome::Succeeded, String::new(), false),
+        WorkerResult::Stopped => (v1::Outcome::Stopped, String::new(), false),
+        WorkerResult::Failed { reason, permanent } => (v1::Outcome::Failed, reason, permanent),
     };
     tracing::info!(?outcome, reason, "training ended");
     client.finish(v1::FinishRequest { outcome: outcome.into(), reason: reason.clone(), permanent }).await?;
@@ -155,7 +156,7 @@ async fn send_heartbeats(client: &Client, stop: &StopSignal) -> ClientError {
     }
 }
 
-async fn train(client: &Client, stop: Arc<StopSignal>) -> Result<AttemptResult, Error> {
+async fn train(client: &Client, stop: Arc<StopSignal>) -> Result<WorkerResult, Error> {
     let task = client.fetch().await?;
     let config = serde_json::from_str(&task.config).map_err(Error::Configuration)?;
     let snapshot = match task.snapshot_step {
@@ -174,7 +175,7 @@ async fn train(client: &Client, stop: Arc<StopSignal>) -> Result<AttemptResult, 
         let result = std::panic::catch_unwind(AssertUnwindSafe(|| training::train(task, &reports, &stop)));
         let result = result.unwrap_or_else(|panic| {
             let reason = format!("panic: {}", panic_message(&*panic));
-            AttemptResult::Failed { reason, permanent: false }
+            WorkerResult::Failed { reason, permanent: false }
         });
         // Closes the queue, so that sending ends after the last report.
         drop(reports);

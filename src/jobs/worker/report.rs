@@ -13,7 +13,7 @@ use crate::wire::v1;
 
 /// Time in which metrics are collected for a batch.
 const BATCH_DELAY: Duration = Duration::from_millis(100);
-/// Most metrics in a batch.
+/// Maximum number of metrics in a batch.
 const BATCH_SIZE: usize = 2000;
 
 /// Sends all reports until training has closed the queue. Clears `snapshot_pending` after each snapshot.

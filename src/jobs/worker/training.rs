@@ -11,14 +11,14 @@ use crate::checkpoint::Checkpoint;
 use crate::env::EpisodeMetrics;
 use crate::jobs::Directive;
 use crate::learner::{Evaluation, Event, TrainConfig, Trainer, evaluate, layout_list};
-use crate::store::AttemptResult;
+use crate::store::WorkerResult;
 use crate::wire::v1::CheckpointKind;
 
-/// The layouts on which a job's initial and published policies are evaluated. Training never uses them.
-const REFERENCE: &str = "eval-v1";
+/// The layouts on which the initial and the published policy of a job are evaluated. Training never uses them.
+const EVAL_LAYOUTS: &str = "eval-v1";
 /// The metric of that evaluation.
-const REFERENCE_ROW: &str = "eval-v1/mean_aoi";
-/// Most points of a curve. Longer runs skip iterations, the same ones in every run.
+const EVAL_METRIC: &str = "eval-v1/mean_aoi";
+/// Maximum number of points of a curve. Longer runs skip iterations, the same ones in every run.
 const MAX_POINTS: u64 = 4000;
 
 /// A metric: step, name, value.
@@ -79,15 +79,15 @@ impl ReportQueue {
 }
 
 /// Trains until the end, or until `stop` is set.
-pub(super) fn train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> AttemptResult {
+pub(super) fn train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> WorkerResult {
     match try_train(task, reports, stop) {
         Ok(end) => end,
         // Another attempt would fail with the same configuration, snapshot or weights.
-        Err(e) => AttemptResult::Failed { reason: e.to_string(), permanent: true },
+        Err(e) => WorkerResult::Failed { reason: e.to_string(), permanent: true },
     }
 }
 
-fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Result<AttemptResult, Box<dyn std::error::Error>> {
+fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Result<WorkerResult, Box<dyn std::error::Error>> {
     let TrainingTask { config, threads, snapshot, snapshot_every } = task;
     let mut trainer = match &snapshot {
         Some(bytes) => Trainer::restore(bytes, threads)?,
@@ -95,10 +95,10 @@ fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Re
     };
     drop(snapshot);
     if trainer.step() == 0 {
-        let untrained = reference(&trainer.checkpoint()?, threads)?;
-        reports.push(Report::Metrics { step: 0, rows: vec![(0, REFERENCE_ROW, untrained)] });
+        let untrained = eval_mean_aoi(&trainer.checkpoint()?, threads)?;
+        reports.push(Report::Metrics { step: 0, rows: vec![(0, EVAL_METRIC, untrained)] });
     }
-    let mut curve = Curve::new(trainer.config(), trainer.step());
+    let mut curve = CurveSampler::new(trainer.config(), trainer.step());
     let mut last_snapshot = Instant::now();
     while stop.directive() == Directive::Continue
         && let Some(event) = trainer.next()
@@ -115,7 +115,7 @@ fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Re
             }
             Event::Diverged { step } => {
                 let reason = format!("training diverged at step {step}: a weight is not finite or too large");
-                return Ok(AttemptResult::Failed { reason, permanent: true });
+                return Ok(WorkerResult::Failed { reason, permanent: true });
             }
             Event::Iteration(_) | Event::Evaluation(_) | Event::Finished { .. } => {}
         }
@@ -125,59 +125,57 @@ fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Re
         }
     }
     match stop.directive() {
-        Directive::Cancel => Ok(AttemptResult::Stopped),
+        Directive::Cancel => Ok(WorkerResult::Stopped),
         Directive::Pause if !trainer.finished() => {
             reports.snapshot(&trainer);
-            Ok(AttemptResult::Stopped)
+            Ok(WorkerResult::Stopped)
         }
         Directive::Pause | Directive::Continue => {
             reports.checkpoint(CheckpointKind::Last, &trainer.checkpoint()?);
-            let best = trainer.best()?.ok_or("no policy was ever evaluated")?;
+            let best = trainer.best()?.ok_or("no policy has been evaluated")?;
             let step = trainer.step();
-            reports.push(Report::Metrics { step, rows: vec![(step, REFERENCE_ROW, reference(&best, threads)?)] });
-            Ok(AttemptResult::Succeeded)
+            reports.push(Report::Metrics { step, rows: vec![(step, EVAL_METRIC, eval_mean_aoi(&best, threads)?)] });
+            Ok(WorkerResult::Succeeded)
         }
     }
 }
 
-/// Mean AoI of a policy on the reference layouts.
-fn reference(checkpoint: &Checkpoint, threads: usize) -> Result<f64, Box<dyn std::error::Error>> {
-    let seeds = layout_list(REFERENCE)?.seeds(usize::MAX);
+/// Mean AoI of a policy on [`EVAL_LAYOUTS`].
+fn eval_mean_aoi(checkpoint: &Checkpoint, threads: usize) -> Result<f64, Box<dyn std::error::Error>> {
+    let seeds = layout_list(EVAL_LAYOUTS)?.seeds(usize::MAX);
     let episodes = evaluate(&checkpoint.policy(), &checkpoint.config().environment, &seeds, threads)?;
     Ok(EpisodeMetrics::mean(&episodes).mean_aoi)
 }
 
-/// Selects the iterations that become points of a curve, and measures their speed.
-struct Curve {
-    /// Environment steps per iteration.
-    iteration: u64,
-    /// Every so many iterations one becomes a point.
-    stride: u64,
-    /// Environment steps of the run.
-    steps: u64,
+/// Selects the iterations that become points of a training curve, and adds the training speed to them.
+struct CurveSampler {
+    steps_per_iteration: u64,
+    iterations_per_point: u64,
+    /// Environment steps of the whole run.
+    total_steps: u64,
     /// Step and time of the last point.
-    point: (u64, Instant),
+    last_point: (u64, Instant),
 }
 
-impl Curve {
+impl CurveSampler {
     fn new(config: &TrainConfig, step: u64) -> Self {
-        let iteration = (config.training.envs * config.environment.slots) as u64;
-        let steps = config.training.steps;
-        let stride = steps.div_ceil(iteration).div_ceil(MAX_POINTS).max(1);
-        Self { iteration, stride, steps, point: (step, Instant::now()) }
+        let steps_per_iteration = (config.training.envs * config.environment.slots) as u64;
+        let total_steps = config.training.steps;
+        let iterations_per_point = total_steps.div_ceil(steps_per_iteration).div_ceil(MAX_POINTS).max(1);
+        Self { steps_per_iteration, iterations_per_point, total_steps, last_point: (step, Instant::now()) }
     }
 
     fn rows(&mut self, event: &Event) -> Vec<Row> {
         let mut rows = event.rows();
         if let Event::Iteration(done) = event {
-            let regular = (done.step / self.iteration).is_multiple_of(self.stride);
-            if !regular && done.step < self.steps {
+            let regular = (done.step / self.steps_per_iteration).is_multiple_of(self.iterations_per_point);
+            if !regular && done.step < self.total_steps {
                 return Vec::new();
             }
             let now = Instant::now();
-            let seconds = (now - self.point.1).as_secs_f64();
-            rows.push((done.step, "env_steps_per_s", (done.step - self.point.0) as f64 / seconds));
-            self.point = (done.step, now);
+            let seconds = (now - self.last_point.1).as_secs_f64();
+            rows.push((done.step, "env_steps_per_s", (done.step - self.last_point.0) as f64 / seconds));
+            self.last_point = (done.step, now);
         }
         rows
     }
@@ -192,8 +190,8 @@ mod tests {
     fn curve_of(steps: u64) -> Vec<u64> {
         let mut config = TrainConfig::preset(Algorithm::Qmix, Preset::Practical);
         config.training.steps = steps;
-        let (mut curve, mut points) = (Curve::new(&config, 0), Vec::new());
-        let iteration = curve.iteration;
+        let (mut curve, mut points) = (CurveSampler::new(&config, 0), Vec::new());
+        let iteration = curve.steps_per_iteration;
         for step in (iteration..steps + iteration).step_by(iteration as usize) {
             let done = Iteration {
                 step,

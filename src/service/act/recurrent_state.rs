@@ -3,12 +3,12 @@
 use std::sync::Arc;
 use std::time::Instant;
 
+use super::compute;
 use super::request::{Request, Response};
-use super::slot;
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::service::{App, Error};
-use crate::serving::{Fleet, LoadedPolicy, Observation, OutputBuffers, PolicySpec, RecurrentState, Task};
+use crate::serving::{FleetIds, FleetInput, LoadedPolicy, OutputBuffers, PolicySpec, RecurrentState, Task};
 
 pub(super) async fn act(app: &App, state: &[u8], request: Request, deadline: Option<Instant>) -> Result<Response, Error> {
     let Some(spec) = &request.policy else {
@@ -19,38 +19,38 @@ pub(super) async fn act(app: &App, state: &[u8], request: Request, deadline: Opt
         None => app.registry.resolve(spec)?,
         Some(state) => pinned_version(app, spec, state)?,
     };
-    let Observation { fleet, uav_order: order, content } = request.observation;
-    let slot = slot::build(content, fleet.size(), &policy).await?;
+    let FleetInput { fleet, canonical_of_request, content } = request.input;
+    let slot = compute::convert(content, fleet.size(), &policy).await?;
     let step = state.as_ref().map_or(0, |state| state.step);
     if let Some(sent) = request.step.filter(|&sent| sent != step) {
-        let message = format!("step {sent} does not match recurrent_state, which is of step {step}");
+        let message = format!("step {sent} does not match recurrent_state, which belongs to step {step}");
         return Err(Error::Precondition { code: ErrorCode::WrongStep, message });
     }
     let memory = if let Some(state) = state {
         memory_of(state, &fleet, &policy)?
     } else {
-        let mut memory = vec![0.0; policy.policy.memory_len(slot.uavs(), slot.users())];
-        policy.policy.start(slot.uavs(), slot.users(), request.seed.unwrap_or(0), &mut memory);
+        let mut memory = vec![0.0; policy.implementation.memory_len(slot.uavs(), slot.users())];
+        policy.implementation.start(slot.uavs(), slot.users(), request.seed.unwrap_or(0), &mut memory);
         memory
     };
     let task = Task::new(policy.clone(), slot, step, memory, OutputBuffers::default());
-    let output = slot::compute(app, task, deadline).await?;
+    let output = compute::run(app, task, deadline).await?;
     let next = RecurrentState::new(policy.reference.digest, step.saturating_add(1), &fleet, output.memory);
     let recurrent_state = Some(next.encode());
-    Ok(Response { policy, uavs: fleet.uavs, order, decision: output.decision, recurrent_state })
+    Ok(Response { policy, uavs: fleet.uavs, canonical_of_request, decision: output.decision, recurrent_state })
 }
 
 /// The version that wrote `state`: an episode stays on its version even if an alias has moved or a newer version has been
 /// published.
 fn pinned_version(app: &App, spec: &PolicySpec, state: &RecurrentState) -> Result<Arc<LoadedPolicy>, Error> {
-    app.registry.pinned(spec, &state.digest)?.ok_or_else(|| {
+    app.registry.find_by_digest(spec, &state.digest)?.ok_or_else(|| {
         let expected = format!("the recurrent_state of an earlier response of {spec}");
         Invalid::new("recurrent_state", "the state of another policy or version", expected).into()
     })
 }
 
 /// The memory in `state`, checked against the fleet and the policy.
-fn memory_of(state: RecurrentState, fleet: &Fleet, policy: &LoadedPolicy) -> Result<Vec<f32>, Invalid> {
+fn memory_of(state: RecurrentState, fleet: &FleetIds, policy: &LoadedPolicy) -> Result<Vec<f32>, Invalid> {
     let wrong = |value: &str| {
         let expected = "the recurrent_state of an earlier response to the same UAVs and users";
         Invalid::new("recurrent_state", value, expected)
@@ -62,7 +62,7 @@ fn memory_of(state: RecurrentState, fleet: &Fleet, policy: &LoadedPolicy) -> Res
     if state.fleet != fleet.fingerprint() {
         return Err(wrong("the state of UAVs or users with other ids"));
     }
-    if state.memory.len() != policy.policy.memory_len(uavs, users) {
+    if state.memory.len() != policy.implementation.memory_len(uavs, users) {
         return Err(wrong("a state of another length"));
     }
     Ok(state.memory)

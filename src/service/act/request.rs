@@ -5,17 +5,17 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 
-use crate::serving::{Decision, LoadedPolicy, Observation, PolicySpec};
+use crate::serving::{Decision, FleetInput, LoadedPolicy, PolicySpec};
 
 /// A request for one slot.
 #[derive(Clone, Debug)]
 pub struct Request {
     /// The policy; optional for sessions, which are pinned to one.
     pub policy: Option<PolicySpec>,
-    /// The observation of the fleet.
-    pub observation: Observation,
+    /// Positions or detections of the fleet.
+    pub input: FleetInput,
     /// Where the fleet's memory is kept.
-    pub memory: Memory,
+    pub memory: MemoryLocation,
     /// The step, if the caller counts steps.
     pub step: Option<u64>,
     /// The run of a session; ignored if the caller keeps the memory.
@@ -26,7 +26,7 @@ pub struct Request {
 
 /// Where the memory of a fleet is kept between slots.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Memory {
+pub enum MemoryLocation {
     /// On the server, in this session.
     Session(String),
     /// On the server, in a session that the requests themselves begin and end.
@@ -64,7 +64,7 @@ impl fmt::Display for SequenceId {
     }
 }
 
-/// The decision for one slot. Its headings are in canonical order of UAVs; `order` leads to the order of the request.
+/// The decision for one slot. Its headings are in canonical order of UAVs; `canonical_of_request` leads to the order of the request.
 #[derive(Clone, Debug)]
 pub struct Response {
     /// The policy version that decided.
@@ -72,7 +72,7 @@ pub struct Response {
     /// Ids of UAVs in canonical order.
     pub uavs: Vec<String>,
     /// Canonical index of each UAV in the order of the request.
-    pub order: Vec<u32>,
+    pub canonical_of_request: Vec<u32>,
     /// The decision.
     pub decision: Decision,
     /// Memory for the next slot, if the caller keeps it.

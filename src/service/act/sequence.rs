@@ -6,13 +6,13 @@
 use std::sync::Arc;
 use std::time::Instant;
 
+use super::compute;
 use super::request::{Request, Response, Sequence, SequenceId};
 use super::session::{self, SessionStep};
-use super::slot;
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::service::{App, Error};
-use crate::serving::{Observation, PolicySpec, Session};
+use crate::serving::{FleetInput, PolicySpec, Session};
 
 /// Prefix of the names of sessions that are sequences.
 pub const SEQUENCE_PREFIX: &str = "sequence:";
@@ -53,7 +53,7 @@ fn not_started(id: &SequenceId, policy: &str) -> Error {
     Error::Precondition { code: ErrorCode::SequenceNotStarted, message }
 }
 
-/// The first slot. If it is rejected because of its observation, a running sequence of this name continues unchanged.
+/// Runs the first slot. If its input is invalid, a running sequence of this name continues unchanged.
 async fn start(
     app: &App,
     name: &str,
@@ -66,10 +66,10 @@ async fn start(
         return Err(Error::Precondition { code: ErrorCode::WrongStep, message });
     }
     let policy = app.registry.resolve(spec)?;
-    let Observation { fleet, uav_order, content } = request.observation;
-    let slot = slot::build(content, fleet.size(), &policy).await?;
-    let step = SessionStep { fleet, uav_order, slot, step: Some(0), run_id: None };
-    let mut guard = StartGuard { app, session: app.sessions.begin(name, policy, request.seed)?, completed: false };
+    let FleetInput { fleet, canonical_of_request, content } = request.input;
+    let slot = compute::convert(content, fleet.size(), &policy).await?;
+    let step = SessionStep { fleet, canonical_of_request, slot, step: Some(0), run_id: None };
+    let mut guard = StartGuard { app, session: app.sessions.start_replacing(name, policy, request.seed)?, completed: false };
     let response = session::advance(app, &guard.session, step, deadline).await?;
     guard.completed = true;
     Ok((guard.session.clone(), response))

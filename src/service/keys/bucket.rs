@@ -1,9 +1,8 @@
 //! Rate limits: a lock-free token bucket (GCRA) on nanosecond time stamps that the caller passes in.
 //!
-//! The crate `governor` implements the same algorithm and cannot replace it here. A batch is answered first and charged
-//! afterwards, possibly with more requests than the burst, and the following requests wait for it; governor's `check_n` refuses a
-//! charge that exceeds the burst and takes nothing when too few tokens are left. governor also counts whole requests, and
-//! rates of API keys may be fractional.
+//! The crate `governor` implements the same algorithm, but lacks two features that API keys need. First, a batch is charged
+//! after it was accepted, possibly with more requests than the burst; later requests then wait. `check_n` of governor refuses
+//! such a charge. Second, rates of API keys may be fractions of a request per second; governor counts whole requests.
 
 use std::ops::RangeInclusive;
 use std::sync::atomic::{AtomicI64, Ordering};
@@ -35,15 +34,19 @@ impl Rate {
 pub struct TokenBucket {
     /// Time between two tokens.
     interval: i64,
-    /// How far `full_at` may lie ahead of now while a token is left.
-    slack: i64,
+    /// A token is left while `full_at` is at most this far in the future: the time to refill all tokens but one.
+    burst_allowance: i64,
     full_at: AtomicI64,
 }
 
 impl TokenBucket {
     pub fn new(rate: Rate) -> Self {
         let interval = 1e9 / rate.per_second;
-        Self { interval: interval as i64, slack: (interval * (rate.burst - 1.0)) as i64, full_at: AtomicI64::new(i64::MIN) }
+        Self {
+            interval: interval as i64,
+            burst_allowance: (interval * (rate.burst - 1.0)) as i64,
+            full_at: AtomicI64::new(i64::MIN),
+        }
     }
 
     /// Takes one token at `now`.
@@ -64,7 +67,7 @@ impl TokenBucket {
     }
 
     fn wait(&self, full_at: i64, now: i64) -> i64 {
-        full_at.saturating_sub(now).saturating_sub(self.slack)
+        full_at.saturating_sub(now).saturating_sub(self.burst_allowance)
     }
 
     fn later(&self, full_at: i64, tokens: u32, now: i64) -> i64 {

@@ -40,7 +40,7 @@ struct Key {
     expires_at: AtomicI64,
     last_used_at: AtomicI64,
     /// Value of `last_used_at` in the database.
-    saved_at: AtomicI64,
+    stored_last_used_at: AtomicI64,
 }
 
 /// The sender of a request, identified by its API key. Transports put it into the extensions of the request.
@@ -114,7 +114,7 @@ impl Keyring {
         let keys: Vec<Arc<Key>> = self.keys.read().unwrap_or_else(PoisonError::into_inner).values().cloned().collect();
         let changed = |key: &Arc<Key>| {
             let used_at = key.last_used_at.load(Ordering::Relaxed);
-            (used_at != key.saved_at.load(Ordering::Relaxed)).then(|| (Arc::clone(key), used_at))
+            (used_at != key.stored_last_used_at.load(Ordering::Relaxed)).then(|| (Arc::clone(key), used_at))
         };
         let used: Vec<(Arc<Key>, i64)> = keys.iter().filter_map(changed).collect();
         let rows = used.iter().filter_map(|(key, at)| Some((key.id.clone(), Timestamp::from_millisecond(*at).ok()?)));
@@ -123,7 +123,7 @@ impl Keyring {
             return Ok(());
         }
         store.touch_keys(&rows).await?;
-        used.iter().for_each(|(key, at)| key.saved_at.store(*at, Ordering::Relaxed));
+        used.iter().for_each(|(key, at)| key.stored_last_used_at.store(*at, Ordering::Relaxed));
         Ok(())
     }
 }
@@ -139,7 +139,7 @@ impl Key {
             revoked: AtomicBool::new(false),
             expires_at: AtomicI64::new(i64::MAX),
             last_used_at: AtomicI64::new(used_at),
-            saved_at: AtomicI64::new(used_at),
+            stored_last_used_at: AtomicI64::new(used_at),
             id: record.id.clone(),
         };
         key.update(&record);

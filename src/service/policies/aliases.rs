@@ -2,15 +2,15 @@
 
 use std::collections::BTreeMap;
 
-use super::{PolicyStores, serialized};
+use super::{PolicyStores, one_at_a_time};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
-use crate::service::paging::number;
+use crate::service::paging::parse_number;
 use crate::service::{App, Error, Page, PageRequest};
 use crate::serving::{PolicyKind, PolicyRef, PolicySpec, Registry, VersionSelector, check_name};
-use crate::store::{AliasMove, Promotion, PromotionFilter};
+use crate::store::{AliasHistoryEntry, AliasHistoryFilter, AliasMove};
 
-/// Most aliases of one policy.
+/// Maximum number of aliases of one policy.
 const MAX_ALIASES: usize = 100;
 
 /// An alias to set or delete.
@@ -44,7 +44,7 @@ pub fn aliases(app: &App, name: &str) -> Result<BTreeMap<String, u64>, Error> {
 pub async fn set_alias(app: &App, change: AliasChange, version: u64) -> Result<Option<u64>, Error> {
     check_names(&change)?;
     let at = app.clock.now();
-    serialized(app, async move |PolicyStores { store, registry }| {
+    one_at_a_time(app, async move |PolicyStores { store, registry }| {
         let AliasChange { name, alias, by, .. } = &change;
         let spec = PolicySpec { name: name.clone(), version: VersionSelector::Version(version) };
         let found = registry.describe(&spec)?;
@@ -73,7 +73,7 @@ pub async fn set_alias(app: &App, change: AliasChange, version: u64) -> Result<O
 pub async fn delete_alias(app: &App, change: AliasChange) -> Result<(), Error> {
     check_names(&change)?;
     let at = app.clock.now();
-    serialized(app, async move |PolicyStores { store, registry }| {
+    one_at_a_time(app, async move |PolicyStores { store, registry }| {
         let AliasChange { name, alias, by, .. } = &change;
         let Some(version) = registry.aliases(name)?.remove(alias) else {
             return Err(Error::not_found("alias", format!("{name}@{alias}")));
@@ -93,14 +93,14 @@ pub async fn delete_alias(app: &App, change: AliasChange) -> Result<(), Error> {
 /// # Errors
 /// [`Error::NotFound`]: there is no such policy. [`Error::Invalid`]: the page size is out of range, or the token is
 /// invalid.
-pub async fn history(app: &App, name: &str, alias: Option<&str>, page: &PageRequest) -> Result<Page<Promotion>, Error> {
+pub async fn history(app: &App, name: &str, alias: Option<&str>, page: &PageRequest) -> Result<Page<AliasHistoryEntry>, Error> {
     check_name("policy", name)?;
     if let Some(alias) = alias {
         check_name("alias", alias)?;
     }
     app.registry.aliases(name)?;
-    let (limit, before) = (page.usual_limit()?, page.position(number)?);
-    let mut moves = app.store.promotions(PromotionFilter { name, alias, before }, limit as u32 + 1).await?;
+    let (limit, before) = (page.usual_limit()?, page.parse_token(parse_number)?);
+    let mut moves = app.store.alias_history(AliasHistoryFilter { name, alias, before }, limit as u32 + 1).await?;
     let more = moves.len() > limit;
     moves.truncate(limit);
     Ok(Page::new(moves, more, |last| last.id.to_string()))

@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use sha2::{Digest, Sha256};
 
-use super::publish::{StoredVersion, publish};
-use super::{PolicyStores, serialized};
+use super::publish::{StoredVersion, publish_bytes};
+use super::{PolicyStores, one_at_a_time};
 use crate::invalid::Invalid;
 use crate::policy::baselines::{self, EnvParams};
 use crate::service::{App, Error};
@@ -21,20 +21,20 @@ pub struct IndexEntry {
     /// The version.
     pub version: u64,
     /// Whether it is loaded.
-    pub ready: bool,
+    pub loaded: bool,
     /// Why the version is not loaded; empty if it is.
     pub reason: String,
 }
 
 /// All versions by name and number.
 pub fn index(app: &App) -> Vec<IndexEntry> {
-    let entry = |reference: &PolicyRef, ready| IndexEntry {
+    let entry = |reference: &PolicyRef, loaded| IndexEntry {
         name: reference.name.clone(),
         version: reference.version,
-        ready,
-        reason: if ready { String::new() } else { "unloaded".to_owned() },
+        loaded,
+        reason: if loaded { String::new() } else { "unloaded".to_owned() },
     };
-    app.registry.versions().iter().map(|(info, ready)| entry(&info.reference, *ready)).collect()
+    app.registry.versions().iter().map(|(info, loaded)| entry(&info.reference, *loaded)).collect()
 }
 
 /// Loads every version of a policy (`NAME`) or one (`NAME:VERSION`). Loaded versions stay as they are.
@@ -44,24 +44,24 @@ pub fn index(app: &App) -> Vec<IndexEntry> {
 pub async fn load_policy(app: &App, name: &str) -> Result<(), Error> {
     let spec = spec_of(name)?;
     let now = app.clock.now();
-    serialized(app, async move |PolicyStores { store, registry }| {
-        let mut loaded = Vec::new();
-        for (info, ready) in versions(&registry, &spec)? {
-            loaded.push(match (ready, info.kind) {
+    one_at_a_time(app, async move |PolicyStores { store, registry }| {
+        let mut to_insert = Vec::new();
+        for (info, loaded) in versions(&registry, &spec)? {
+            to_insert.push(match (loaded, info.kind) {
                 (true, _) => continue,
                 (false, PolicyKind::Baseline) => {
                     let missing = || Error::not_found("policy", info.reference.to_string());
-                    let policy = baselines::by_name(&spec.name, EnvParams::default()).ok_or_else(missing)?;
-                    LoadedPolicy { info, policy }
+                    let implementation = baselines::by_name(&spec.name, EnvParams::default()).ok_or_else(missing)?;
+                    LoadedPolicy { info, implementation }
                 }
                 (false, PolicyKind::Checkpoint) => {
                     StoredVersion::read(&store, &spec.name, info.reference.version).await?.load().await?
                 }
             });
         }
-        let numbers: Vec<u64> = loaded.iter().map(|policy| policy.reference.version).collect();
+        let numbers: Vec<u64> = to_insert.iter().map(|policy| policy.reference.version).collect();
         store.set_policy_versions_loaded(&spec.name, &numbers, true, now).await?;
-        for policy in loaded {
+        for policy in to_insert {
             tracing::info!(policy = %policy.reference, "policy loaded");
             registry.insert(policy);
         }
@@ -78,9 +78,9 @@ pub async fn load_policy(app: &App, name: &str) -> Result<(), Error> {
 pub async fn unload_policy(app: &App, name: &str) -> Result<(), Error> {
     let spec = spec_of(name)?;
     let now = app.clock.now();
-    serialized(app, async move |PolicyStores { store, registry }| {
+    one_at_a_time(app, async move |PolicyStores { store, registry }| {
         let all = versions(&registry, &spec)?;
-        let numbers: Vec<u64> = all.iter().filter(|(_, ready)| *ready).map(|(info, _)| info.reference.version).collect();
+        let numbers: Vec<u64> = all.iter().filter(|(_, loaded)| *loaded).map(|(info, _)| info.reference.version).collect();
         store.set_policy_versions_loaded(&spec.name, &numbers, false, now).await?;
         for version in numbers {
             registry.unload(&spec.name, version);
@@ -109,16 +109,16 @@ fn versions(registry: &Registry, spec: &PolicySpec) -> Result<Vec<(Arc<PolicyInf
 }
 
 /// Fills the registry with baselines, published versions, bundled policies and aliases. Unloaded versions stay unloaded. A
-/// damaged version is logged and left out.
+/// damaged version is logged and skipped.
 ///
 /// # Errors
 /// [`Error::Internal`] when the database fails, [`Error::Invalid`] when a bundled policy is not a checkpoint.
-pub async fn load(app: &App) -> Result<(), Error> {
-    let world = EnvParams::default();
+pub async fn fill_registry(app: &App) -> Result<(), Error> {
+    let params = EnvParams::default();
     for baseline in &baselines::LIST {
-        let Some(policy) = baselines::by_name(baseline.name, world) else { continue };
+        let Some(policy) = baselines::by_name(baseline.name, params) else { continue };
         // Equal digests mean equal headings, as for checkpoints.
-        let digest = Sha256::digest(format!("baseline {} {world:?}", baseline.name)).into();
+        let digest = Sha256::digest(format!("baseline {} {params:?}", baseline.name)).into();
         let reference = PolicyRef { name: baseline.name.to_owned(), version: 1, digest };
         app.registry.insert(LoadedPolicy::baseline(reference, baseline.description, policy, app.clock.now()));
     }
@@ -132,7 +132,7 @@ pub async fn load(app: &App) -> Result<(), Error> {
         }
     }
     for (name, bytes) in BUNDLED {
-        publish(app, name, bytes.to_vec()).await?;
+        publish_bytes(app, name, bytes.to_vec()).await?;
     }
     for alias in app.store.policy_aliases().await? {
         app.registry.set_alias(&alias.name, &alias.alias, alias.version);

@@ -1,7 +1,7 @@
 //! The use cases of policies: list, get and export; publish checkpoints as versions; move aliases; load and unload versions.
 //!
-//! A change is committed to the database first and applied to the registry afterwards. Changes are serialized, so the registry
-//! passes through the states of the database in order. A change runs to its end even if the caller disconnects.
+//! A change is committed to the database first and applied to the registry afterwards. Changes run one at a time, so the registry
+//! passes through the states of the database in order. A change completes even if the caller disconnects.
 
 mod aliases;
 mod loading;
@@ -11,8 +11,8 @@ mod upload_limit;
 use std::sync::Arc;
 
 pub use aliases::{AliasChange, aliases, delete_alias, history, set_alias};
-pub use loading::{IndexEntry, index, load, load_policy, unload_policy};
-pub use publish::{CheckpointSource, PolicyUpload, check_publishable, publish, upload};
+pub use loading::{IndexEntry, fill_registry, index, load_policy, unload_policy};
+pub use publish::{CheckpointSource, PublishRequest, check_publishable, publish, publish_bytes};
 pub use upload_limit::{UploadLimit, UploadPermit};
 
 use super::paging::json_bytes;
@@ -59,8 +59,8 @@ struct PolicyStores {
     registry: Arc<Registry>,
 }
 
-/// Runs `change` after all changes before it, to its end.
-async fn serialized<T, F>(app: &App, change: impl FnOnce(PolicyStores) -> F) -> Result<T, Error>
+/// Runs `change` after all changes that were begun before. It completes even if the caller disconnects.
+async fn one_at_a_time<T, F>(app: &App, change: impl FnOnce(PolicyStores) -> F) -> Result<T, Error>
 where
     T: Send + 'static,
     F: Future<Output = Result<T, Error>> + Send + 'static,
@@ -68,7 +68,7 @@ where
     let registry = app.registry.clone();
     let change = change(PolicyStores { store: app.store.clone(), registry: registry.clone() });
     let task = tokio::spawn(async move {
-        let _turn = registry.lock_changes().await;
+        let _lock = registry.lock_changes().await;
         change.await
     });
     task.await.map_err(Error::internal)?

@@ -8,7 +8,7 @@ use sha2::{Digest, Sha256};
 
 use super::aliases::{check_alias, unloaded};
 use super::upload_limit::UploadPermit;
-use super::{PolicyStores, serialized};
+use super::{PolicyStores, one_at_a_time};
 use crate::checkpoint::Checkpoint;
 use crate::invalid::Invalid;
 use crate::policy::baselines;
@@ -28,7 +28,7 @@ pub enum CheckpointSource {
 
 /// A request to publish a checkpoint.
 #[derive(Debug)]
-pub struct PolicyUpload {
+pub struct PublishRequest {
     /// Name of the policy; it may be new.
     pub name: String,
     /// The checkpoint.
@@ -56,19 +56,19 @@ pub fn check_publishable(name: &str) -> Result<(), Invalid> {
 ///
 /// # Errors
 /// [`Error::Invalid`] for a name or bytes that cannot be published, [`Error::Internal`] when the database fails.
-pub async fn publish(app: &App, name: &str, bytes: Vec<u8>) -> Result<PolicyRef, Error> {
+pub async fn publish_bytes(app: &App, name: &str, bytes: Vec<u8>) -> Result<PolicyRef, Error> {
     let (reference, _) = store_version(app, name, CheckpointBytes { bytes, _permit: None }, None, None).await?;
     Ok(reference)
 }
 
-/// Publishes the checkpoint of a caller. Returns the version, and whether it is new.
+/// Publishes a checkpoint, uploaded or of a job, on request of a caller. Returns the version, and whether it is new.
 ///
 /// # Errors
-/// As [`publish`]; [`Error::NotFound`] for an unknown checkpoint, [`Error::Precondition`] for an alias to an unloaded version,
+/// As [`publish_bytes`]; [`Error::NotFound`] for an unknown checkpoint, [`Error::Precondition`] for an alias to an unloaded version,
 /// [`Error::Draining`].
-pub async fn upload(app: &App, upload: PolicyUpload) -> Result<(PolicyDetails, bool), Error> {
+pub async fn publish(app: &App, request: PublishRequest) -> Result<(PolicyDetails, bool), Error> {
     app.admit()?;
-    let PolicyUpload { name, source, alias, by } = upload;
+    let PublishRequest { name, source, alias, by } = request;
     check_publishable(&name)?;
     if let Some(alias) = &alias {
         check_name("alias", alias)?;
@@ -93,7 +93,7 @@ async fn store_version(
     let parsed = ParsedCheckpoint::parse(checkpoint).await?;
     let mut reference = PolicyRef { name: name.to_owned(), version: 0, digest: parsed.digest };
     let now = app.clock.now();
-    serialized(app, async move |PolicyStores { store, registry }| {
+    one_at_a_time(app, async move |PolicyStores { store, registry }| {
         let of_name = registry.versions_of(&reference.name);
         let known = of_name.into_iter().find(|(info, _)| info.reference.digest == reference.digest);
         if let Some(alias) = &alias {
@@ -147,8 +147,8 @@ impl ParsedCheckpoint {
         let parsed = tokio::task::spawn_blocking(move || {
             let bytes = &source.bytes;
             let size = bytes.len();
-            let refused = |e| Invalid::new("checkpoint", format!("{size} bytes"), format!("a checkpoint of Qedgix ({e})"));
-            let checkpoint = Checkpoint::from_bytes(bytes).map_err(refused)?;
+            let invalid = |e| Invalid::new("checkpoint", format!("{size} bytes"), format!("a checkpoint of Qedgix ({e})"));
+            let checkpoint = Checkpoint::from_bytes(bytes).map_err(invalid)?;
             let (policy, digest) = (Arc::new(checkpoint.policy()), Sha256::digest(bytes).into());
             Ok(Self { checkpoint, policy, source, digest })
         });
@@ -180,7 +180,7 @@ impl ParsedCheckpoint {
             metrics,
             created_at: Timestamp::from_millisecond(created_at).unwrap_or_default(),
         };
-        LoadedPolicy { info: Arc::new(info), policy: self.policy }
+        LoadedPolicy { info: Arc::new(info), implementation: self.policy }
     }
 }
 

@@ -6,7 +6,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use crate::service::Error;
 
-/// Most uploads at once.
+/// Maximum number of uploads at once.
 const MAX_UPLOADS: usize = 4;
 
 /// The limit, shared by all uploads.

@@ -23,7 +23,7 @@ pub(super) struct Queued {
 #[derive(Default)]
 pub(super) struct Batch {
     pub(super) tasks: Vec<Queued>,
-    turns: Vec<FleetStep<'static>>,
+    fleet_steps: Vec<FleetStep<'static>>,
 }
 
 impl Batch {
@@ -46,11 +46,11 @@ impl Batch {
         if size == 0 {
             return 0;
         }
-        let mut turns = recycle(std::mem::take(&mut self.turns));
-        turns.extend(self.tasks.iter_mut().map(|queued| queued.task.turn()));
+        let mut fleet_steps = recycle(std::mem::take(&mut self.fleet_steps));
+        fleet_steps.extend(self.tasks.iter_mut().map(|queued| queued.task.as_fleet_step()));
         // Unwind safe: after a panic, the outputs are dropped below.
-        let result = catch_unwind(AssertUnwindSafe(|| policy.policy.act(&mut turns)));
-        self.turns = recycle(turns);
+        let result = catch_unwind(AssertUnwindSafe(|| policy.implementation.act(&mut fleet_steps)));
+        self.fleet_steps = recycle(fleet_steps);
         let compute = started.elapsed();
         if result.is_err() {
             counters.failure.increment(size as u64);
@@ -79,7 +79,7 @@ pub(super) fn run_single(mut task: Task, metrics: &EngineMetrics) -> Result<Task
     let policy = task.policy().clone();
     let counters = metrics.policy(&policy.reference.name);
     // Unwind safe: after a panic, the output is dropped.
-    let result = catch_unwind(AssertUnwindSafe(|| policy.policy.act(&mut [task.turn()])));
+    let result = catch_unwind(AssertUnwindSafe(|| policy.implementation.act(&mut [task.as_fleet_step()])));
     if result.is_err() {
         counters.failure.increment(1);
         return Err(panicked(&policy));
@@ -92,12 +92,12 @@ pub(super) fn run_single(mut task: Task, metrics: &EngineMetrics) -> Result<Task
 }
 
 fn panicked(policy: &LoadedPolicy) -> Error {
-    Error::Fault(format!("policy {} panicked", policy.reference))
+    Error::Internal(format!("policy {} panicked", policy.reference))
 }
 
-/// An empty vector with the allocation of `turns`, for elements of another lifetime: a vector that is collected from its own
+/// An empty vector with the allocation of `fleet_steps`, for elements of another lifetime: a vector that is collected from its own
 /// elements keeps its allocation.
-fn recycle<'to>(mut turns: Vec<FleetStep<'_>>) -> Vec<FleetStep<'to>> {
-    turns.clear();
-    turns.into_iter().map(|_| unreachable!("the vector is empty")).collect()
+fn recycle<'to>(mut fleet_steps: Vec<FleetStep<'_>>) -> Vec<FleetStep<'to>> {
+    fleet_steps.clear();
+    fleet_steps.into_iter().map(|_| unreachable!("the vector is empty")).collect()
 }

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use metrics::{Counter, Histogram};
 
-/// Most policies with counters of their own. Later ones share counters with the label `other`.
+/// Maximum number of policies with counters of their own. Later ones share counters with the label `other`.
 const MAX_POLICIES: usize = 256;
 
 /// Metrics of all policies.

@@ -9,7 +9,7 @@
 //! run at once.
 //!
 //! A task is not computed if its caller stopped waiting (its future was dropped, or its deadline passed). If a policy panics,
-//! all callers of the batch receive [`Error::Fault`] and the thread continues.
+//! all callers of the batch receive [`Error::Internal`] and the thread continues.
 
 mod batch;
 mod metrics;
@@ -29,14 +29,15 @@ use tokio::sync::oneshot::error::TryRecvError;
 
 use super::Error;
 
-/// Most work of a batch. A higher limit would delay small fleets that share a batch with large ones.
+/// Maximum work of a batch. A higher limit would delay small fleets that share a batch with large ones.
 const MAX_BATCH_WORK: usize = 1 << 17;
-/// Most work of a batch that is computed inline: well below a millisecond, because the caller's thread also serves
+/// Maximum work of a batch that is computed inline: well below a millisecond, because the caller's thread also serves
 /// connections.
 const MAX_INLINE_WORK: usize = 1 << 13;
-/// After this many inline batches of one, small fleets skip the batching check, which costs as much as a forward pass.
-const MAX_SINGLES: u32 = 4;
-/// Of the small fleets that skip the check, one in this many makes it nevertheless.
+/// A small task normally yields to other callers before it is computed, so that their tasks can join its batch. This costs as
+/// much as a forward pass. After this many inline batches of one task, small tasks no longer yield.
+const SINGLES_BEFORE_SKIP: u32 = 4;
+/// One in this many small tasks yields nevertheless, to notice other callers.
 const BATCHING_PROBE_INTERVAL: u32 = 16;
 
 /// Limits of an engine.
@@ -44,9 +45,9 @@ const BATCHING_PROBE_INTERVAL: u32 = 16;
 pub struct EngineConfig {
     /// Computing threads.
     pub threads: usize,
-    /// Most tasks in the queue; more are rejected.
+    /// Maximum number of tasks in the queue; more are rejected.
     pub queue: usize,
-    /// Most fleets of a batch.
+    /// Maximum number of fleets in a batch.
     pub max_batch: usize,
     /// How long the oldest task may wait for others to join its batch; zero: not at all.
     pub max_batch_delay: Duration,
@@ -68,7 +69,7 @@ struct Shared {
     /// Notified when a thread may have work.
     queued: Condvar,
     /// Inline batches of one since the last inline batch of several.
-    singles: AtomicU32,
+    single_batches: AtomicU32,
     config: EngineConfig,
     metrics: EngineMetrics,
 }
@@ -142,7 +143,7 @@ impl Shared {
     /// Computes one task on this thread. [`Shared::reserve_inline`] has returned true.
     fn run_inline(&self, task: Task) -> Result<TaskOutput, Error> {
         let output = batch::run_single(task, &self.metrics);
-        self.singles.fetch_add(1, Ordering::Relaxed);
+        self.single_batches.fetch_add(1, Ordering::Relaxed);
         self.lock().running -= 1;
         output
     }
@@ -162,9 +163,9 @@ impl Shared {
         };
         let size = batch.run(&self.metrics);
         if size > 1 {
-            self.singles.store(0, Ordering::Relaxed);
+            self.single_batches.store(0, Ordering::Relaxed);
         } else {
-            self.singles.fetch_add(1, Ordering::Relaxed);
+            self.single_batches.fetch_add(1, Ordering::Relaxed);
         }
         let mut queue = self.lock();
         queue.running -= 1;
@@ -172,11 +173,11 @@ impl Shared {
         true
     }
 
-    /// Whether a small task should give others a chance to join its batch: after a recent batch of several, and in regular
+    /// Whether a small task should yield so that others can join its batch: after a recent batch of several tasks, and at regular
     /// intervals.
     fn expects_batch(&self) -> bool {
-        let singles = self.singles.load(Ordering::Relaxed);
-        singles < MAX_SINGLES || singles.is_multiple_of(BATCHING_PROBE_INTERVAL)
+        let single_batches = self.single_batches.load(Ordering::Relaxed);
+        single_batches < SINGLES_BEFORE_SKIP || single_batches.is_multiple_of(BATCHING_PROBE_INTERVAL)
     }
 
     fn enqueue(&self, task: Task, deadline: Option<Instant>) -> Result<oneshot::Receiver<Result<TaskOutput, Error>>, Error> {
@@ -204,12 +205,12 @@ impl Shared {
 
 /// Whether a task may be computed inline.
 fn is_small(task: &Task) -> bool {
-    task.policy().policy.is_cheap() && task.work() <= MAX_INLINE_WORK
+    task.policy().implementation.is_cheap() && task.work() <= MAX_INLINE_WORK
 }
 
 /// The error of a caller whose task was dropped without a reply: a bug in the engine.
 fn lost_request() -> Error {
-    Error::Fault("the engine lost a request".into())
+    Error::Internal("the engine lost a request".into())
 }
 
 /// Wakes a thread when a caller stops waiting, so that its task leaves the queue soon.
@@ -240,7 +241,7 @@ impl Engine {
         let shared = Arc::new(Shared {
             queue: Mutex::default(),
             queued: Condvar::new(),
-            singles: AtomicU32::new(0),
+            single_batches: AtomicU32::new(0),
             config,
             metrics: EngineMetrics::new(),
         });
@@ -267,7 +268,7 @@ impl Engine {
     /// Runs the policy of `task`.
     ///
     /// # Errors
-    /// [`Error::Busy`] if the queue is full, [`Error::Deadline`] if the deadline passes, [`Error::Fault`] if the policy
+    /// [`Error::Busy`] if the queue is full, [`Error::Deadline`] if the deadline passes, [`Error::Internal`] if the policy
     /// panics.
     pub async fn run(&self, task: Task, deadline: Option<Instant>) -> Result<TaskOutput, Error> {
         let shared = &*self.shared;

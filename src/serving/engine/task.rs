@@ -66,7 +66,7 @@ impl Task {
         headings.clear();
         headings.resize(slot.uavs(), 0);
         q_values.clear();
-        q_values.resize(slot.uavs() * policy.policy.actions(), f32::NAN);
+        q_values.resize(slot.uavs() * policy.implementation.actions(), f32::NAN);
         let decision = Decision { step, headings, q_values, timings: Timings::default() };
         Self { policy, slot, output: TaskOutput { memory, decision } }
     }
@@ -77,7 +77,7 @@ impl Task {
     }
 
     /// The arguments of the policy for this task.
-    pub(super) fn turn(&mut self) -> FleetStep<'_> {
+    pub(super) fn as_fleet_step(&mut self) -> FleetStep<'_> {
         let TaskOutput { memory, decision } = &mut self.output;
         let Decision { step, headings, q_values, .. } = decision;
         FleetStep { slot: &self.slot, step: *step, memory, headings, q_values: Some(q_values) }

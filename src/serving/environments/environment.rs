@@ -71,7 +71,7 @@ pub struct Environment {
     /// Set while `simulation` is locked, so that whoever locks it afterwards sees the flag.
     deleted: AtomicBool,
     /// The environment's share of the memory for environments.
-    _memory: OwnedSemaphorePermit,
+    _memory_permit: OwnedSemaphorePermit,
 }
 
 impl Environment {
@@ -79,7 +79,7 @@ impl Environment {
         id: String,
         spec: EnvironmentSpec,
         simulation: Simulation,
-        memory: OwnedSemaphorePermit,
+        memory_permit: OwnedSemaphorePermit,
         clock: Clock,
     ) -> Self {
         let created_at = clock.now();
@@ -92,7 +92,7 @@ impl Environment {
             cursor: SyncMutex::new(simulation.cursor()),
             simulation: Arc::new(Mutex::new(simulation)),
             deleted: AtomicBool::new(false),
-            _memory: memory,
+            _memory_permit: memory_permit,
         }
     }
 
@@ -111,7 +111,7 @@ impl Environment {
     /// Handles a second creation under the same name: a retry if the environment was created from `spec` and is unused.
     ///
     /// # Errors
-    /// [`Error::Exists`] otherwise.
+    /// [`Error::Conflict`] otherwise.
     pub(super) async fn recreate(&self, spec: &EnvironmentSpec) -> Result<(), Error> {
         let simulation = self.simulation.lock().await;
         let reason = if self.deleted.load(Ordering::Relaxed) {
@@ -124,7 +124,7 @@ impl Environment {
             self.last_use.touch(self.clock.monotonic());
             return Ok(());
         };
-        Err(Error::Exists(format!("environment {:?} exists {reason}; delete it, or choose another name", self.id)))
+        Err(Error::Conflict(format!("environment {:?} exists {reason}; delete it, or choose another name", self.id)))
     }
 
     /// Rejects all later requests. Waits for the step in flight.
@@ -136,7 +136,7 @@ impl Environment {
     /// Begins an episode.
     ///
     /// # Errors
-    /// [`Error::Invalid`] if the seed is out of range or graphs would be too large, [`Error::Unknown`] if the environment
+    /// [`Error::Invalid`] if the seed is out of range or graphs would be too large, [`Error::NotFound`] if the environment
     /// has been deleted.
     pub async fn reset(self: &Arc<Self>, reset: EnvironmentReset) -> Result<EnvironmentState, Error> {
         reset.seed.map_or(Ok(()), check_seed)?;
@@ -154,7 +154,7 @@ impl Environment {
     ///
     /// # Errors
     /// [`Error::Invalid`] if the actions do not fit or graphs would be too large, `wrong_step` for a step that is neither
-    /// the last nor the next, `episode_over` after the episode's last slot, [`Error::Unknown`] if the environment has been
+    /// the last nor the next, `episode_over` after the episode's last slot, [`Error::NotFound`] if the environment has been
     /// deleted.
     pub async fn step(self: &Arc<Self>, request: EnvironmentStep) -> Result<EnvironmentState, Error> {
         let headings = self.spec.headings(&request.actions)?;
@@ -187,7 +187,7 @@ impl Environment {
     /// Waits for the reset or step in flight.
     async fn lock_simulation(&self) -> Result<OwnedMutexGuard<Simulation>, Error> {
         let simulation = self.simulation.clone().lock_owned().await;
-        if self.deleted.load(Ordering::Relaxed) { Err(Error::unknown(Self::KIND, &self.id)) } else { Ok(simulation) }
+        if self.deleted.load(Ordering::Relaxed) { Err(Error::not_found(Self::KIND, &self.id)) } else { Ok(simulation) }
     }
 
     /// Publishes the cursor after a reset or step, and returns the state.
@@ -208,7 +208,7 @@ impl Environment {
         }
         let environment = self.clone();
         let done = tokio::task::spawn_blocking(move || work(&environment));
-        done.await.map_err(|e| Error::Fault(e.to_string()))
+        done.await.map_err(|e| Error::Internal(e.to_string()))
     }
 }
 

@@ -1,5 +1,5 @@
 //! Environments that the server hosts for callers that train elsewhere. This file owns their creation, their deletion and the
-//! memory that they may take together; `environment` owns the requests to one of them.
+//! memory that they may use together; `environment` owns the requests to one of them.
 
 mod environment;
 mod simulation;
@@ -21,14 +21,14 @@ use crate::clock::Clock;
 use simulation::Simulation;
 
 /// Unit of memory accounting, in bytes.
-const PAGE: usize = 1024;
+const MEMORY_UNIT: usize = 1024;
 
 /// Limits of environments.
 #[derive(Clone, Copy, Debug)]
 pub struct EnvironmentsConfig {
     /// Their number and time to live.
     pub limits: Limits,
-    /// Bytes that all environments may take together.
+    /// Maximum number of bytes of all environments together.
     pub memory: usize,
 }
 
@@ -36,16 +36,20 @@ pub struct EnvironmentsConfig {
 #[derive(Debug)]
 pub struct Environments {
     table: Table<Environment>,
-    /// One permit per free page.
-    pages: Arc<Semaphore>,
+    /// One permit per free unit.
+    memory_units: Arc<Semaphore>,
     memory: usize,
 }
 
 impl Environments {
     /// An empty set of environments.
     pub fn new(config: EnvironmentsConfig, clock: Clock) -> Self {
-        let pages = (config.memory / PAGE).min(Semaphore::MAX_PERMITS);
-        Self { table: Table::new(config.limits, clock), pages: Arc::new(Semaphore::new(pages)), memory: config.memory }
+        let memory_units = (config.memory / MEMORY_UNIT).min(Semaphore::MAX_PERMITS);
+        Self {
+            table: Table::new(config.limits, clock),
+            memory_units: Arc::new(Semaphore::new(memory_units)),
+            memory: config.memory,
+        }
     }
 
     /// The environments by name.
@@ -57,10 +61,10 @@ impl Environments {
     /// the same `spec`, the call is a retry and returns that environment.
     ///
     /// # Errors
-    /// [`Error::Exists`] if the name is taken, [`Error::Busy`] if the number or the memory of environments is exhausted.
+    /// [`Error::Conflict`] if the name is taken, [`Error::Busy`] if the number or the memory of environments is exhausted.
     pub async fn create(&self, id: Option<String>, spec: EnvironmentSpec) -> Result<EnvironmentInfo, Error> {
         let id = id.unwrap_or_else(generate_id);
-        // First of all, so that a retry and a name that is taken are recognised even when no memory is left.
+        // Checked first, so that a retry succeeds and a conflict is reported even if no memory is left.
         let environment = match self.table.get(&id) {
             Ok(existing) => {
                 existing.recreate(&spec).await?;
@@ -72,14 +76,14 @@ impl Environments {
     }
 
     async fn build(&self, id: String, spec: EnvironmentSpec) -> Result<Arc<Environment>, Error> {
-        let pages = u32::try_from(spec.bytes().div_ceil(PAGE)).unwrap_or(u32::MAX);
-        let acquire = || self.pages.clone().try_acquire_many_owned(pages);
-        let memory = acquire().or_else(|_| {
+        let memory_units = u32::try_from(spec.bytes().div_ceil(MEMORY_UNIT)).unwrap_or(u32::MAX);
+        let acquire = || self.memory_units.clone().try_acquire_many_owned(memory_units);
+        let memory_permit = acquire().or_else(|_| {
             // Removing idle environments frees memory.
-            self.table.sweep();
+            self.table.remove_expired();
             acquire()
         });
-        let memory = memory.map_err(|_| {
+        let memory_permit = memory_permit.map_err(|_| {
             let (size, memory) = (spec.bytes() >> 10, self.memory >> 10);
             Error::Busy(format!("no memory for an environment of {size} KiB; all environments together may take {memory} KiB"))
         })?;
@@ -88,10 +92,10 @@ impl Environments {
             Simulation::new(&requested)?
         } else {
             let built = tokio::task::spawn_blocking(move || Simulation::new(&requested));
-            built.await.map_err(|e| Error::Fault(e.to_string()))??
+            built.await.map_err(|e| Error::Internal(e.to_string()))??
         };
         let clock = self.table.clock().clone();
-        let make = || Environment::new(id.clone(), spec.clone(), simulation, memory, clock);
+        let make = || Environment::new(id.clone(), spec.clone(), simulation, memory_permit, clock);
         match self.table.find_or_add(&id, make)? {
             Lookup::Added(environment) => Ok(environment),
             // A concurrent call created it.
@@ -102,7 +106,7 @@ impl Environments {
     /// Describes environment `id`, and counts as a use of it.
     ///
     /// # Errors
-    /// `environment_expired`, or [`Error::Unknown`].
+    /// `environment_expired`, or [`Error::NotFound`].
     pub fn describe(&self, id: &str) -> Result<EnvironmentInfo, Error> {
         Ok(self.table.get(id)?.info(self.table.ttl()))
     }
@@ -110,7 +114,7 @@ impl Environments {
     /// Deletes environment `id`. Waits for the step in flight.
     ///
     /// # Errors
-    /// `environment_expired`, or [`Error::Unknown`].
+    /// `environment_expired`, or [`Error::NotFound`].
     pub async fn delete(&self, id: &str) -> Result<EnvironmentInfo, Error> {
         let environment = self.table.get(id)?;
         self.table.remove(&environment);

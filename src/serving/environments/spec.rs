@@ -7,11 +7,11 @@ use crate::invalid::{Invalid, in_range};
 use crate::rng;
 use crate::train_config::EXACT;
 
-/// Most copies of one environment.
+/// Maximum number of copies of one environment.
 const MAX_COPIES: usize = 1024;
-/// Most UAVs and users in all copies of one environment: a response without graphs stays below 4 MiB.
+/// Maximum number of UAVs and users in all copies of one environment: a response without graphs stays below 4 MiB.
 const MAX_NODES: usize = 32_768;
-/// Most detections of a response, if in every copy all nodes detect each other: about 20 MiB.
+/// Maximum number of detections of a response, if in every copy all nodes detect each other: about 20 MiB.
 const MAX_DETECTIONS: usize = 1 << 19;
 
 /// Everything that, together with the actions, determines the states of an environment.
@@ -33,7 +33,7 @@ impl EnvironmentSpec {
     /// # Errors
     /// Names the first field that is out of range, or `count` if all copies together have too many nodes.
     pub fn new(config: EnvConfig, copies: usize, seed: u64, auto_reset: bool) -> Result<Self, Invalid> {
-        config.validate().map_err(|e| e.within("environment"))?;
+        config.validate().map_err(|e| e.with_prefix("environment"))?;
         in_range("count", copies, 1..=MAX_COPIES)?;
         check_seed(seed)?;
         if copies * config.nodes() > MAX_NODES {

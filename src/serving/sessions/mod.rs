@@ -21,7 +21,7 @@ impl Sessions {
     /// has no step. With a new `run_id` the call restarts that session, on the version that it is pinned to.
     ///
     /// # Errors
-    /// [`Error::Exists`] if the name is taken, `run_fenced` if `run_id` names a former run, [`Error::Busy`] if the number of
+    /// [`Error::Conflict`] if the name is taken, `run_fenced` if `run_id` names a former run, [`Error::Busy`] if the number of
     /// sessions is exhausted.
     pub async fn open(&self, policy: Arc<LoadedPolicy>, options: SessionOptions) -> Result<SessionInfo, Error> {
         let id = options.id.clone().unwrap_or_else(generate_id);
@@ -29,24 +29,24 @@ impl Sessions {
         let session = match self.find_or_add(&id, make)? {
             Lookup::Added(session) => session,
             Lookup::Found(session) => {
-                session.reopen(&policy, &options).await?;
+                session.retry_or_restart(&policy, &options).await?;
                 session
             }
         };
         Ok(session.info(self.ttl()))
     }
 
-    /// Begins session `id` pinned to `policy`, in place of the session of that name, if any. Steps of that session that are in
+    /// Starts session `id` pinned to `policy`, in place of the session of that name, if any. Steps of that session that are in
     /// flight complete.
     ///
     /// # Errors
     /// [`Error::Busy`] if the number of sessions is exhausted.
-    pub fn begin(&self, id: &str, policy: Arc<LoadedPolicy>, seed: Option<u64>) -> Result<Arc<Session>, Error> {
+    pub fn start_replacing(&self, id: &str, policy: Arc<LoadedPolicy>, seed: Option<u64>) -> Result<Arc<Session>, Error> {
         let options = SessionOptions { seed, ..SessionOptions::default() };
         self.replace(id, || Session::new(id.to_owned(), policy, &options, self.clock().clone()))
     }
 
-    /// Removes a session that [`Sessions::begin`] began, unless another session has taken its name.
+    /// Removes a session that [`Sessions::start_replacing`] started, unless another session has taken its name.
     pub fn discard(&self, session: &Arc<Session>) {
         self.remove(session);
     }
@@ -54,7 +54,7 @@ impl Sessions {
     /// Describes session `id`, and counts as a use of it.
     ///
     /// # Errors
-    /// `session_expired`, or [`Error::Unknown`].
+    /// `session_expired`, or [`Error::NotFound`].
     pub fn describe(&self, id: &str) -> Result<SessionInfo, Error> {
         Ok(self.get(id)?.info(self.ttl()))
     }
@@ -62,7 +62,7 @@ impl Sessions {
     /// Closes session `id`. Waits for the step in flight.
     ///
     /// # Errors
-    /// `session_expired`, or [`Error::Unknown`].
+    /// `session_expired`, or [`Error::NotFound`].
     pub async fn close(&self, id: &str) -> Result<SessionInfo, Error> {
         let session = self.get(id)?;
         self.remove(&session);

@@ -13,9 +13,9 @@ use super::seed::{run_hash, session_seed};
 use crate::clock::Clock;
 use crate::error_code::ErrorCode;
 use crate::serving::table::{LastUse, TableEntry};
-use crate::serving::{Decision, Error, Fleet, LoadedPolicy, OutputBuffers, PolicyRef, TaskOutput};
+use crate::serving::{Decision, Error, FleetIds, LoadedPolicy, OutputBuffers, PolicyRef, TaskOutput};
 
-/// Most former runs that a session remembers in order to reject them.
+/// Maximum number of former runs that a session remembers, in order to reject them.
 const MAX_FORMER_RUNS: usize = 64;
 
 /// Description of a session.
@@ -72,7 +72,7 @@ struct SessionState {
     /// Steps of the current run.
     steps: u64,
     /// The ids of the run's first step.
-    fleet: Option<Fleet>,
+    fleet: Option<FleetIds>,
     memory: Vec<f32>,
     last: Option<Decision>,
     /// Buffers of earlier steps, for reuse.
@@ -98,7 +98,7 @@ pub struct PendingStep<'a> {
     /// The run that this step begins.
     new_run: Option<String>,
     /// The ids, if this is the first step of a run.
-    fleet: Option<Fleet>,
+    fleet: Option<FleetIds>,
     /// The step's index.
     pub step: u64,
     /// A copy of the memory before the step.
@@ -135,14 +135,14 @@ impl Session {
 
     /// Waits for the step in flight, then checks a request for `step` of `run_id` by `fleet`.
     ///
-    /// A repetition of the last step returns the last decision, whatever the request observes.
+    /// A repetition of the last step returns the last decision. The content of the request is ignored.
     ///
     /// # Errors
     /// `wrong_step` if the step is neither the last nor the next, `run_fenced` if `run_id` names a former run,
-    /// [`Error::Invalid`] if the ids differ from those of the run's first step, [`Error::Unknown`] if the session is closed.
+    /// [`Error::Invalid`] if the ids differ from those of the run's first step, [`Error::NotFound`] if the session is closed.
     pub async fn begin_step<'a>(
         &'a self,
-        fleet: &Fleet,
+        fleet: &FleetIds,
         step: Option<u64>,
         run_id: Option<&str>,
     ) -> Result<StepStart<'a>, Error> {
@@ -153,7 +153,7 @@ impl Session {
             return Ok(StepStart::Repeated(last.clone()));
         }
         if state.closed || state.ended {
-            return Err(Error::unknown(Self::KIND, &self.id));
+            return Err(Error::not_found(Self::KIND, &self.id));
         }
         let new_run = state.new_run(&self.id, run_id)?;
         let steps = if new_run.is_some() { 0 } else { state.steps };
@@ -176,8 +176,8 @@ impl Session {
             let run = new_run.as_deref().or(state.run_id.as_deref());
             let seed = state.seed.unwrap_or_else(|| session_seed(&self.id, run));
             let (uavs, users) = (fleet.uavs.len(), fleet.users.len());
-            memory.resize(self.policy.policy.memory_len(uavs, users), 0.0);
-            self.policy.policy.start(uavs, users, seed, &mut memory);
+            memory.resize(self.policy.implementation.memory_len(uavs, users), 0.0);
+            self.policy.implementation.start(uavs, users, seed, &mut memory);
         } else {
             memory.extend_from_slice(&state.memory);
         }
@@ -186,11 +186,15 @@ impl Session {
         Ok(StepStart::Next(PendingStep { session: self, state, new_run, fleet, step, memory, buffers }))
     }
 
-    /// Handles a second `OpenSession` with the name of this session.
-    pub(super) async fn reopen(&self, policy: &LoadedPolicy, options: &SessionOptions) -> Result<(), Error> {
+    /// Handles another `OpenSession` with the name of this session. With a new run id it restarts the session; with the same
+    /// options before the first step it is a retry and changes nothing.
+    ///
+    /// # Errors
+    /// [`Error::Conflict`] otherwise, `run_fenced` for the id of an earlier run.
+    pub(super) async fn retry_or_restart(&self, policy: &LoadedPolicy, options: &SessionOptions) -> Result<(), Error> {
         let taken = |reason: &str| {
             let message = format!("session {:?} exists {reason}; close it, choose another name, or give a new run_id", self.id);
-            Err(Error::Exists(message))
+            Err(Error::Conflict(message))
         };
         let mut state = self.state.lock().await;
         if state.closed {
@@ -201,7 +205,7 @@ impl Session {
         }
         match state.new_run(&self.id, options.run_id.as_deref())? {
             Some(run) => {
-                state.begin_run(run);
+                state.start_run(run);
                 state.seed = options.seed;
             }
             None if state.steps > 0 => return taken(&format!("and has {} steps", state.steps)),
@@ -266,7 +270,7 @@ impl SessionState {
     }
 
     /// Restarts the session as `run`.
-    fn begin_run(&mut self, run: String) {
+    fn start_run(&mut self, run: String) {
         if let Some(former) = self.run_id.replace(run) {
             self.former_runs.push_back(run_hash(&former));
             if self.former_runs.len() > MAX_FORMER_RUNS {
@@ -284,7 +288,7 @@ impl PendingStep<'_> {
     /// Completes the step with `output`. Returns the decision.
     pub fn commit(mut self, output: TaskOutput) -> Decision {
         if let Some(run) = self.new_run.take() {
-            self.state.begin_run(run);
+            self.state.start_run(run);
         }
         let TaskOutput { memory, decision } = output;
         let state = &mut *self.state;

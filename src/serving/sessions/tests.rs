@@ -6,7 +6,7 @@ use super::*;
 use crate::clock::ManualClock;
 use crate::invalid::Invalid;
 use crate::policy::{Policy, RequiredInput};
-use crate::serving::{Decision, Fleet, Limits, PolicyRef, TaskOutput};
+use crate::serving::{Decision, FleetIds, Limits, PolicyRef, TaskOutput};
 
 /// Its memory is the seed at first; it decides nothing.
 struct SeedPolicy;
@@ -51,16 +51,16 @@ fn named(id: &str) -> SessionOptions {
 fn code(error: &Error) -> &'static str {
     match error {
         Error::Precondition { code, .. } => code.as_str(),
-        Error::Unknown { .. } => "unknown",
-        Error::Exists(_) => "exists",
+        Error::NotFound { .. } => "unknown",
+        Error::Conflict(_) => "exists",
         Error::Busy(_) => "busy",
         Error::Invalid(_) => "invalid",
         _ => "other",
     }
 }
 
-fn fleet(ids: [&str; 2]) -> Fleet {
-    Fleet { uavs: ids.map(str::to_owned).to_vec(), users: vec!["user".into()] }
+fn fleet(ids: [&str; 2]) -> FleetIds {
+    FleetIds { uavs: ids.map(str::to_owned).to_vec(), users: vec!["user".into()] }
 }
 
 async fn step_once(session: &Session, step: Option<u64>, run: Option<&str>) -> Result<(u64, Vec<f32>), &'static str> {
@@ -189,7 +189,7 @@ async fn numbers_of_open_and_of_expired_sessions_are_bounded() {
     sessions.open(policy("p"), named("c")).await.unwrap();
     assert_eq!(sessions.len(), 1, "idle sessions were removed");
     pass(601);
-    sessions.sweep();
+    sessions.remove_expired();
     assert!(sessions.is_empty());
     let codes = ["a", "b", "c"].map(|id| code(&sessions.get(id).unwrap_err()));
     assert_eq!(codes.iter().filter(|c| **c == "session_expired").count(), 2);

@@ -115,10 +115,10 @@ async fn a_retry_by_step_advances_nothing() {
     }
     assert_eq!(fails(&mut client, slot("count", 5).int("step", 3)).await.1, NOT_STARTED.1);
     assert_eq!(fails(&mut client, slot("count", 5)).await.1, NOT_STARTED.1);
-    server.app.sessions.sweep();
+    server.app.sessions.remove_expired();
     assert_eq!(fly(&mut client, end()).await.0, 3);
     server.advance(11);
-    server.app.sessions.sweep();
+    server.app.sessions.remove_expired();
     assert!(server.app.sessions.is_empty());
     assert_eq!(fails(&mut client, end()).await.1, NOT_STARTED.1);
 }

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use proptest::prelude::*;
-use qedgix::api::convert::tensors::{Data, Tensor, observation};
+use qedgix::api::convert::tensors::{Data, Tensor, fleet_input};
 use qedgix::policy::baselines::{EnvParams, LIST, by_name};
 use qedgix::policy::{FleetStep, RequiredInput};
 
@@ -351,7 +351,7 @@ proptest! {
     /// Whatever is sent is refused with the name of a tensor, or is a slot that every policy it fits can decide.
     #[test]
     fn tensors_never_panic(mut tensors in tensors()) {
-        let observation = match observation(&mut tensors) {
+        let observation = match fleet_input(&mut tensors) {
             Ok(observation) => observation,
             Err(refused) => {
                 prop_assert!(!refused.field.is_empty() && !refused.expected.is_empty(), "{refused}");
@@ -359,7 +359,7 @@ proptest! {
             }
         };
         let (uavs, users) = (observation.uavs(), observation.users());
-        prop_assert_eq!(observation.uav_order.len(), uavs);
+        prop_assert_eq!(observation.canonical_of_request.len(), uavs);
         for baseline in LIST.iter().filter(|baseline| baseline.needs != RequiredInput::FullScene) {
             let policy = by_name(baseline.name, EnvParams::default()).unwrap();
             let Ok(slot) = observation.clone().into_slot(&*policy) else { continue };

@@ -2,7 +2,7 @@
 //!
 //! Values are little-endian, in row-major order. An element of BYTES is preceded by its length in 4 bytes.
 
-mod observation;
+mod fleet_input;
 
 use std::fmt;
 
@@ -10,7 +10,7 @@ use bytes::{Buf, BufMut, Bytes, BytesMut};
 
 use crate::invalid::Invalid;
 
-pub use observation::{Dimension, INPUTS, element_count, observation};
+pub use fleet_input::{Dimension, INPUTS, element_count, fleet_input};
 
 /// The supported datatypes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -46,7 +46,7 @@ impl Datatype {
         Self::ALL.into_iter().find(|datatype| datatype.name() == name)
     }
 
-    /// Least number of bytes of an element.
+    /// Minimum number of bytes of an element.
     fn size(self) -> usize {
         match self {
             Self::Int32 | Self::Fp32 | Self::Bytes => 4,
@@ -152,9 +152,8 @@ impl Tensor {
         self.invalid(".shape", format!("{:?}", self.shape), expected)
     }
 
-    /// The first dimension of a tensor whose other dimensions must be `inner`. At most `max`.
-    ///
-    /// `expected` describes the shape in errors.
+    /// The first dimension of a tensor, at most `max`. Checks that the other dimensions are `inner`. `expected` describes the
+    /// shape in errors.
     fn rows(&self, expected: &str, inner: &[i64], max: usize) -> Result<usize, Invalid> {
         let (first, rest) = self.shape.split_first().ok_or_else(|| self.invalid_shape(expected))?;
         let rows = usize::try_from(*first).ok().filter(|_| rest == inner).ok_or_else(|| self.invalid_shape(expected))?;
@@ -164,7 +163,7 @@ impl Tensor {
         Ok(rows)
     }
 
-    /// The datatype of the tensor, if `allowed` has it.
+    /// The datatype of the tensor. Checks that it is one of `allowed`.
     fn check_datatype(&self, allowed: &[Datatype]) -> Result<Datatype, Invalid> {
         let found = Datatype::parse(&self.datatype).filter(|datatype| allowed.contains(datatype));
         let names = || allowed.iter().map(|datatype| datatype.name()).collect::<Vec<_>>().join(" or ");

@@ -158,11 +158,11 @@ pub(super) fn config(model: Model, ttl: Duration) -> wire::ModelConfig {
 
 /// Encodes an entry of the repository index.
 pub(super) fn entry(entry: IndexEntry) -> wire::repository_index_response::ModelIndex {
-    let IndexEntry { name, version, ready, reason } = entry;
+    let IndexEntry { name, version, loaded, reason } = entry;
     wire::repository_index_response::ModelIndex {
         name,
         version: version.to_string(),
-        state: oip::state(ready).to_owned(),
+        state: oip::state(loaded).to_owned(),
         reason,
     }
 }

@@ -47,7 +47,7 @@ pub(super) struct JobPath {
 
 /// Submit a job
 ///
-/// The job is on the disk when it is returned.
+/// When the response arrives, the job is in the database.
 #[utoipa::path(
     post, path = "/v1/jobs", operation_id = "submitJob", tag = "jobs",
     params((
@@ -90,7 +90,7 @@ struct ListQuery {
     /// Only jobs in this state.
     #[param(nullable = false)]
     state: Option<JobState>,
-    /// At most this many jobs; 0: 100. A page ends early before it exceeds about 1 MiB.
+    /// Maximum number of jobs. 0: 100. A page has fewer jobs if it would exceed about 1 MiB.
     #[serde(default)]
     #[param(maximum = 1000)]
     page_size: u32,
@@ -182,7 +182,7 @@ struct MetricsQuery {
     #[serde(default)]
     #[param(inline)]
     format: Format,
-    /// At most this many rows; 0: 10 000, or all rows as CSV.
+    /// Maximum number of rows. 0: 10 000, or all rows as CSV.
     #[serde(default)]
     #[param(maximum = 100_000)]
     page_size: u32,

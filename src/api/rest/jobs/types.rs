@@ -27,14 +27,14 @@ pub(super) struct JobRequest {
     /// Name of the job and of the policy that it publishes.
     #[schema(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$")]
     name: Option<String>,
-    /// For people.
+    /// Labels, which the server does not interpret.
     #[schema(schema_with = labels)]
     labels: Option<BTreeMap<String, String>>,
-    /// CPU cores that the job may use.
+    /// Threads that the job may use.
     #[serde(default, deserialize_with = "json::optional_integer")]
     #[schema(minimum = 1)]
     threads: Option<usize>,
-    /// Higher runs first.
+    /// Jobs with a higher priority start first. Default: 0.
     #[serde(default, deserialize_with = "json::optional_integer")]
     #[schema(minimum = -100, maximum = 100)]
     priority: Option<i64>,
@@ -42,13 +42,13 @@ pub(super) struct JobRequest {
     algorithm: Option<Algorithm>,
     /// The configuration that `environment` and `training` start from; default: `practical`.
     preset: Option<Preset>,
-    /// Fields that replace those of the preset; the letters of the paper (`M`, `N`, `K`, `v`, `t`, `d`) are accepted, too.
+    /// Fields that replace those of the preset; the symbols `M`, `N`, `K`, `v`, `t` and `d` are accepted, too.
     #[schema(value_type = Option<EnvConfig>)]
     environment: Option<Map<String, Value>>,
     /// Fields that replace those of the preset.
     #[schema(schema_with = partial_training)]
     training: Option<Map<String, Value>>,
-    /// Fixes every metric and weight; default: 1.
+    /// Seed of the training. Configuration and seed determine every metric and weight. Default: 1.
     #[serde(default, deserialize_with = "json::optional_integer")]
     seed: Option<u64>,
 }
@@ -83,7 +83,7 @@ pub(super) struct JobSummary {
     #[schema(value_type = Uuid)]
     id: JobId,
     state: JobState,
-    /// What a running job was asked to do and has not done yet.
+    /// Pending action of a running job; null if there is none.
     #[schema(required = true)]
     wanted: Option<PendingAction>,
     /// Why the job failed, or why its last attempt ended.
@@ -173,7 +173,7 @@ pub(in crate::api::rest) struct MetricRow {
     name: String,
     /// Environment steps.
     step: u64,
-    /// Null where the value was not a finite number.
+    /// Null if the value is not finite.
     #[schema(required = true)]
     value: Option<f64>,
     at: Timestamp,

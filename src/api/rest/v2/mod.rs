@@ -153,7 +153,7 @@ async fn index(State(app): Shared, Raw(body): Raw) -> Result<Json<Value>, Error>
         json!({
             "name": entry.name,
             "version": entry.version.to_string(),
-            "state": oip::state(entry.ready),
+            "state": oip::state(entry.loaded),
             "reason": entry.reason,
         })
     };

@@ -1,15 +1,15 @@
-//! Conversion of tensors to an [`Observation`]: a scene, or a graph as a list of edges.
+//! Conversion of tensors to an [`FleetInput`]: a scene, or a graph as a list of edges.
 //!
 //! Node indices have the order of the request: first the UAVs, then the users.
 
 use super::{Datatype, Tensor};
 use crate::env::Point;
 use crate::invalid::Invalid;
-use crate::serving::ids::{Ids, check_counts, check_distinct, request_order};
-use crate::serving::nodes::{aoi, finite, mirror, point};
-use crate::serving::{Fleet, Graph, GraphForm, MAX_DETECTIONS, MAX_NODES, Observation, ReportedDetection, Scene, SceneOrGraph};
+use crate::serving::ids::{Ids, canonical_of_request, check_counts, check_distinct};
+use crate::serving::nodes::{check_aoi, check_finite, check_point, mirror};
+use crate::serving::{FleetIds, FleetInput, Graph, GraphForm, MAX_DETECTIONS, MAX_NODES, ReportedDetection, Scene, SceneOrGraph};
 
-/// The inputs of an observation: name, datatype in the metadata, and the meaning of each dimension.
+/// The inputs of a fleet: name, datatype in the metadata, and the meaning of each dimension.
 pub const INPUTS: [(&str, Datatype, &[Dimension]); 8] = [
     ("uav_positions", Datatype::Fp32, &[Dimension::Uavs, Dimension::Two]),
     ("user_positions", Datatype::Fp32, &[Dimension::Users, Dimension::Two]),
@@ -45,11 +45,11 @@ pub fn element_count(tensors: &[Tensor]) -> usize {
     tensors.iter().map(elements).fold(0, usize::saturating_add)
 }
 
-/// Removes the inputs of the observation from `tensors` and converts them. Names must be distinct.
+/// Removes the inputs of the fleet from `tensors` and converts them. Names must be distinct.
 ///
 /// # Errors
 /// [`Invalid`] for a tensor that is missing, superfluous, or not accepted.
-pub fn observation(tensors: &mut Vec<Tensor>) -> Result<Observation, Invalid> {
+pub fn fleet_input(tensors: &mut Vec<Tensor>) -> Result<FleetInput, Invalid> {
     let mut take = |name: &str| {
         let at = tensors.iter().position(|tensor| tensor.name == name)?;
         Some(tensors.swap_remove(at))
@@ -61,7 +61,7 @@ pub fn observation(tensors: &mut Vec<Tensor>) -> Result<Observation, Invalid> {
     let uavs = count_uavs(uav_positions.as_ref(), uav_count.as_ref(), uav_ids.as_ref())?;
     check_counts("uavs and users", uavs, users)?;
     let ages = user_aoi.numbers(users)?.into_iter().enumerate();
-    let ages = ages.map(|(j, value)| aoi(|| format!("user_aoi[{j}]"), value)).collect::<Result<Vec<f32>, _>>()?;
+    let ages = ages.map(|(j, value)| check_aoi(|| format!("user_aoi[{j}]"), value)).collect::<Result<Vec<f32>, _>>()?;
     let own = uav_positions.map(|tensor| points(&tensor, "[M, 2]", uavs)).transpose()?;
     let nodes = Nodes::new(uavs, users, uav_ids.as_ref(), user_ids.as_ref())?;
     let content = match (user_positions, edge_index, edge_relative) {
@@ -83,10 +83,10 @@ pub fn observation(tensors: &mut Vec<Tensor>) -> Result<Observation, Invalid> {
             return Err(Invalid::new("user_positions", "a tensor", expected));
         }
     };
-    Ok(Observation { uav_order: request_order(&nodes.uavs), content, fleet: nodes.fleet })
+    Ok(FleetInput { canonical_of_request: canonical_of_request(&nodes.uavs), content, fleet: nodes.fleet })
 }
 
-/// The number of UAVs, which all inputs must agree on.
+/// The number of UAVs. All inputs that imply it must agree.
 fn count_uavs(positions: Option<&Tensor>, count: Option<&Tensor>, ids: Option<&Tensor>) -> Result<usize, Invalid> {
     let count_of = |tensor: &Tensor| -> Result<usize, Invalid> {
         tensor.rows("[1]", &[], 1)?;
@@ -115,15 +115,15 @@ fn points(tensor: &Tensor, expected: &str, count: usize) -> Result<Vec<Point>, I
     }
     let values = tensor.numbers(2 * count)?;
     let pairs = values.chunks_exact(2).enumerate();
-    pairs.map(|(i, pair)| point(|| format!("{}[{i}]", tensor.name), [pair[0], pair[1]])).collect()
+    pairs.map(|(i, pair)| check_point(|| format!("{}[{i}]", tensor.name), [pair[0], pair[1]])).collect()
 }
 
-/// The fleet and the places of its nodes in the request.
+/// The ids of the fleet, and the order of the request.
 struct Nodes {
-    fleet: Fleet,
-    /// Place of each UAV among the request's UAVs, in canonical order.
+    fleet: FleetIds,
+    /// Index in the request of each UAV, in canonical order.
     uavs: Vec<u32>,
-    /// Place of each user among the users of the request, in canonical order.
+    /// Index in the request of each user, in canonical order.
     users: Vec<u32>,
 }
 
@@ -134,7 +134,7 @@ impl Nodes {
         check_distinct((&uav_ids, &uavs), (&user_ids, &users), |is_uav, place| {
             format!("{}[{place}]", if is_uav { "uav_ids" } else { "user_ids" })
         })?;
-        Ok(Self { fleet: Fleet { uavs: uav_ids, users: user_ids }, uavs, users })
+        Ok(Self { fleet: FleetIds { uavs: uav_ids, users: user_ids }, uavs, users })
     }
 
     /// Values of the users in canonical order.
@@ -145,12 +145,12 @@ impl Nodes {
     /// Canonical index of each node in the order of the request.
     fn canonical(&self) -> Vec<u32> {
         let uavs = self.uavs.len() as u32;
-        let users = request_order(&self.users).into_iter().map(|user| uavs + user);
-        request_order(&self.uavs).into_iter().chain(users).collect()
+        let users = canonical_of_request(&self.users).into_iter().map(|user| uavs + user);
+        canonical_of_request(&self.uavs).into_iter().chain(users).collect()
     }
 }
 
-/// Ids in canonical order with their places in the request. Default ids: `KIND-0`, `KIND-1`, ...
+/// Ids in canonical order, with their indices in the request. Default ids: `KIND-0`, `KIND-1`, ...
 fn ids(tensor: Option<&Tensor>, count: usize, expected: &str, kind: &str) -> Result<(Vec<String>, Vec<u32>), Invalid> {
     let Some(tensor) = tensor else {
         return Ok((0..count as u32).map(|i| (format!("{kind}-{i}"), i)).unzip());
@@ -188,14 +188,14 @@ fn graph(nodes: &Nodes, own: Option<&[Point]>, ages: &[f32], index: &Tensor, rel
         if from == target {
             return Err(Invalid::new(format!("edge_index[{e}]"), format!("{ends:?}"), "two different nodes"));
         }
-        let part = |axis: usize| finite(|| format!("edge_relative[{e}][{axis}]"), rel[axis]);
-        let detection = ReportedDetection { target, rel: [part(0)?, part(1)?], place: e as u32, mirrored: false };
+        let part = |axis: usize| check_finite(|| format!("edge_relative[{e}][{axis}]"), rel[axis]);
+        let detection = ReportedDetection { target, rel: [part(0)?, part(1)?], request_index: e as u32, mirrored: false };
         detections[from as usize].push(detection);
     }
     for list in &mut detections {
         list.sort_by_key(|detection| detection.target);
         if let Some(pair) = list.windows(2).find(|pair| pair[0].target == pair[1].target) {
-            let (first, again) = (pair[0].place, pair[1].place as usize);
+            let (first, again) = (pair[0].request_index, pair[1].request_index as usize);
             let ends = format!("{:?}", &ends[2 * again..2 * again + 2]);
             return Err(Invalid::new(format!("edge_index[{again}]"), ends, format!("an edge that differs from edge {first}")));
         }
@@ -206,10 +206,10 @@ fn graph(nodes: &Nodes, own: Option<&[Point]>, ages: &[f32], index: &Tensor, rel
             None => vec![None; uavs],
         },
         aoi: nodes.sort_users(ages),
-        left_out: detections[uavs..].iter().map(Vec::is_empty).collect(),
+        without_detections: detections[uavs..].iter().map(Vec::is_empty).collect(),
         detections,
-        // The fields of edges have the places of edges, not of nodes.
-        places: Vec::new(),
+        // Errors about edges name the index of the edge, so no node indices are needed.
+        request_of_canonical: Vec::new(),
         form: GraphForm::Edges,
     })
 }

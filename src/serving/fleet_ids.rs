@@ -8,16 +8,16 @@ use crate::invalid::Invalid;
 
 /// Ids of UAVs and users in canonical order: shorter first, then bytewise, so that `uav-2` comes before `uav-10`.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Fleet {
+pub struct FleetIds {
     /// Ids of the M UAVs.
     pub uavs: Vec<String>,
     /// Ids of the N users.
     pub users: Vec<String>,
 }
 
-impl Fleet {
-    /// Longest id, in characters.
-    pub const LONGEST_ID: usize = 128;
+impl FleetIds {
+    /// Maximum length of an id, in characters.
+    pub const MAX_ID_LEN: usize = 128;
 
     /// Compares two ids in canonical order.
     pub fn order(a: &str, b: &str) -> Ordering {

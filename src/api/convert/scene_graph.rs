@@ -1,12 +1,12 @@
-//! Graphs and scenes, in both directions; ids are `uav-0`, `user-0`, ... where the server names the nodes.
+//! Converts graphs and scenes from and to messages. In graphs and scenes of the server, ids are `uav-0`, ..., `user-0`, ...
 
 use crate::env::Point;
 use crate::invalid::Invalid;
 use crate::policy::Slot;
-use crate::serving::{Node, NodeDetection, Observation, Scene};
+use crate::serving::{FleetInput, Node, NodeDetection, Scene};
 use crate::wire::v1;
 
-impl TryFrom<v1::Graph> for Observation {
+impl TryFrom<v1::Graph> for FleetInput {
     type Error = Invalid;
 
     fn try_from(graph: v1::Graph) -> Result<Self, Invalid> {
@@ -27,7 +27,7 @@ impl TryFrom<v1::Graph> for Observation {
     }
 }
 
-impl TryFrom<v1::Scene> for Observation {
+impl TryFrom<v1::Scene> for FleetInput {
     type Error = Invalid;
 
     fn try_from(scene: v1::Scene) -> Result<Self, Invalid> {

@@ -1,4 +1,4 @@
-//! Graphs and scenes, in both directions: `/v1/act` accepts what an environment returns.
+//! Graphs and scenes in requests and responses. `/v1/act` accepts those of an environment unchanged.
 
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -8,14 +8,14 @@ use utoipa::openapi::schema::Schema;
 
 use super::config_schemas::schema;
 use super::json::objects_only;
-use crate::api::convert::observation::{nodes, uavs, users};
+use crate::api::convert::scene_graph::{nodes, uavs, users};
 use crate::env::Point;
 use crate::invalid::Invalid;
 use crate::policy::Slot;
-use crate::serving::{self, Observation};
+use crate::serving::{self, FleetInput};
 
-/// What each node detects. Edges follow from detections, in both directions: a detection that one side reports is mirrored; the
-/// reports of both sides have to agree.
+/// The detections of all nodes. If only one of two nodes reports a detection, the server adds the reverse detection. If both
+/// report one, the relative position of one must be the negation of the other, within 1e-5.
 #[derive(Debug, Deserialize, Serialize, ToSchema)]
 #[serde(deny_unknown_fields, remote = "Self")]
 pub(super) struct Graph {
@@ -31,13 +31,14 @@ struct Node {
     id: String,
     #[schema(schema_with = node_kind)]
     kind: NodeKind,
-    /// The nodes within this node's detection range. A user's may be left out: they are then derived from the UAVs' detections.
+    /// The nodes within the detection range of this node. Empty for a user: the server derives them from the detections of the
+    /// UAVs.
     #[serde(default)]
     detections: Vec<Detection>,
-    /// A UAV's own position, for policies that need it.
+    /// Position of a UAV. Required by policies with `NEEDS_OWN_POSITIONS`.
     #[serde(skip_serializing_if = "Option::is_none")]
     position: Option<Position>,
-    /// A user's own AoI, in slots; where left out, it is taken from the detections of the user.
+    /// AoI of a user in slots. Default: the AoI in a detection of the user, or 0 if no node detects the user.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0, maximum = 1e6)]
     aoi: Option<f64>,
@@ -59,7 +60,7 @@ fn node_kind() -> RefOr<Schema> {
 #[serde(deny_unknown_fields, remote = "Self")]
 struct Detection {
     target_id: String,
-    /// Target position minus own position, in units of the square's side.
+    /// Position of the target minus position of the node, in units of the side of the square.
     rel_x: f64,
     rel_y: f64,
     /// AoI in slots; required if the target is a user, absent if it is a UAV.
@@ -78,7 +79,7 @@ struct Position {
     y: f64,
 }
 
-/// Everything at absolute positions; the server derives the detections.
+/// The absolute positions of all UAVs and users. The server derives the detections.
 #[derive(Debug, Deserialize, Serialize, ToSchema)]
 #[serde(deny_unknown_fields, remote = "Self")]
 pub(super) struct Scene {
@@ -123,7 +124,7 @@ impl Graph {
     }
 }
 
-impl TryFrom<Graph> for Observation {
+impl TryFrom<Graph> for FleetInput {
     type Error = Invalid;
 
     fn try_from(graph: Graph) -> Result<Self, Invalid> {
@@ -166,7 +167,7 @@ impl Scene {
     }
 }
 
-impl TryFrom<Scene> for Observation {
+impl TryFrom<Scene> for FleetInput {
     type Error = Invalid;
 
     fn try_from(scene: Scene) -> Result<Self, Invalid> {

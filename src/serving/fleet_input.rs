@@ -1,33 +1,33 @@
-//! The observation of one fleet in one slot, and its conversion to the [`Slot`] that a policy reads.
+//! The input of one fleet in one slot, and its conversion to the [`Slot`] that a policy reads.
 //!
-//! `api::convert` builds an [`Observation`] and checks everything that does not depend on the policy. This file applies the
+//! `api::convert` builds an [`FleetInput`] and checks everything that does not depend on the policy. This file applies the
 //! policy's detection range and needs: it computes the detections of a scene, and completes a graph.
 
-use super::Fleet;
+use super::FleetIds;
 use crate::env::Point;
 use crate::invalid::Invalid;
 use crate::policy::{Detection, Policy, RequiredInput, Slot};
 
-/// Most nodes of one observation.
+/// Maximum number of nodes of one fleet.
 pub const MAX_NODES: usize = 20_000;
-/// Most detections of one observation, mirrored and derived ones included.
+/// Maximum number of detections of one input, including mirrored and derived ones.
 pub const MAX_DETECTIONS: usize = 1 << 22;
 
 /// Relative coordinates may exceed the detection range by this factor, for callers that compute in f32.
 const RANGE_TOLERANCE: f64 = 1.0 + 1e-5;
 
-/// Observation of one fleet in one slot, in canonical order of ids.
+/// Input of one fleet in one slot, in canonical order of ids.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Observation {
+pub struct FleetInput {
     /// The ids of UAVs and users.
-    pub fleet: Fleet,
+    pub fleet: FleetIds,
     /// Canonical index of each UAV in the order of the request.
-    pub uav_order: Vec<u32>,
+    pub canonical_of_request: Vec<u32>,
     /// Positions or detections.
     pub content: SceneOrGraph,
 }
 
-/// The two forms of an observation.
+/// The two forms of an input.
 #[derive(Clone, Debug, PartialEq)]
 pub enum SceneOrGraph {
     /// Absolute positions.
@@ -56,10 +56,10 @@ pub struct Graph {
     pub aoi: Vec<f32>,
     /// Detections of each node, UAVs first, in ascending order of target.
     pub detections: Vec<Vec<ReportedDetection>>,
-    /// Whether the request leaves out the detections of each user, so that they have to be derived.
-    pub left_out: Vec<bool>,
-    /// Index of each node in the request's list.
-    pub places: Vec<u32>,
+    /// Whether the request has no detections of each user, so that they have to be derived.
+    pub without_detections: Vec<bool>,
+    /// Index of each node in the list of the request.
+    pub request_of_canonical: Vec<u32>,
     /// Form of the request, for the field names in errors.
     pub form: GraphForm,
 }
@@ -74,16 +74,16 @@ pub enum GraphForm {
     Edges,
 }
 
-/// A detection of a request, in f64 and with its place in the request.
+/// A detection of a request, in f64 and with its index in the request.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ReportedDetection {
     /// Canonical node index, UAVs first.
     pub target: u32,
     /// Position of the target minus position of the detecting node.
     pub rel: Point,
-    /// Index in the request's detections of the node, or in its list of edges.
-    pub place: u32,
-    /// Whether the request has only the opposite detection, of which this is the mirror image.
+    /// Index of the detection among those of the node in the request, or in its list of edges.
+    pub request_index: u32,
+    /// Whether this detection is not in the request, but was added because the request has the reverse detection.
     pub mirrored: bool,
 }
 
@@ -93,7 +93,7 @@ impl ReportedDetection {
     }
 }
 
-impl Observation {
+impl FleetInput {
     /// M.
     pub fn uavs(&self) -> usize {
         self.fleet.uavs.len()
@@ -107,7 +107,7 @@ impl Observation {
     /// The input of `policy`. Work is bounded by [`MAX_NODES`] and [`MAX_DETECTIONS`].
     ///
     /// # Errors
-    /// Names the field at fault if the fleet does not fit the policy, if something that the policy needs is missing, if a
+    /// [`Invalid`] if the fleet does not fit the policy, if something that the policy needs is missing, if a
     /// detection lies beyond its range, or if there are too many detections.
     pub fn into_slot(self, policy: &dyn Policy) -> Result<Slot, Invalid> {
         let size = (self.uavs(), self.users());
@@ -116,10 +116,10 @@ impl Observation {
 }
 
 impl SceneOrGraph {
-    /// As [`Observation::into_slot`], for a fleet of `(uavs, users)`.
+    /// As [`FleetInput::into_slot`], for a fleet of `(uavs, users)`.
     ///
     /// # Errors
-    /// As [`Observation::into_slot`].
+    /// As [`FleetInput::into_slot`].
     pub fn into_slot(self, (uavs, users): (usize, usize), policy: &dyn Policy) -> Result<Slot, Invalid> {
         policy.check_fleet(uavs, users)?;
         let range = policy.detection_range();
@@ -137,7 +137,7 @@ fn too_many_detections(field: &str) -> Invalid {
     Invalid::new(field, value, format!("at most {MAX_DETECTIONS} detections per request"))
 }
 
-fn within(rel: &Point, range: f64) -> bool {
+fn is_within(rel: &Point, range: f64) -> bool {
     rel[0] * rel[0] + rel[1] * rel[1] <= range * range
 }
 
@@ -151,7 +151,7 @@ impl Graph {
             && let Some(i) = self.positions.iter().position(Option::is_none)
         {
             let field = match self.form {
-                GraphForm::Nodes => format!("graph.nodes[{}].position", self.places[i]),
+                GraphForm::Nodes => format!("graph.nodes[{}].position", self.request_of_canonical[i]),
                 GraphForm::Edges => "uav_positions".into(),
             };
             return Err(Invalid::missing(field, "the position of the UAV, which this policy needs"));
@@ -181,7 +181,7 @@ impl Graph {
     /// The request's field that holds the relative coordinates of detection `place` of `node`.
     pub fn rel_field(&self, node: usize, place: u32) -> String {
         match self.form {
-            GraphForm::Nodes => format!("graph.nodes[{}].detections[{place}].rel", self.places[node]),
+            GraphForm::Nodes => format!("graph.nodes[{}].detections[{place}].rel", self.request_of_canonical[node]),
             GraphForm::Edges => format!("edge_relative[{place}]"),
         }
     }
@@ -190,9 +190,9 @@ impl Graph {
     fn check_range(&self, range: f64) -> Result<(), Invalid> {
         for (node, list) in self.detections.iter().enumerate() {
             for detection in list.iter().filter(|d| !d.mirrored) {
-                if !within(&detection.rel, range * RANGE_TOLERANCE) {
+                if !is_within(&detection.rel, range * RANGE_TOLERANCE) {
                     let [x, y] = detection.rel;
-                    let field = self.rel_field(node, detection.place);
+                    let field = self.rel_field(node, detection.request_index);
                     let expected = format!("a position within the detection range of the policy ({range})");
                     return Err(Invalid::new(field, format!("({x}, {y})"), expected));
                 }
@@ -204,6 +204,9 @@ impl Graph {
     /// Derives detections between users for users whose detections the request leaves out. If UAV i detects users j and k,
     /// then j detects k at `rel_ik - rel_ij`, provided that this is within the range; if several UAVs detect both, the first
     /// one in canonical order determines the coordinates. Returns one unsorted list per user.
+    ///
+    /// Example: UAV 0 detects users 1 and 2 at (0.1, 0) and (0.3, 0). With a range of 0.25, user 1 detects user 2 at (0.2, 0),
+    /// and user 2 detects user 1 at (-0.2, 0).
     fn derive_user_detections(&self, range: f64) -> Result<Vec<Vec<Detection>>, Invalid> {
         let (uavs, users) = (self.positions.len(), self.aoi.len());
         let mut total: usize = self.detections.iter().map(Vec::len).sum();
@@ -211,50 +214,50 @@ impl Graph {
             return Err(too_many_detections("graph"));
         }
         let mut derived = vec![Vec::new(); users];
-        if !self.left_out.contains(&true) {
+        if !self.without_detections.contains(&true) {
             return Ok(derived);
         }
-        // If both users of a pair left out their lists, the pair is examined once, from the first of the two.
-        let mut unreported = vec![0_u64; users.div_ceil(64)];
-        for j in (0..users).filter(|&j| self.left_out[j]) {
-            unreported[j / 64] |= 1 << (j % 64);
+        // Bit set of the users without detections. A pair of two such users is examined once, for the first of the two.
+        let mut all_without = vec![0_u64; users.div_ceil(64)];
+        for j in (0..users).filter(|&j| self.without_detections[j]) {
+            all_without[j / 64] |= 1 << (j % 64);
         }
         let by_uav: Vec<DetectedUsers> =
             self.detections[..uavs].iter().map(|list| DetectedUsers::new(list, uavs, users)).collect();
-        // Bit sets of users: those to skip, and those that user j detects.
-        let mut known = vec![0_u64; users.div_ceil(64)];
-        let mut found = vec![0_u64; known.len()];
+        // Bit sets of users, for each user j: those that need not be examined, and those that j detects.
+        let mut skip = vec![0_u64; users.div_ceil(64)];
+        let mut detected = vec![0_u64; skip.len()];
         let mut rels = vec![[0.0_f32; 2]; users];
-        for j in (0..users).filter(|&j| self.left_out[j]) {
+        for j in (0..users).filter(|&j| self.without_detections[j]) {
             let reported = &self.detections[uavs + j];
-            known.fill(0);
-            found.fill(0);
+            skip.fill(0);
+            detected.fill(0);
             let others = reported.iter().filter_map(|d| (d.target as usize).checked_sub(uavs));
             for user in others.chain([j]) {
-                known[user / 64] |= 1 << (user % 64);
+                skip[user / 64] |= 1 << (user % 64);
             }
-            for (known, unreported) in known.iter_mut().zip(&unreported[..j / 64]) {
-                *known |= unreported;
+            for (skip, all_without) in skip.iter_mut().zip(&all_without[..j / 64]) {
+                *skip |= all_without;
             }
-            known[j / 64] |= unreported[j / 64] & ((1 << (j % 64)) - 1);
+            skip[j / 64] |= all_without[j / 64] & ((1 << (j % 64)) - 1);
             for to_uav in reported.iter().take_while(|d| (d.target as usize) < uavs) {
                 let DetectedUsers { bits, first, rel: list } = &by_uav[to_uav.target as usize];
-                for (word, (known, &bits)) in known.iter_mut().zip(bits).enumerate() {
+                for (word, (skip, &bits)) in skip.iter_mut().zip(bits).enumerate() {
                     // A pair of users that several UAVs detect is examined once.
-                    let mut fresh = bits & !*known;
-                    *known |= bits;
-                    while fresh != 0 {
-                        let bit = fresh.trailing_zeros();
-                        fresh &= fresh - 1;
+                    let mut candidates = bits & !*skip;
+                    *skip |= bits;
+                    while candidates != 0 {
+                        let bit = candidates.trailing_zeros();
+                        candidates &= candidates - 1;
                         let index = first[word] as usize + (bits & ((1 << bit) - 1)).count_ones() as usize;
                         let rel = [list[index][0] + to_uav.rel[0], list[index][1] + to_uav.rel[1]];
-                        found[word] |= u64::from(within(&rel, range)) << bit;
+                        detected[word] |= u64::from(is_within(&rel, range)) << bit;
                         rels[word * 64 + bit as usize] = rel.map(|x| x as f32);
                     }
                 }
             }
-            for (word, &found) in found.iter().enumerate() {
-                let mut rest = found;
+            for (word, &detected) in detected.iter().enumerate() {
+                let mut rest = detected;
                 while rest != 0 {
                     let k = word * 64 + rest.trailing_zeros() as usize;
                     rest &= rest - 1;

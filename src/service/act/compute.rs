@@ -1,4 +1,4 @@
-//! Steps that all kinds of memory share: conversion of the observation, and the call of the engine.
+//! Converts the input of a fleet and runs the policy, for every location of the memory.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -9,25 +9,25 @@ use crate::policy::Slot;
 use crate::service::{App, Error};
 use crate::serving::{LoadedPolicy, SceneOrGraph, Task, TaskOutput};
 
-/// Observations with at least this many nodes are converted on a blocking thread, not on those that serve connections.
-pub const INLINE_NODES: usize = 256;
+/// Inputs with at least this many nodes are converted on a blocking thread, not on the threads that serve connections.
+pub const OFFLOAD_NODES: usize = 256;
 
-/// Converts an observation of `uavs` UAVs and `users` users to the input of `policy`.
-pub(super) async fn build(
+/// Converts the scene or graph of `uavs` UAVs and `users` users to the input of `policy`.
+pub(super) async fn convert(
     content: SceneOrGraph,
     (uavs, users): (usize, usize),
     policy: &Arc<LoadedPolicy>,
 ) -> Result<Slot, Error> {
-    if uavs + users < INLINE_NODES {
-        return Ok(content.into_slot((uavs, users), &*policy.policy)?);
+    if uavs + users < OFFLOAD_NODES {
+        return Ok(content.into_slot((uavs, users), &*policy.implementation)?);
     }
     let policy = policy.clone();
-    let converted = tokio::task::spawn_blocking(move || content.into_slot((uavs, users), &*policy.policy));
+    let converted = tokio::task::spawn_blocking(move || content.into_slot((uavs, users), &*policy.implementation));
     Ok(converted.await.map_err(Error::internal)??)
 }
 
 /// Runs the policy of `task`.
-pub(super) async fn compute(app: &App, task: Task, deadline: Option<Instant>) -> Result<TaskOutput, Error> {
+pub(super) async fn run(app: &App, task: Task, deadline: Option<Instant>) -> Result<TaskOutput, Error> {
     record_in_span("policy", &task.policy().reference);
     Ok(app.engine.run(task, deadline).await?)
 }

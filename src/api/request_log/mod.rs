@@ -20,7 +20,7 @@ pub(super) const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id"
 
 /// Methods and routes called once per slot or by monitoring. Their spans have level DEBUG, so that they cost nothing by
 /// default.
-const QUIET: &[&str] = &[
+const DEBUG_SPANS: &[&str] = &[
     "Act",
     "Step",
     "ModelInfer",
@@ -37,8 +37,8 @@ const QUIET: &[&str] = &[
 ];
 
 /// Whether the span of the method or route `name` has level DEBUG.
-pub(super) fn is_quiet(name: &str) -> bool {
-    QUIET.contains(&name)
+pub(super) fn has_debug_span(name: &str) -> bool {
+    DEBUG_SPANS.contains(&name)
 }
 
 /// Creates request ids: a random number per process and a counter.

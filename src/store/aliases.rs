@@ -1,5 +1,4 @@
-//! Aliases of policies with their history, and which versions are unloaded. An alias and its history change in one
-//! transaction.
+//! Aliases of policies with their history. An alias and its history change in one transaction.
 
 use jiff::Timestamp;
 use sqlx::{FromRow, SqliteConnection};
@@ -34,7 +33,7 @@ pub struct AliasMove<'a> {
 
 /// An entry in the history of a policy's aliases.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Promotion {
+pub struct AliasHistoryEntry {
     /// Id; later moves have larger ids.
     pub id: i64,
     /// The alias.
@@ -43,14 +42,14 @@ pub struct Promotion {
     pub version: Option<u64>,
     /// The version that the alias pointed to before; `None` if it was new.
     pub previous: Option<u64>,
-    /// When the alias moves.
+    /// When the alias moved.
     pub at: Timestamp,
     /// Id of the caller's API key.
     pub by: Option<String>,
 }
 
 #[derive(FromRow)]
-struct PromotionRow {
+struct AliasHistoryRow {
     id: i64,
     alias: String,
     version: Option<i64>,
@@ -61,7 +60,7 @@ struct PromotionRow {
 
 /// Selects entries of the history.
 #[derive(Clone, Copy, Debug)]
-pub struct PromotionFilter<'a> {
+pub struct AliasHistoryFilter<'a> {
     /// Name of the policy.
     pub name: &'a str,
     /// Only moves of this alias.
@@ -125,46 +124,17 @@ impl Store {
     ///
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
-    pub async fn promotions(&self, filter: PromotionFilter<'_>, limit: u32) -> Result<Vec<Promotion>> {
+    pub async fn alias_history(&self, filter: AliasHistoryFilter<'_>, limit: u32) -> Result<Vec<AliasHistoryEntry>> {
         let sql = "SELECT id, alias, version, previous, at, by FROM policy_promotions
                    WHERE name = ?1 AND (?2 IS NULL OR alias = ?2) AND (?3 IS NULL OR id < ?3) ORDER BY id DESC LIMIT ?4";
-        let PromotionFilter { name, alias, before } = filter;
-        let rows: Vec<PromotionRow> =
+        let AliasHistoryFilter { name, alias, before } = filter;
+        let rows: Vec<AliasHistoryRow> =
             sqlx::query_as(sql).bind(name).bind(alias).bind(before).bind(limit).fetch_all(&self.read).await?;
-        let read = |row: PromotionRow| {
-            let PromotionRow { id, alias, version, previous, at, by } = row;
+        let read = |row: AliasHistoryRow| {
+            let AliasHistoryRow { id, alias, version, previous, at, by } = row;
             let (version, previous) = (version.map(|v| v as u64), previous.map(|v| v as u64));
-            Ok(Promotion { id, alias, version, previous, at: timestamp(at)?, by })
+            Ok(AliasHistoryEntry { id, alias, version, previous, at: timestamp(at)?, by })
         };
         rows.into_iter().map(read).collect()
-    }
-
-    /// Marks versions of a policy as loaded or unloaded.
-    ///
-    /// # Errors
-    /// [`Error`](super::Error) when the database fails.
-    pub async fn set_policy_versions_loaded(&self, name: &str, versions: &[u64], loaded: bool, now: Timestamp) -> Result<()> {
-        let mut tx = self.begin().await?;
-        for &version in versions {
-            let query = if loaded {
-                sqlx::query("DELETE FROM policies_unloaded WHERE name = ? AND version = ?").bind(name).bind(version as i64)
-            } else {
-                let sql = "INSERT INTO policies_unloaded (name, version, at) VALUES (?, ?, ?) ON CONFLICT DO NOTHING";
-                sqlx::query(sql).bind(name).bind(version as i64).bind(now.as_millisecond())
-            };
-            query.execute(&mut *tx).await?;
-        }
-        tx.commit().await?;
-        Ok(())
-    }
-
-    /// Names and numbers of the unloaded versions.
-    ///
-    /// # Errors
-    /// [`Error`](super::Error) when the database fails.
-    pub async fn unloaded_policies(&self) -> Result<Vec<(String, u64)>> {
-        let sql = "SELECT name, version FROM policies_unloaded ORDER BY name, version";
-        let rows: Vec<(String, i64)> = sqlx::query_as(sql).fetch_all(&self.read).await?;
-        Ok(rows.into_iter().map(|(name, version)| (name, version as u64)).collect())
     }
 }
