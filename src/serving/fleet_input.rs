@@ -178,10 +178,10 @@ impl Graph {
         Ok(Slot::from_flat_detections(positions, uavs, self.aoi, offsets, detections))
     }
 
-    /// The request's field that holds the relative coordinates of detection `place` of `node`.
-    pub fn rel_field(&self, node: usize, place: u32) -> String {
+    /// The request's field that holds the relative coordinate x (`axis` 0) or y (1) of detection `place` of `node`.
+    pub fn rel_field(&self, node: usize, place: u32, axis: usize) -> String {
         match self.form {
-            GraphForm::Nodes => format!("graph.nodes[{}].detections[{place}].rel", self.request_of_canonical[node]),
+            GraphForm::Nodes => format!("graph.nodes[{}].detections[{place}].rel_{}", self.request_of_canonical[node], ["x", "y"][axis]),
             GraphForm::Edges => format!("edge_relative[{place}]"),
         }
     }
@@ -192,7 +192,7 @@ impl Graph {
             for detection in list.iter().filter(|d| !d.mirrored) {
                 if !is_within(&detection.rel, range * RANGE_TOLERANCE) {
                     let [x, y] = detection.rel;
-                    let field = self.rel_field(node, detection.request_index);
+                    let field = self.rel_field(node, detection.request_index, usize::from(y.abs() > x.abs()));
                     let expected = format!("a position within the detection range of the policy ({range})");
                     return Err(Invalid::new(field, format!("({x}, {y})"), expected));
                 }

@@ -240,8 +240,9 @@ pub(crate) fn mirror(mut graph: Graph) -> Result<Graph, Invalid> {
                 continue;
             };
             let [x, y] = other[at].rel;
-            if (x - back[0]).abs() > REPORT_TOLERANCE || (y - back[1]).abs() > REPORT_TOLERANCE {
-                let field = graph.rel_field(detection.target as usize, other[at].request_index);
+            let differs = [(x - back[0]).abs() > REPORT_TOLERANCE, (y - back[1]).abs() > REPORT_TOLERANCE];
+            if let Some(axis) = differs.iter().position(|&differs| differs) {
+                let field = graph.rel_field(detection.target as usize, other[at].request_index, axis);
                 let expected =
                     format!("about ({}, {}), the negation of the position that the other node reports", back[0], back[1]);
                 return Err(Invalid::new(field, format!("({x}, {y})"), expected));

@@ -181,7 +181,6 @@ async fn an_unloaded_version_serves_nobody_new_and_those_that_fly_it_go_on() {
         ];
         for (code, reason, message) in refusals {
             assert_eq!((code, reason.as_str()), (Code::FailedPrecondition, "policy_unloaded"), "{message}");
-            assert_eq!(message, "policy mine:2 is unloaded; load it to fly it");
         }
     }
     let on = client.act(in_session("s", Some(1), scene(3, 5, 1))).await.unwrap().into_inner();

@@ -40,7 +40,7 @@ async fn an_alias_is_set_moved_and_deleted_and_that_is_remembered() {
         rest.send(Method::PUT, path, body).await
     };
     let moved = |version: u64, previous: Value| json!({"alias": "live", "version": version, "previous": previous});
-    assert_eq!(put(1, Some(2)).await.1["detail"], "mine@live means nothing, not version 2 as expected");
+    assert_eq!(put(1, Some(2)).await.1["code"], "alias_moved");
     assert_eq!(put(1, Some(0)).await, (StatusCode::CREATED, moved(1, json!(null))));
     assert_eq!(put(1, Some(0)).await.1["code"], "alias_moved");
     server.advance(5);
