@@ -181,7 +181,9 @@ impl Graph {
     /// The request's field that holds the relative coordinate x (`axis` 0) or y (1) of detection `place` of `node`.
     pub fn rel_field(&self, node: usize, place: u32, axis: usize) -> String {
         match self.form {
-            GraphForm::Nodes => format!("graph.nodes[{}].detections[{place}].rel_{}", self.request_of_canonical[node], ["x", "y"][axis]),
+            GraphForm::Nodes => {
+                format!("graph.nodes[{}].detections[{place}].rel_{}", self.request_of_canonical[node], ["x", "y"][axis])
+            }
             GraphForm::Edges => format!("edge_relative[{place}]"),
         }
     }
