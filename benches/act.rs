@@ -4,7 +4,7 @@
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use qedgix::learner::{Algorithm, Learner, Preset, TrainConfig};
-use qedgix::policy::{FleetStep, LearnedPolicy, Policy, Slot};
+use qedgix::policy::{FleetGraph, FleetStep, LearnedPolicy, Policy};
 
 fn act(c: &mut Criterion) {
     let mut group = c.benchmark_group("act");
@@ -20,12 +20,12 @@ fn act(c: &mut Criterion) {
         let (own, all, aoi) = (spread(uavs, 0.618), spread(users, 0.7548), vec![3.0; users]);
         let mut memory = vec![0.0; policy.memory_len(uavs, users)];
         policy.start(uavs, users, 1, &mut memory);
-        let (mut headings, mut slot) = (vec![0; uavs], Slot::default());
+        let (mut headings, mut graph) = (vec![0; uavs], FleetGraph::default());
         group.bench_function(format!("{uavs} UAVs, {users} users"), |b| {
             b.iter(|| {
-                slot.set_scene(&own, &all, &aoi, 0.28);
+                graph.set_scene(&own, &all, &aoi, 0.28);
                 let (memory, headings) = (&mut memory[..], &mut headings[..]);
-                policy.act(&mut [FleetStep { slot: &slot, step: 0, memory, headings, q_values: None }]);
+                policy.act(&mut [FleetStep { graph: &graph, step: 0, memory, headings, q_values: None }]);
             });
         });
     }

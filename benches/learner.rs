@@ -9,8 +9,8 @@ use std::time::Duration;
 
 use criterion::{BatchSize, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use qedgix::learner::{Algorithm, Learner, MixerKind, Preset, TrainConfig};
-use qedgix::nn::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
-use qedgix::policy::{Actor, Aggregation, Identity, ObservationKind, StepInput, TOKEN};
+use qedgix::nn::matmul::{InitialValue, Lhs, Out, Rhs, matmul};
+use qedgix::policy::{Aggregation, BatchedAgent, Identity, ObservationKind, StepInput, TOKEN};
 use sample::episodes;
 
 /// The configuration of docs/performance.md: flat, one-hot, mean, qmix.
@@ -74,7 +74,7 @@ fn products(c: &mut Criterion) {
                 || vec![0.0_f32; m * n],
                 |c| {
                     let out = Out { data: c, stride: n };
-                    matmul((m, k, n), Lhs::rows(&a, k), Rhs { data: &b, stride: n }, out, Accumulate::Zero);
+                    matmul((m, k, n), Lhs::rows(&a, k), Rhs { data: &b, stride: n }, out, InitialValue::Zero);
                 },
                 BatchSize::NumIterations(100),
             );
@@ -95,10 +95,10 @@ fn step(c: &mut Criterion) {
                 (0..fleets).flat_map(|e| &x[(e * (k + 1) + k / 2) * width..][..width]).copied().collect()
             };
             let (uav_xy, aoi) = (middle(&ep.uav_xy, 2 * m), middle(&ep.aoi, n));
-            let mut actor = Actor::new(learner.agent(), fleets);
-            actor.begin(learner.agent(), learner.agent_parameters(), &vec![0.0; fleets * m * TOKEN]);
+            let mut batched_agent = BatchedAgent::new(learner.agent(), fleets);
+            batched_agent.begin(learner.agent(), learner.agent_parameters(), &vec![0.0; fleets * m * TOKEN]);
             let input = StepInput { uav_xy: &uav_xy, user_xy: &ep.user_xy, aoi: &aoi };
-            group.bench_function(BenchmarkId::new(name, fleets), |b| b.iter(|| actor.step(learner.agent(), input)[0]));
+            group.bench_function(BenchmarkId::new(name, fleets), |b| b.iter(|| batched_agent.step(learner.agent(), input)[0]));
         }
     }
     group.finish();

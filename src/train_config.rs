@@ -61,7 +61,7 @@ pub struct Training {
     pub self_loops: bool,
     /// Without a graph network: number of links over which a UAV observes. 1: its own detections; L + 1: what L graph layers
     /// bring.
-    #[serde(default = "one")]
+    #[serde(default = "default_hops")]
     pub hops: usize,
     /// Whether relative positions are divided by the detection range in flat observations, and own positions scaled to [-1, 1].
     #[serde(default)]
@@ -69,14 +69,14 @@ pub struct Training {
     /// Mixer.
     pub mixer: MixerKind,
     /// Factor of the initial weights of the hypernetworks' last layers.
-    #[serde(default = "unit")]
+    #[serde(default = "default_factor")]
     pub hyper_init: f64,
     /// Environment steps to train for.
     pub steps: u64,
     /// Learning rate of Adam at the start.
     pub learning_rate: f64,
-    /// Share of the learning rate that is left at the end; it falls linearly over `steps`. 1: the rate is constant.
-    #[serde(default = "unit")]
+    /// The learning rate at the end of training, as a fraction of `learning_rate`; it falls linearly over `steps`. 1.0: no decay.
+    #[serde(default = "default_factor")]
     pub learning_rate_decay: f64,
     /// Discount factor.
     pub gamma: f64,
@@ -98,7 +98,7 @@ pub struct Training {
     pub buffer: usize,
     /// Episodes between copies of the online networks to the target networks.
     pub target_every: u64,
-    /// Share by which the target networks move to the online networks after each update. 0: they are copied every
+    /// Fraction of the distance to the online networks by which the target networks move after each update. 0: they are copied every
     /// `target_every` episodes.
     #[serde(default)]
     pub target_tau: f64,
@@ -234,7 +234,7 @@ impl TrainConfig {
         };
         if config.environment.reward_scale.is_none() {
             let env = &config.environment;
-            let scale = if preset == Preset::Authors { env.users as f64 } else { env.reward_factor() };
+            let scale = if preset == Preset::Authors { env.users as f64 } else { env.effective_reward_scale() };
             config.environment.reward_scale = Some(scale);
         }
         config.validate()?;
@@ -260,7 +260,13 @@ impl TrainConfig {
     /// The sizes of the agents.
     pub fn dims(&self) -> Dims {
         let env = &self.environment;
-        Dims { uavs: env.uavs, users: env.users, actions: env.headings(), detection_range: env.detection_range, slots: env.slots }
+        Dims {
+            uavs: env.uavs,
+            users: env.users,
+            actions: env.actions(),
+            detection_range: env.detection_range,
+            episode_slots: env.slots,
+        }
     }
 
     /// Checks each field and their combination.
@@ -268,8 +274,8 @@ impl TrainConfig {
     /// # Errors
     /// [`Invalid`] for the first invalid field.
     pub fn validate(&self) -> Result<(), Invalid> {
-        /// Largest size of replay in bytes.
-        const LIMIT: usize = 8 << 30;
+        /// Maximum size of replay in bytes.
+        const MAX_REPLAY_BYTES: usize = 8 << 30;
         self.environment.validate().map_err(|e| e.with_prefix("environment"))?;
         self.training.validate().map_err(|e| e.with_prefix("training"))?;
         let mixes = self.training.mixer != MixerKind::None;
@@ -287,9 +293,9 @@ impl TrainConfig {
         }
         let episode = (env.slots + 1) * (env.uavs * 8 + env.users * 10) + env.slots * (env.uavs + 4);
         let replay = episode.saturating_mul(t.buffer);
-        if replay > LIMIT {
+        if replay > MAX_REPLAY_BYTES {
             let value = format!("{} episodes of {} MiB in total", t.buffer, replay >> 20);
-            return Err(Invalid::new("training.buffer", value, format!("at most {} MiB in total", LIMIT >> 20)));
+            return Err(Invalid::new("training.buffer", value, format!("at most {} MiB in total", MAX_REPLAY_BYTES >> 20)));
         }
         Ok(())
     }
@@ -327,16 +333,16 @@ impl Training {
     }
 }
 
-fn one() -> usize {
+fn default_hops() -> usize {
     1
 }
 
-fn unit() -> f64 {
+fn default_factor() -> f64 {
     1.0
 }
 
-/// Symbols of the paper, accepted as names of fields.
-const LETTERS: [(&str, &str); 9] = [
+/// Symbols and abbreviations of the paper, accepted as names of fields.
+const PAPER_SYMBOLS: [(&str, &str); 9] = [
     ("M", "uavs"),
     ("N", "users"),
     ("K", "slots"),
@@ -352,31 +358,31 @@ const LETTERS: [(&str, &str); 9] = [
 ///
 /// # Errors
 /// [`Invalid`] for the first field that is unknown, of the wrong type or out of range, named as `environment.uavs`.
-pub fn environment(mut document: Value) -> Result<EnvConfig, Invalid> {
-    integral(&mut document);
+pub fn parse_environment(mut document: Value) -> Result<EnvConfig, Invalid> {
+    floats_to_integers(&mut document);
     let Value::Object(fields) = &document else {
         return Err(Invalid::schema("environment", &document, "an object"));
     };
     let mut config = overridden("environment", &EnvConfig::default(), fields)?;
     config.validate().map_err(|e| e.with_prefix("environment"))?;
-    config.reward_scale = Some(config.reward_factor());
+    config.reward_scale = Some(config.effective_reward_scale());
     Ok(config)
 }
 
 /// Largest integer that all JSON readers and `google.protobuf.Struct` represent exactly.
-pub const EXACT: u64 = (1 << 53) - 1;
+pub const MAX_EXACT_INTEGER: u64 = (1 << 53) - 1;
 
 /// Converts whole numbers to integers, because `google.protobuf.Struct` has no integers.
-pub fn integral(value: &mut Value) {
+pub fn floats_to_integers(value: &mut Value) {
     match value {
         Value::Number(number) => {
-            let float = number.as_f64().filter(|x| number.is_f64() && x.fract() == 0.0 && x.abs() <= EXACT as f64);
+            let float = number.as_f64().filter(|x| number.is_f64() && x.fract() == 0.0 && x.abs() <= MAX_EXACT_INTEGER as f64);
             if let Some(float) = float {
                 *value = Value::from(float as i64);
             }
         }
-        Value::Array(items) => items.iter_mut().for_each(integral),
-        Value::Object(fields) => fields.values_mut().for_each(integral),
+        Value::Array(items) => items.iter_mut().for_each(floats_to_integers),
+        Value::Object(fields) => fields.values_mut().for_each(floats_to_integers),
         Value::Null | Value::Bool(_) | Value::String(_) => {}
     }
 }
@@ -386,7 +392,7 @@ fn overridden<T: Serialize + DeserializeOwned>(section: &str, base: &T, patch: &
     let mut fields = serde_json::to_value(base).expect("a configuration is plain data");
     let known: Vec<String> = fields.as_object().into_iter().flatten().map(|(name, _)| name.clone()).collect();
     for (key, value) in patch {
-        let name = LETTERS.iter().find(|(letter, _)| letter == key).map_or(key.as_str(), |(_, name)| name);
+        let name = PAPER_SYMBOLS.iter().find(|(symbol, _)| symbol == key).map_or(key.as_str(), |(_, name)| name);
         if !known.iter().any(|k| k == name) {
             return Err(Invalid::unknown_field(format!("{section}.{key}"), format!("one of {}", known.join(", "))));
         }

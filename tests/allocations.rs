@@ -10,7 +10,7 @@ use futures::FutureExt;
 use futures::future::BoxFuture;
 use jiff::Timestamp;
 use qedgix::learner::{Algorithm, Learner, Preset, TrainConfig};
-use qedgix::policy::{LearnedPolicy, Slot};
+use qedgix::policy::{FleetGraph, LearnedPolicy};
 use qedgix::serving::{Decision, Engine, EngineConfig, Error, LoadedPolicy, OutputBuffers, PolicyRef, Task, TaskOutput};
 
 const UAVS: usize = 3;
@@ -25,10 +25,10 @@ fn policy() -> Arc<LoadedPolicy> {
 }
 
 /// Slot `step` of fleet `fleet`. Detections differ from slot to slot.
-fn slot(fleet: usize, step: usize) -> Slot {
+fn slot(fleet: usize, step: usize) -> FleetGraph {
     let at = |i: usize| [((i * 7 + fleet * 3 + step) % 11) as f64 / 20.0, ((i * 5 + step * 2) % 13) as f64 / 24.0];
     let (uavs, users): (Vec<_>, Vec<_>) = ((0..UAVS).map(at).collect(), (UAVS..UAVS + USERS).map(at).collect());
-    Slot::from_scene(&uavs, &users, &[3.0; USERS], 0.28)
+    FleetGraph::from_scene(&uavs, &users, &[3.0; USERS], 0.28)
 }
 
 /// Runs `fleets` fleets concurrently for `steps` slots. Returns the number of allocations of each slot.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use qedgix::env::{EnvConfig, EpisodeMetrics, Point};
 use qedgix::learner::{difference, evaluate, layout_list};
 use qedgix::policy::baselines::{self, EnvParams, LIST};
-use qedgix::policy::{FleetStep, Policy, RequiredInput, Slot};
+use qedgix::policy::{FleetGraph, FleetStep, Policy, RequiredInput};
 
 fn policy(name: &str) -> Arc<dyn Policy> {
     baselines::by_name(name, EnvParams::default()).unwrap()
@@ -61,11 +61,11 @@ fn mean_aoi_for_the_sizes_of_the_paper() {
 fn tour_plans_once_and_again_after_users_have_moved() {
     let policy = policy("tour");
     let users: Vec<Point> = (0..5).map(|j| [0.1 + 0.2 * j as f64, 0.3]).collect();
-    let scene = |users: &[Point]| Slot::from_scene(&[[0.5, 0.5]; 3], users, &[0.0; 5], policy.detection_range());
+    let scene = |users: &[Point]| FleetGraph::from_scene(&[[0.5, 0.5]; 3], users, &[0.0; 5], policy.detection_range());
     let mut memory = vec![0.0; policy.memory_len(3, 5)];
-    let fly = |slot: &Slot, step, memory: &mut Vec<f32>| {
+    let fly = |graph: &FleetGraph, step, memory: &mut Vec<f32>| {
         let mut headings = [99; 3];
-        policy.act(&mut [FleetStep { slot, step, memory, headings: &mut headings, q_values: None }]);
+        policy.act(&mut [FleetStep { graph, step, memory, headings: &mut headings, q_values: None }]);
         headings
     };
     fly(&scene(&users), 0, &mut memory);
@@ -111,7 +111,7 @@ fn episodes_depend_on_seeds_only() {
 
 /// A fleet in one slot, with its memory.
 struct Fleet {
-    slot: Slot,
+    graph: FleetGraph,
     memory: Vec<f32>,
     headings: Vec<u8>,
 }
@@ -124,11 +124,11 @@ impl Fleet {
         let aoi: Vec<f32> = (0..users).map(|i| (i * 7 % 11) as f32).collect();
         let mut memory = vec![7.0; policy.memory_len(uavs, users)];
         policy.start(uavs, users, seed, &mut memory);
-        Self { slot: Slot::from_scene(&own, &all, &aoi, policy.detection_range()), memory, headings: vec![99; uavs] }
+        Self { graph: FleetGraph::from_scene(&own, &all, &aoi, policy.detection_range()), memory, headings: vec![99; uavs] }
     }
 
     fn turn(&mut self, step: u64) -> FleetStep<'_> {
-        FleetStep { slot: &self.slot, step, memory: &mut self.memory, headings: &mut self.headings, q_values: None }
+        FleetStep { graph: &self.graph, step, memory: &mut self.memory, headings: &mut self.headings, q_values: None }
     }
 }
 
@@ -159,9 +159,9 @@ fn detections_suffice_for_baselines_that_do_not_need_the_scene() {
         let policy = policy(b.name);
         let mut scene = Fleet::new(&*policy, 3, 5, 11);
         let mut graph = Fleet::new(&*policy, 3, 5, 11);
-        let lists: Vec<_> = (0..8).map(|i| scene.slot.detections(i).to_vec()).collect();
-        let own = (b.needs == RequiredInput::OwnPositions).then(|| scene.slot.uav_positions().unwrap().to_vec());
-        graph.slot = Slot::from_detections(own, 3, scene.slot.aoi().to_vec(), &lists);
+        let lists: Vec<_> = (0..8).map(|i| scene.graph.detections(i).to_vec()).collect();
+        let own = (b.needs == RequiredInput::OwnPositions).then(|| scene.graph.uav_positions().unwrap().to_vec());
+        graph.graph = FleetGraph::from_detections(own, 3, scene.graph.aoi().to_vec(), &lists);
         for step in 0..5 {
             policy.act(&mut [scene.turn(step)]);
             policy.act(&mut [graph.turn(step)]);

@@ -4,7 +4,7 @@ use proptest::prelude::*;
 use qedgix::checkpoint::{self, Checkpoint, Error};
 use qedgix::env::EpisodeMetrics;
 use qedgix::learner::{Algorithm, MixerKind, Preset, TrainConfig, evaluate, layout_list};
-use qedgix::policy::{FleetStep, Policy, Slot};
+use qedgix::policy::{FleetGraph, FleetStep, Policy};
 use rand::RngExt;
 use serde_json::{Value, json};
 
@@ -16,7 +16,7 @@ fn config() -> TrainConfig {
 
 /// Weights of typical size, all different.
 fn weights(config: &TrainConfig) -> Vec<f32> {
-    (0..checkpoint::layout(config).len()).map(|i| ((i * 7919 % 1000) as f32 / 1000.0 - 0.5) * 0.2).collect()
+    (0..checkpoint::parameter_layout(config).len()).map(|i| ((i * 7919 % 1000) as f32 / 1000.0 - 0.5) * 0.2).collect()
 }
 
 fn example(config: TrainConfig) -> Checkpoint {
@@ -250,10 +250,10 @@ fn run_policy(checkpoint: &Checkpoint, seed: u64) {
         for step in 0..3 {
             let (at, of): (Vec<_>, Vec<_>) = ((0..uavs).map(|_| place()).collect(), (0..users).map(|_| place()).collect());
             let aoi: Vec<f32> = (0..users).map(|user| (user * 1000) as f32).collect();
-            let slot = Slot::from_scene(&at, &of, &aoi, policy.detection_range());
+            let graph = FleetGraph::from_scene(&at, &of, &aoi, policy.detection_range());
             let (mut headings, mut q) = (vec![255; uavs], vec![0.0; uavs * policy.actions()]);
             policy.act(&mut [FleetStep {
-                slot: &slot,
+                graph: &graph,
                 step,
                 memory: &mut memory,
                 headings: &mut headings,
@@ -339,7 +339,7 @@ proptest! {
     #[test]
     fn every_valid_checkpoint_runs(config in configurations(), scale in prop::sample::select(vec![0.1, 10.0, 1e6]), seed: u64) {
         let mut rng = qedgix::rng::stream(seed, "test-weights", 0);
-        let weights = (0..checkpoint::layout(&config).len()).map(|_| rng.random_range(-scale..scale)).collect();
+        let weights = (0..checkpoint::parameter_layout(&config).len()).map(|_| rng.random_range(-scale..scale)).collect();
         let bytes = Checkpoint::new(config, 1, None, weights).unwrap().to_bytes();
         run_policy(&Checkpoint::from_bytes(&bytes).unwrap(), seed);
     }

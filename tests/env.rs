@@ -287,7 +287,7 @@ proptest! {
         let mut batch = BatchEnv::new(&config, 3).unwrap();
         batch.reset(&[seed ^ 1, seed, seed ^ 2]);
         for slot in 0..40_usize {
-            let moves: Vec<u8> = (0..uavs).map(|i| actions[(slot * uavs + i) % 200] % config.headings() as u8).collect();
+            let moves: Vec<u8> = (0..uavs).map(|i| actions[(slot * uavs + i) % 200] % config.actions() as u8).collect();
             let before: Vec<f32> = one.aoi().to_vec();
             let reward = one.step(&moves).unwrap();
             // The second copy of the batch equals the single episode, bit for bit.

@@ -117,7 +117,7 @@ impl Policy for RecordingPolicy {
     fn start(&self, _uavs: usize, _users: usize, _seed: u64, _memory: &mut [f32]) {}
     fn act(&self, turns: &mut [FleetStep<'_>]) {
         for turn in turns {
-            let slot = turn.slot;
+            let slot = turn.graph;
             let detected = (0..slot.uavs() + slot.users()).map(|i| slot.detections(i).iter().map(|d| d.target).collect());
             self.0.lock().unwrap().push(ObservedSlot {
                 step: turn.step,

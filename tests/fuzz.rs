@@ -17,7 +17,7 @@ use qedgix::api::{grpc, rest};
 use qedgix::checkpoint::{Checkpoint, layout};
 use qedgix::clock::Clock;
 use qedgix::config::Config;
-use qedgix::policy::{FleetStep, Policy, Slot};
+use qedgix::policy::{FleetGraph, FleetStep, Policy};
 use qedgix::server::{self, DataDir};
 use qedgix::service::App;
 use qedgix::telemetry;
@@ -259,7 +259,7 @@ struct Subject {
     rest: axum::Router,
     grpc: BoxCloneSyncService<Request<tonic::body::Body>, Response<Body>, Infallible>,
     checkpoint: Vec<u8>,
-    slot: Slot,
+    graph: FleetGraph,
 }
 
 impl Subject {
@@ -282,7 +282,7 @@ impl Subject {
             grpc: BoxCloneSyncService::new(grpc),
             app,
             checkpoint: Checkpoint::new(config, 1, None, weights).unwrap().to_bytes(),
-            slot: Slot::from_scene(&points(3), &points(5), &[1.0; 5], 0.28),
+            graph: FleetGraph::from_scene(&points(3), &points(5), &[1.0; 5], 0.28),
         }
     }
 
@@ -328,7 +328,13 @@ impl Subject {
         }
         let (mut memory, mut headings) = (vec![0.0; policy.memory_len(3, 5)], [0; 3]);
         policy.start(3, 5, 1, &mut memory);
-        policy.act(&mut [FleetStep { slot: &self.slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: None }]);
+        policy.act(&mut [FleetStep {
+            graph: &self.graph,
+            step: 0,
+            memory: &mut memory,
+            headings: &mut headings,
+            q_values: None,
+        }]);
         assert!(headings.iter().all(|&heading| usize::from(heading) < policy.actions()));
         "accepted".into()
     }

@@ -117,7 +117,7 @@ impl Config {
             normalise: false,
         };
         if count("token")? != TOKEN {
-            return Err(format!("metadata token = {}; expected {TOKEN}", text("token")?));
+            return Err(format!("metadata identity_token = {}; expected {TOKEN}", text("token")?));
         }
         Ok(Self {
             agent,
@@ -126,7 +126,7 @@ impl Config {
                 users: count("N")?,
                 actions: count("A")?,
                 detection_range: real("d")?,
-                slots: count("K")?,
+                episode_slots: count("K")?,
             },
             mixer: match text("mixer")? {
                 "qmix" => MixerKind::Qmix,
@@ -206,7 +206,7 @@ fn check(file: &Path) -> Checked<String> {
     let all = SafeTensors::deserialize(&bytes).map_err(|e| e.to_string())?;
     let mut tensors = Tensors { all, read: BTreeSet::new() };
     let mut report = Report::default();
-    let Dims { uavs: m, users: n, slots: k, actions, .. } = config.dims;
+    let Dims { uavs: m, users: n, episode_slots: k, actions, .. } = config.dims;
     let b = config.batch;
 
     let episodes = Episodes {
@@ -220,7 +220,7 @@ fn check(file: &Path) -> Checked<String> {
         aoi: tensors.f32("in.aoi", &[b, k + 1, n])?,
         actions: tensors.actions("in.actions", &[b, k, m], actions)?,
         reward: tensors.f32("in.reward", &[b, k])?,
-        token: tensors.f32("in.token", &[b, m, TOKEN])?,
+        identity_token: tensors.f32("in.token", &[b, m, TOKEN])?,
     };
     check_features(&config, &episodes, &mut tensors, &mut report)?;
 
@@ -237,7 +237,7 @@ fn check(file: &Path) -> Checked<String> {
     let (mut online, target, grads, after) = (flat("")?, flat("target_")?, flat("grad.")?, flat("after.")?);
 
     let mut trace = Trace::default();
-    let metrics = loss.evaluate(&online, &target, &episodes, Some(&mut trace));
+    let metrics = loss.compute_gradient(&online, &target, &episodes, Some(&mut trace));
     for (name, ours, shape) in [
         ("out.q", &trace.q[..], &[b, k + 1, m, actions][..]),
         ("out.q_tot", &trace.q_tot, &[b, k]),
@@ -269,10 +269,10 @@ fn check(file: &Path) -> Checked<String> {
 
 /// Compares the detections of all pairs, exactly, and the flat observation of every node and the flat state if recorded.
 fn check_features(config: &Config, episodes: &Episodes, tensors: &mut Tensors<'_>, report: &mut Report) -> Checked<()> {
-    let Dims { uavs: m, users: n, slots: k, detection_range: range, .. } = config.dims;
+    let Dims { uavs: m, users: n, episode_slots: k, detection_range: range, .. } = config.dims;
     let (b, nodes, width) = (episodes.len, m + n, 2 * m + 3 * n);
     // With one layer, the geometry has the detections of users too.
-    let wanted = GeometryConfig { range, slots: k, layers: 1, self_loops: config.agent.self_loops, hops: 1 };
+    let wanted = GeometryConfig { range, episode_slots: k, layers: 1, self_loops: config.agent.self_loops, hops: 1 };
     let (mut geometry, mut search) = (Geometry::default(), HopSearch::default());
     geometry.clear();
     let mut state = vec![0.0; b * (k + 1) * width];
@@ -288,7 +288,7 @@ fn check_features(config: &Config, episodes: &Episodes, tensors: &mut Tensors<'_
     let mut observations = vec![0.0_f32; b * (k + 1) * nodes * width];
     let rows = visible.chunks_exact_mut(nodes).zip(observations.chunks_exact_mut(width));
     for (at, (visible, observation)) in rows.enumerate() {
-        let view = geometry.node(at / nodes, at % nodes, &mut search);
+        let view = geometry.view_of_node(at / nodes, at % nodes, &mut search);
         visible[view.node] = 1.0;
         view.detections.iter().for_each(|d| visible[d.target as usize] = 1.0);
         flat_observation(&view, 1.0, observation);

@@ -56,24 +56,24 @@ fn check(
 trait Layer {
     fn forward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>) -> Batch<f64>;
     fn backward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>, dy: Batch<f64>, grads: &mut [f64]) -> Batch<f64>;
-    fn prepare(&self, flat: &[f64], transposed: &mut [f64]);
+    fn prepare(&self, params: &[f64], prepared: &mut [f64]);
 }
 
 fn check_layer(name: &str, layout: &ParameterLayout, layer: &mut impl Layer, width: usize, samples: usize) {
-    let params = layout.len();
-    let mut at = uniform(params, &format!("{name} parameters"));
+    let count = layout.len();
+    let mut at = uniform(count, &format!("{name} parameters"));
     at.iter_mut().for_each(|p| *p *= 0.2);
     at.extend(uniform(width * samples, name));
     let mut run = |at: &[f64], cotangent: Option<&[f64]>| -> (Vec<f64>, Vec<f64>) {
-        let (flat, x) = at.split_at(params);
-        let mut transposed = vec![0.0; params];
-        layer.prepare(flat, &mut transposed);
-        let w = Weights { flat, transposed: &transposed };
+        let (params, x) = at.split_at(count);
+        let mut prepared = vec![0.0; count];
+        layer.prepare(params, &mut prepared);
+        let w = Weights { params, prepared: &prepared };
         let mut input = Batch::default();
-        input.reset(width, samples);
+        input.resize(width, samples);
         input.as_mut_slice().copy_from_slice(x);
         let y = layer.forward(w, &input);
-        let mut gradient = vec![0.0; params];
+        let mut gradient = vec![0.0; count];
         if let Some(cotangent) = cotangent {
             let mut dy = y.clone();
             dy.as_mut_slice().copy_from_slice(cotangent);
@@ -86,28 +86,28 @@ fn check_layer(name: &str, layout: &ParameterLayout, layer: &mut impl Layer, wid
     let cotangent = uniform(outputs, "cotangent");
     let (_, gradient) = run(&at, Some(&cotangent));
     let mut ranges: Vec<_> = layout.parameters().iter().map(|p| (p.name.clone(), p.range.clone())).collect();
-    ranges.push(("input".into(), params..at.len()));
+    ranges.push(("input".into(), count..at.len()));
     check(name, &ranges, &at, &gradient, |at| run(at, None).0.iter().zip(&cotangent).map(|(y, c)| y * c).sum());
 }
 
 struct Plain(Linear);
 
 impl Layer for Plain {
-    fn prepare(&self, flat: &[f64], transposed: &mut [f64]) {
-        self.0.prepare(flat, transposed);
+    fn prepare(&self, params: &[f64], prepared: &mut [f64]) {
+        self.0.prepare(params, prepared);
     }
 
     fn forward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>) -> Batch<f64> {
         let mut y = Batch::default();
-        y.reset(self.0.outputs, x.len());
+        y.resize(self.0.outputs, x.len());
         self.0.forward(w, x.rows(), y.rows_mut());
         y
     }
 
     fn backward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>, dy: Batch<f64>, grads: &mut [f64]) -> Batch<f64> {
         let mut dx = Batch::default();
-        dx.reset(x.width(), x.len());
-        self.0.backward(w.flat, x.rows(), dy.rows(), grads, Some(dx.rows_mut()));
+        dx.resize(x.width(), x.len());
+        self.0.backward(w.params, x.rows(), dy.rows(), grads, Some(dx.rows_mut()));
         dx
     }
 }
@@ -122,23 +122,23 @@ fn linear() {
 struct Split(Mlp<96>, MlpCache<f64>);
 
 impl Layer for Split {
-    fn prepare(&self, flat: &[f64], transposed: &mut [f64]) {
-        self.0.prepare(flat, transposed);
+    fn prepare(&self, params: &[f64], prepared: &mut [f64]) {
+        self.0.prepare(params, prepared);
     }
 
     fn forward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>) -> Batch<f64> {
         let mut y = Batch::default();
-        y.reset(8, x.len());
+        y.resize(8, x.len());
         self.0.forward(w, (x.rows(), x.rows().from_column(5), 5), &mut self.1, y.rows_mut());
         y
     }
 
     fn backward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>, dy: Batch<f64>, grads: &mut [f64]) -> Batch<f64> {
-        self.0.backward(w.flat, (x.rows(), x.rows().from_column(5), 5), dy.rows(), &mut self.1, grads);
+        self.0.backward(w.params, (x.rows(), x.rows().from_column(5), 5), dy.rows(), &mut self.1, grads);
         let mut dx = Batch::default();
-        dx.reset(x.width(), x.len());
-        let start = qedgix::nn::matmul::Accumulate::Zero;
-        self.0.first.backward_input(w.flat, (0, x.width()), self.0.d_first(&self.1), dx.rows_mut(), start);
+        dx.resize(x.width(), x.len());
+        let start = qedgix::nn::matmul::InitialValue::Zero;
+        self.0.first.backward_input(w.params, (0, x.width()), self.0.d_first(&self.1), dx.rows_mut(), start);
         dx
     }
 }
@@ -156,24 +156,24 @@ struct Cell(Gru, Batch<f64>, Batch<f64>);
 const SLOTS: usize = 5;
 
 impl Layer for Cell {
-    fn prepare(&self, flat: &[f64], transposed: &mut [f64]) {
-        self.0.prepare(flat, transposed);
+    fn prepare(&self, params: &[f64], prepared: &mut [f64]) {
+        self.0.prepare(params, prepared);
     }
 
     fn forward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>) -> Batch<f64> {
         let n = x.len() / SLOTS;
-        self.2.reset_zero(HIDDEN, x.len() + n);
+        self.2.resize_zero(HIDDEN, x.len() + n);
         self.0.forward(w, x.rows(), SLOTS, &mut self.1, &mut self.2);
         let mut y = Batch::default();
-        y.reset(HIDDEN, x.len());
+        y.resize(HIDDEN, x.len());
         y.as_mut_slice().copy_from_slice(&self.2.as_slice()[n * HIDDEN..]);
         y
     }
 
     fn backward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>, mut dy: Batch<f64>, grads: &mut [f64]) -> Batch<f64> {
-        self.0.backward(w.flat, (x.rows(), SLOTS), &self.2, (&mut self.1, &mut dy), grads);
+        self.0.backward(w.params, (x.rows(), SLOTS), &self.2, (&mut self.1, &mut dy), grads);
         let mut dx = Batch::default();
-        self.0.backward_input(w.flat, &self.1, &mut dx);
+        self.0.backward_input(w.params, &self.1, &mut dx);
         dx
     }
 }
@@ -188,13 +188,13 @@ fn gru_over_time() {
 struct Convolution(GraphLayer, Graph, LayerCache<f64>);
 
 impl Layer for Convolution {
-    fn prepare(&self, flat: &[f64], transposed: &mut [f64]) {
-        self.0.prepare(flat, transposed);
+    fn prepare(&self, params: &[f64], prepared: &mut [f64]) {
+        self.0.prepare(params, prepared);
     }
 
     fn forward(&mut self, w: Weights<'_, f64>, x: &Batch<f64>) -> Batch<f64> {
         let mut y = Batch::default();
-        y.reset(HIDDEN, self.1.offsets.len() - 1);
+        y.resize(HIDDEN, self.1.offsets.len() - 1);
         self.0.forward(w, &self.1, x.rows(), &mut self.2, y.rows_mut());
         y
     }
@@ -246,16 +246,16 @@ fn whole_loss() {
         ("iql", AgentConfig { gnn: Gnn::None, identity: Identity::Token, ..set }, MixerKind::None),
     ];
     for (name, agent, mixer) in cases {
-        let dims = Dims { uavs: 3, users: 4, actions: 9, detection_range: 0.28, slots: 3 };
+        let dims = Dims { uavs: 3, users: 4, actions: 9, detection_range: 0.28, episode_slots: 3 };
         let td_lambda = TdLambda { gamma: 0.95, lambda: 0.6 };
         let mut loss = Loss::<f64>::new(agent, dims, mixer, td_lambda, 1);
         let layout = loss.layout().clone();
         let online: Vec<f64> = layout.initialise(&mut rng::stream(1, "online", 0));
         let target: Vec<f64> = layout.initialise(&mut rng::stream(1, "target", 0));
         let episodes = episodes(&dims, 2, 3);
-        loss.evaluate(&online, &target, &episodes, None);
+        loss.compute_gradient(&online, &target, &episodes, None);
         let gradient = loss.gradient().to_vec();
         let ranges: Vec<_> = layout.parameters().iter().map(|p| (p.name.clone(), p.range.clone())).collect();
-        check(name, &ranges, &online, &gradient, |online| loss.evaluate(online, &target, &episodes, None).loss);
+        check(name, &ranges, &online, &gradient, |online| loss.compute_gradient(online, &target, &episodes, None).loss);
     }
 }

@@ -9,14 +9,14 @@ use qedgix::learner::{Algorithm, Learner, Preset, TrainConfig};
 use qedgix::nn::{Batch, Graph, GraphLayer, HIDDEN, LayerCache, ParameterLayout, Rows, Weights};
 use qedgix::policy::mixer::{Mixer, MixerCache, MixerKind};
 use qedgix::policy::{
-    Actor, Agent, AgentConfig, Dims, FleetStep, Geometry, GeometryConfig, Gnn, HopSearch, Identity, LearnedPolicy,
-    ObservationKind, Policy, RequiredInput, Slot, StepInput, TOKEN,
+    Agent, AgentConfig, BatchedAgent, Dims, FleetGraph, FleetStep, Geometry, GeometryConfig, Gnn, HopSearch, Identity,
+    LearnedPolicy, ObservationKind, Policy, RequiredInput, StepInput, TOKEN,
 };
 use qedgix::rng;
 use rand::RngExt;
 use sample::{AGENT, episodes};
 
-const DIMS: Dims = Dims { uavs: 3, users: 5, actions: 8, detection_range: 0.28, slots: 80 };
+const DIMS: Dims = Dims { uavs: 3, users: 5, actions: 8, detection_range: 0.28, episode_slots: 80 };
 const SET: AgentConfig =
     AgentConfig { observation: ObservationKind::Set, identity: Identity::Phase, self_position: true, ..AGENT };
 
@@ -28,18 +28,18 @@ fn learned(config: AgentConfig) -> LearnedPolicy {
     LearnedPolicy::new(config, DIMS, parameters(Agent::new(config, DIMS).layout(), 1)).expect("as many as the layout says")
 }
 
-/// A slot with all nodes near the centre, so that most nodes detect each other.
-fn slot(uavs: usize, users: usize, seed: u64) -> Slot {
+/// What a fleet detects with all nodes near the centre, so that most nodes detect each other.
+fn graph(uavs: usize, users: usize, seed: u64) -> FleetGraph {
     let mut stream = rng::stream(seed, "slot", 0);
     let mut points = |n: usize| -> Vec<Point> { (0..n).map(|_| [0, 1].map(|_| 0.3 + 0.4 * stream.random::<f64>())).collect() };
     let (uavs, users) = (points(uavs), points(users));
     let aoi: Vec<f32> = (0..users.len()).map(|i| (i * 7 % 40) as f32).collect();
-    Slot::from_scene(&uavs, &users, &aoi, DIMS.detection_range)
+    FleetGraph::from_scene(&uavs, &users, &aoi, DIMS.detection_range)
 }
 
-/// A fleet with its slot, memory and last results.
+/// A fleet with its graph, memory and last results.
 struct Fleet {
-    slot: Slot,
+    graph: FleetGraph,
     memory: Vec<f32>,
     headings: Vec<u8>,
     q: Vec<f32>,
@@ -50,12 +50,12 @@ impl Fleet {
         let mut memory = vec![0.0; policy.memory_len(uavs, users)];
         policy.start(uavs, users, seed, &mut memory);
         let (headings, q) = (vec![0; uavs], vec![0.0; uavs * policy.actions()]);
-        Self { slot: slot(uavs, users, seed), memory, headings, q }
+        Self { graph: graph(uavs, users, seed), memory, headings, q }
     }
 
     fn turn(&mut self) -> FleetStep<'_> {
-        let Self { slot, memory, headings, q } = self;
-        FleetStep { slot, step: 0, memory, headings, q_values: Some(q) }
+        let Self { graph, memory, headings, q } = self;
+        FleetStep { graph, step: 0, memory, headings, q_values: Some(q) }
     }
 
     fn bits(&self) -> (Vec<u32>, Vec<u8>, Vec<u32>) {
@@ -96,23 +96,23 @@ fn batching_does_not_change_a_bit_of_the_result() {
 fn more_hops_observe_exactly_the_nodes_within_that_many_links() {
     // A chain: UAV 0, four users, UAV 1. Each node detects only the next and the previous one.
     let users: Vec<Point> = (1..=4).map(|i| [0.2 * f64::from(i), 0.0]).collect();
-    let slot = Slot::from_scene(&[[0.0, 0.0], [1.0, 0.0]], &users, &[8.0, 16.0, 24.0, 32.0], 0.25);
+    let graph = FleetGraph::from_scene(&[[0.0, 0.0], [1.0, 0.0]], &users, &[8.0, 16.0, 24.0, 32.0], 0.25);
     for (hops, reach) in [(1, [2].as_slice()), (2, &[2, 3]), (3, &[2, 3, 4]), (4, &[2, 3, 4, 5]), (5, &[1, 2, 3, 4, 5])] {
-        let config = GeometryConfig { range: 0.25, slots: 80, layers: 0, self_loops: false, hops };
+        let config = GeometryConfig { range: 0.25, episode_slots: 80, layers: 0, self_loops: false, hops };
         let (mut geometry, mut search) = (Geometry::default(), HopSearch::default());
         geometry.clear();
         // Several equal fleets: each gets its own nodes.
-        (0..3).for_each(|_| geometry.push_slot(&config, &slot));
+        (0..3).for_each(|_| geometry.push_graph(&config, &graph));
         geometry.finish(&config);
         for fleet in 0..3 {
-            let view = geometry.node(fleet, 0, &mut search);
+            let view = geometry.view_of_node(fleet, 0, &mut search);
             let seen: Vec<u32> = view.detections.iter().map(|d| d.target).collect();
             assert_eq!(seen, reach, "{hops} hops");
             for d in view.detections {
                 let x = if d.target == 1 { 1.0 } else { 0.2 * (d.target - 1) as f32 };
                 assert!((d.rel[0] - x).abs() < 1e-6 && d.rel[1] == 0.0, "{d:?}");
             }
-            assert_eq!(geometry.node(fleet, 1, &mut search).detections.len(), reach.len(), "from the other end");
+            assert_eq!(geometry.view_of_node(fleet, 1, &mut search).detections.len(), reach.len(), "from the other end");
         }
     }
 }
@@ -121,65 +121,71 @@ fn more_hops_observe_exactly_the_nodes_within_that_many_links() {
 fn more_hops_hold_no_more_detections() {
     // A square lattice of 400 UAVs: each has up to 4 links, and observes up to 180 nodes over 9 links.
     let uavs: Vec<Point> = (0..400).map(|i| [0.04 * f64::from(i % 20), 0.04 * f64::from(i / 20)]).collect();
-    let slot = Slot::from_scene(&uavs, &[], &[], 0.05);
+    let graph = FleetGraph::from_scene(&uavs, &[], &[], 0.05);
     let mut held = Vec::new();
     for (hops, observed) in [(1, 4), (9, 180)] {
-        let config = GeometryConfig { range: 0.05, slots: 80, layers: 0, self_loops: false, hops };
+        let config = GeometryConfig { range: 0.05, episode_slots: 80, layers: 0, self_loops: false, hops };
         let (mut geometry, mut search) = (Geometry::default(), HopSearch::default());
         geometry.clear();
-        geometry.push_slot(&config, &slot);
+        geometry.push_graph(&config, &graph);
         geometry.finish(&config);
-        assert_eq!(geometry.node(0, 210, &mut search).detections.len(), observed, "{hops} hops");
+        assert_eq!(geometry.view_of_node(0, 210, &mut search).detections.len(), observed, "{hops} hops");
         held.push(geometry.detection_count());
     }
     assert_eq!(held, [4 * 19 * 20; 2]);
 }
 
 #[test]
-fn actor_policy_and_update_compute_the_same_values() {
+fn batched_agent_policy_and_update_compute_the_same_values() {
     let plain = AgentConfig { gnn: Gnn::None, ..AGENT };
     let configs =
         [AGENT, SET, AgentConfig { identity: Identity::Token, ..plain }, AgentConfig { hops: 3, normalise: true, ..plain }];
     for config in configs {
-        let dims = Dims { slots: 6, ..DIMS };
-        let (m, n, slots) = (dims.uavs, dims.users, dims.slots);
+        let dims = Dims { episode_slots: 6, ..DIMS };
+        let (m, n, slots) = (dims.uavs, dims.users, dims.episode_slots);
         let ep = episodes(&dims, 2, 8);
         let td_lambda = TdLambda { gamma: 0.99, lambda: 0.6 };
         let mut loss = Loss::<f32>::new(config, dims, MixerKind::Vdn, td_lambda, 1);
         let params = parameters(loss.layout(), 3);
         let mut trace = Trace::default();
-        loss.evaluate(&params, &params, &ep, Some(&mut trace));
+        loss.compute_gradient(&params, &params, &ep, Some(&mut trace));
 
         let agent = Agent::new(config, dims);
         let policy = LearnedPolicy::new(config, dims, params.clone()).expect("as many as the layout says");
-        let mut actor = Actor::new(&agent, 1);
+        let mut batched_agent = BatchedAgent::new(&agent, 1);
         for e in 0..2 {
-            actor.begin(&agent, &params, &ep.token[e * m * TOKEN..][..m * TOKEN]);
+            batched_agent.begin(&agent, &params, &ep.identity_token[e * m * TOKEN..][..m * TOKEN]);
             let mut memory = vec![0.0; policy.memory_len(m, n)];
             policy.start(m, n, 0, &mut memory);
             if config.identity == Identity::Token {
-                for (uav, token) in memory.chunks_exact_mut(HIDDEN + 1 + TOKEN).zip(ep.token[e * m * TOKEN..].chunks_exact(TOKEN))
+                for (uav, identity_token) in
+                    memory.chunks_exact_mut(HIDDEN + 1 + TOKEN).zip(ep.identity_token[e * m * TOKEN..].chunks_exact(TOKEN))
                 {
-                    uav[HIDDEN + 1..].copy_from_slice(token);
+                    uav[HIDDEN + 1..].copy_from_slice(identity_token);
                 }
             }
             for t in 0..slots {
                 let at = e * (slots + 1) + t;
                 let (uav_xy, user_xy) = (&ep.uav_xy[at * 2 * m..][..2 * m], &ep.user_xy[e * 2 * n..][..2 * n]);
                 let aoi = &ep.aoi[at * n..][..n];
-                let q = actor.step(&agent, StepInput { uav_xy, user_xy, aoi }).to_vec();
+                let q = batched_agent.step(&agent, StepInput { uav_xy, user_xy, aoi }).to_vec();
                 assert_eq!(q, trace.q[at * m * dims.actions..][..m * dims.actions], "slot {t}, {config:?}");
 
                 let points = |xy: &[f32]| -> Vec<Point> { xy.chunks_exact(2).map(|p| [p[0].into(), p[1].into()]).collect() };
-                let slot = Slot::from_scene(&points(uav_xy), &points(user_xy), aoi, dims.detection_range);
+                let graph = FleetGraph::from_scene(&points(uav_xy), &points(user_xy), aoi, dims.detection_range);
                 let (mut headings, mut served) = (vec![0; m], vec![0.0; q.len()]);
-                let turn =
-                    FleetStep { slot: &slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: Some(&mut served) };
+                let turn = FleetStep {
+                    graph: &graph,
+                    step: 0,
+                    memory: &mut memory,
+                    headings: &mut headings,
+                    q_values: Some(&mut served),
+                };
                 policy.act(&mut [turn]);
                 assert_eq!(q, served, "slot {t}, {config:?}");
 
                 let actions = &ep.actions[(e * slots + t) * m..][..m];
-                actor.record_actions(actions);
+                batched_agent.record_actions(actions);
                 // Continue with the action of the episode instead of the greedy heading.
                 let stride = memory.len() / m;
                 memory.chunks_exact_mut(stride).zip(actions).for_each(|(uav, &a)| uav[HIDDEN] = f32::from(a));
@@ -200,9 +206,9 @@ fn uavs_separate_only_with_an_identity() {
         policy.start(3, 5, seed, &mut memory);
         let mut separated = false;
         for step in 0..80 {
-            let slot = Slot::from_scene(&uavs, &users, &[step as f32; 5], DIMS.detection_range);
+            let graph = FleetGraph::from_scene(&uavs, &users, &[step as f32; 5], DIMS.detection_range);
             let mut headings = [0; 3];
-            policy.act(&mut [FleetStep { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
+            policy.act(&mut [FleetStep { graph: &graph, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
             for (p, h) in uavs.iter_mut().zip(headings) {
                 let (sin, cos) = (f64::from(h) * std::f64::consts::FRAC_PI_4).sin_cos();
                 *p = [(p[0] + 0.04 * cos).clamp(0.0, 1.0), (p[1] + 0.04 * sin).clamp(0.0, 1.0)];
@@ -224,11 +230,11 @@ fn uavs_separate_only_with_an_identity() {
 /// Q-values of one slot, for UAVs and users in the order given.
 fn values(policy: &LearnedPolicy, uavs: &[Point], users: &[(Point, f32)]) -> Vec<f32> {
     let (points, aoi): (Vec<Point>, Vec<f32>) = users.iter().copied().unzip();
-    let slot = Slot::from_scene(uavs, &points, &aoi, DIMS.detection_range);
+    let graph = FleetGraph::from_scene(uavs, &points, &aoi, DIMS.detection_range);
     let mut memory = vec![0.0; policy.memory_len(uavs.len(), users.len())];
     policy.start(uavs.len(), users.len(), 0, &mut memory);
     let (mut headings, mut q) = (vec![0; uavs.len()], vec![0.0; uavs.len() * 8]);
-    policy.act(&mut [FleetStep { slot: &slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: Some(&mut q) }]);
+    policy.act(&mut [FleetStep { graph: &graph, step: 0, memory: &mut memory, headings: &mut headings, q_values: Some(&mut q) }]);
     q
 }
 
@@ -260,18 +266,18 @@ fn set_agents_are_equivariant_in_uavs_and_invariant_in_users() {
 /// A mixer with random parameters: Q_tot as a function of state and values.
 struct RandomMixer {
     mixer: Mixer,
-    flat: Vec<f32>,
-    transposed: Vec<f32>,
+    params: Vec<f32>,
+    prepared: Vec<f32>,
 }
 
 impl RandomMixer {
     fn new(kind: MixerKind, dims: &Dims, seed: u64) -> Self {
         let mut layout = ParameterLayout::default();
         let mixer = Mixer::new(kind, dims, &mut layout);
-        let flat = parameters(&layout, seed);
-        let mut transposed = vec![0.0; flat.len()];
-        mixer.prepare(&flat, &mut transposed);
-        Self { mixer, flat, transposed }
+        let params = parameters(&layout, seed);
+        let mut prepared = vec![0.0; params.len()];
+        mixer.prepare(&params, &mut prepared);
+        Self { mixer, params, prepared }
     }
 
     fn rows(x: &[f32]) -> Rows<'_, f32> {
@@ -279,20 +285,20 @@ impl RandomMixer {
     }
 
     fn total(&self, state: &[f32], q: &[f32]) -> f32 {
-        let w = Weights { flat: &self.flat, transposed: &self.transposed };
+        let w = Weights { params: &self.params, prepared: &self.prepared };
         let mut total = Batch::default();
-        total.reset(1, 1);
+        total.resize(1, 1);
         self.mixer.forward(w, (Self::rows(state), Self::rows(q)), &mut MixerCache::default(), total.rows_mut());
         total.as_slice()[0]
     }
 
     fn slope(&self, state: &[f32], q: &[f32]) -> Vec<f32> {
-        let w = Weights { flat: &self.flat, transposed: &self.transposed };
+        let w = Weights { params: &self.params, prepared: &self.prepared };
         let (mut cache, mut total, mut dq) = (MixerCache::default(), Batch::default(), Batch::default());
-        total.reset(1, 1);
+        total.resize(1, 1);
         let inputs = (Self::rows(state), Self::rows(q));
         self.mixer.forward(w, inputs, &mut cache, total.rows_mut());
-        self.mixer.backward(w, inputs, &mut cache, &[1.0], (&mut vec![0.0; self.flat.len()], &mut dq));
+        self.mixer.backward(w, inputs, &mut cache, &[1.0], (&mut vec![0.0; self.params.len()], &mut dq));
         dq.as_slice().to_vec()
     }
 }
@@ -343,10 +349,17 @@ fn an_invariant_mixer_fits_any_fleet() {
 }
 
 /// x'_i = agg_j f(x_i || x_j - x_i), edge by edge, in f64.
-fn naive_edge_conv(layout: &ParameterLayout, flat: &[f64], graph: &Graph, x: &Batch<f64>, mean: bool, nodes: usize) -> Vec<f64> {
+fn naive_edge_conv(
+    layout: &ParameterLayout,
+    params: &[f64],
+    graph: &Graph,
+    x: &Batch<f64>,
+    mean: bool,
+    nodes: usize,
+) -> Vec<f64> {
     let get = |name: &str| {
         let p = layout.parameters().iter().find(|p| p.name == format!("layer.f.{name}")).expect(name);
-        &flat[p.range.clone()]
+        &params[p.range.clone()]
     };
     let linear = |name: &str, x: &[f64]| -> Vec<f64> {
         let (weight, bias) = (get(&format!("{name}.weight")), get(&format!("{name}.bias")));
@@ -386,22 +399,22 @@ fn factored_edge_conv_equals_the_formula() {
         let mut layout = ParameterLayout::default();
         let layer = GraphLayer::edge_conv(&mut layout, "layer", mean);
         // Different scales and shifts, so that the order of operations matters.
-        let mut flat: Vec<f64> = layout.initialise(&mut rng::stream(7, "init", 0));
-        flat.iter_mut().zip(uniform(layout.len(), 8)).for_each(|(p, d)| *p += 0.1 * f64::from(d));
-        let mut transposed = vec![0.0; flat.len()];
-        layer.prepare(&flat, &mut transposed);
+        let mut params: Vec<f64> = layout.initialise(&mut rng::stream(7, "init", 0));
+        params.iter_mut().zip(uniform(layout.len(), 8)).for_each(|(p, d)| *p += 0.1 * f64::from(d));
+        let mut prepared = vec![0.0; params.len()];
+        layer.prepare(&params, &mut prepared);
         let (mut x, mut y) = (Batch::default(), Batch::default());
-        x.reset(HIDDEN, 12);
+        x.resize(HIDDEN, 12);
         x.as_mut_slice().iter_mut().zip(uniform(12 * HIDDEN, 9)).for_each(|(x, d)| *x = d.into());
-        y.reset(HIDDEN, 9);
+        y.resize(HIDDEN, 9);
         layer.forward(
-            Weights { flat: &flat, transposed: &transposed },
+            Weights { params: &params, prepared: &prepared },
             &graph,
             x.rows(),
             &mut LayerCache::default(),
             y.rows_mut(),
         );
-        let naive = naive_edge_conv(&layout, &flat, &graph, &x, mean, 9);
+        let naive = naive_edge_conv(&layout, &params, &graph, &x, mean, 9);
         for (a, b) in y.as_slice().iter().zip(&naive) {
             assert!((a - b).abs() < 1e-12, "{a}, expected {b}");
         }

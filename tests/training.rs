@@ -57,15 +57,15 @@ fn events_are_in_order_and_end() {
     let mut trainer = Trainer::new(small_config(Algorithm::Qmix), 1).unwrap();
     let events = collect_events(&mut trainer);
     assert!(trainer.finished() && trainer.next().is_none());
-    assert_eq!(events.last(), Some(&Event::Finished { step: 1200 }));
+    assert_eq!(events.last(), Some(&Event::Finished { env_steps: 1200 }));
     let evaluations: Vec<u64> =
-        events.iter().filter_map(|e| if let Event::Evaluation(e) = e { Some(e.step) } else { None }).collect();
+        events.iter().filter_map(|e| if let Event::Evaluation(e) = e { Some(e.env_steps) } else { None }).collect();
     assert_eq!(evaluations, [0, 280, 520, 760, 1000, 1200], "after the iterations that reach 250, 500, ...");
     let iterations: Vec<_> = events.iter().filter_map(|e| if let Event::Iteration(i) = e { Some(*i) } else { None }).collect();
     assert_eq!(iterations.len(), 30);
     for (n, i) in iterations.iter().enumerate() {
         let done = n as u64 + 1;
-        assert_eq!((i.step, i.episodes), (40 * done, 4 * done));
+        assert_eq!((i.env_steps, i.episodes), (40 * done, 4 * done));
         // Replay holds 16 episodes after the fourth iteration.
         let learning = done.saturating_sub(3);
         assert_eq!(i.updates, 2 * learning);
@@ -88,12 +88,12 @@ fn the_best_weights_are_kept_and_reproduce_their_evaluation() {
     }
     let best = trainer.best().unwrap().unwrap();
     assert_eq!(best.metrics().unwrap().mean_aoi, lowest);
-    assert_eq!(trainer.best_evaluation().unwrap().step, best.step());
+    assert_eq!(trainer.best_evaluation().unwrap().env_steps, best.env_steps());
     let seeds = layout_list("valid-v1").unwrap().seeds(6);
     let metrics = evaluate(&best.policy(), &best.config().environment, &seeds, 1).unwrap();
     assert_eq!(EpisodeMetrics::mean(&metrics), *best.metrics().unwrap());
     let last = trainer.checkpoint().unwrap();
-    assert_eq!(last.step(), 1200);
+    assert_eq!(last.env_steps(), 1200);
     assert!(last.metrics().is_some(), "evaluated at the end");
 }
 
@@ -151,7 +151,7 @@ fn transformed_episodes_equal_the_episodes_of_transformed_fleets() {
     let mut rollout = Rollout::new(&train, learner.agent()).unwrap();
     let episodes = rollout.collect(learner.agent(), learner.agent_parameters(), 1.0, 0).clone();
     let mut transformed = episodes.clone();
-    let symmetries: Vec<_> = (0..Symmetry::COUNT).map(Symmetry::number).collect();
+    let symmetries: Vec<_> = (0..Symmetry::COUNT).map(Symmetry::from_index).collect();
     transformed.transform(&symmetries);
     let (m, n, k) = (episodes.uavs, episodes.users, episodes.slots);
     for e in 0..episodes.len {
@@ -185,11 +185,11 @@ fn averaged_weights_are_averages_from_the_first_update() {
         // For the first four updates it is their mean; afterwards older updates have less weight.
         if update <= 4 {
             let mean = |i: usize| online.iter().map(|w| w[i]).sum::<f32>() / update as f32;
-            let close = learner.published().iter().enumerate().all(|(i, a)| (a - mean(i)).abs() < 1e-6);
+            let close = learner.published_parameters().iter().enumerate().all(|(i, a)| (a - mean(i)).abs() < 1e-6);
             assert!(close, "after {update} updates");
         }
     }
-    assert_ne!(learner.published(), learner.parameters());
+    assert_ne!(learner.published_parameters(), learner.parameters());
 }
 
 #[test]

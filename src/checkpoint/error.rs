@@ -1,6 +1,6 @@
 //! Errors of checkpoints.
 
-use super::format::{FORMAT, LARGEST, VERSION};
+use super::format::{FORMAT, MAX_MAGNITUDE, VERSION};
 use crate::invalid::Invalid;
 
 /// Why bytes are not a usable checkpoint.
@@ -111,7 +111,7 @@ pub enum Error {
         found: String,
     },
     /// A value is not finite or too large.
-    #[error("tensor `{name}`: value {index} is {found}; expected a number from -{max} to {max}", max = LARGEST)]
+    #[error("tensor `{name}`: value {index} is {found}; expected a number from -{max} to {max}", max = MAX_MAGNITUDE)]
     Value {
         /// The tensor's name.
         name: String,

@@ -12,7 +12,7 @@ use serde::{Deserialize, Deserializer};
 use serde_json::{Map, Value, json};
 
 use super::error::Error;
-use super::format::LARGEST;
+use super::format::MAX_MAGNITUDE;
 
 /// The entry of the header that holds the metadata.
 const METADATA: &str = "__metadata__";
@@ -52,8 +52,8 @@ pub(super) fn write(metadata: &BTreeMap<&str, String>, tensors: &[Tensor]) -> Ve
     bytes
 }
 
-/// Largest header in bytes: several times the largest configuration, which has a position for each UAV and user.
-const LARGEST_HEADER: u64 = 16 << 20;
+/// Maximum size of the header in bytes: several times the largest configuration, which has a position for each UAV and user.
+const MAX_HEADER_BYTES: u64 = 16 << 20;
 
 /// Metadata and tensors of a file, sorted by name. Values that are not finite or too large are rejected. Memory is bounded by a
 /// small multiple of the length of `bytes`, whatever sizes the header states.
@@ -62,8 +62,8 @@ pub(super) fn read(bytes: &[u8]) -> Result<(BTreeMap<String, String>, Vec<Tensor
         return Err(Error::Truncated { found: bytes.len(), header: 0 });
     };
     let header_len = u64::from_le_bytes(*header_len);
-    if header_len > LARGEST_HEADER {
-        return Err(Error::HeaderTooLarge { found: header_len, limit: LARGEST_HEADER });
+    if header_len > MAX_HEADER_BYTES {
+        return Err(Error::HeaderTooLarge { found: header_len, limit: MAX_HEADER_BYTES });
     }
     let Some((header, data)) = rest.split_at_checked(header_len as usize) else {
         return Err(Error::Truncated { found: bytes.len(), header: header_len });
@@ -85,7 +85,7 @@ pub(super) fn read(bytes: &[u8]) -> Result<(BTreeMap<String, String>, Vec<Tensor
             return Err(Error::Size { name, shape, found: values.len() });
         }
         let values: Vec<f32> = values.chunks_exact(4).map(|x| f32::from_le_bytes([x[0], x[1], x[2], x[3]])).collect();
-        if let Some(index) = values.iter().position(|x| x.is_nan() || x.abs() > LARGEST) {
+        if let Some(index) = values.iter().position(|x| x.is_nan() || x.abs() > MAX_MAGNITUDE) {
             return Err(Error::Value { name, index, found: values[index] });
         }
         end = to;

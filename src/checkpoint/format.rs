@@ -4,5 +4,5 @@
 pub const FORMAT: &str = "qedgix-checkpoint";
 /// `version` of the checkpoints that are written and read.
 pub const VERSION: &str = "1";
-/// Largest magnitude of a parameter: far above the parameters of a trained network, far below the overflow of sums.
-pub const LARGEST: f32 = 1e6;
+/// Maximum magnitude of a parameter: far above the parameters of a trained network, far below the overflow of sums.
+pub const MAX_MAGNITUDE: f32 = 1e6;

@@ -1,6 +1,6 @@
 //! Checkpoints: the parameters and the configuration of a training run as a safetensors file.
 //!
-//! Metadata: `format`, `version`, `config` (the resolved [`TrainConfig`] as JSON), `step`, and `metrics` if the weights were
+//! Metadata: `format`, `version`, `config` (the resolved [`TrainConfig`] as JSON), `step`, and `metrics` if the parameters were
 //! evaluated. Tensors have the names and shapes of the golden files (docs/model.md, "Golden files"); `agent.*` is required to run
 //! the policy, `mixer.*` is optional. The same content gives the same bytes, so the digest identifies it. Reading checks
 //! everything: it returns a usable checkpoint or an [`Error`].
@@ -15,7 +15,7 @@ use sha2::{Digest, Sha256};
 
 pub use error::Error;
 pub use file::Tensor;
-pub use format::{FORMAT, LARGEST, VERSION};
+pub use format::{FORMAT, MAX_MAGNITUDE, VERSION};
 
 use crate::env::EpisodeMetrics;
 use crate::invalid::Invalid;
@@ -28,14 +28,14 @@ use crate::train_config::TrainConfig;
 #[derive(Clone, Debug, PartialEq)]
 pub struct Checkpoint {
     config: TrainConfig,
-    step: u64,
+    env_steps: u64,
     metrics: Option<EpisodeMetrics>,
-    /// Flat, in the order of [`layout`]: `agent.*`, and `mixer.*` if present.
+    /// Flat, in the order of [`parameter_layout`]: `agent.*`, and `mixer.*` if present.
     parameters: Vec<f32>,
 }
 
 /// The parameters of a configuration, `agent.*` then `mixer.*`: the order of the flat vector of [`Checkpoint::parameters`].
-pub fn layout(config: &TrainConfig) -> ParameterLayout {
+pub fn parameter_layout(config: &TrainConfig) -> ParameterLayout {
     let dims = config.dims();
     let mut layout = Agent::new(config.agent(), dims).layout().clone();
     Mixer::new(config.training.mixer, &dims, &mut layout);
@@ -43,14 +43,19 @@ pub fn layout(config: &TrainConfig) -> ParameterLayout {
 }
 
 impl Checkpoint {
-    /// A checkpoint of `parameters` (flat, as [`layout`] orders them) at environment step `step`.
+    /// A checkpoint of `parameters` (flat, as [`parameter_layout`] orders them) after `env_steps` environment steps.
     ///
     /// # Errors
     /// [`Error::Config`] if the configuration is invalid or has another number of parameters; [`Error::Value`] if a parameter is
     /// not finite or too large.
-    pub fn new(config: TrainConfig, step: u64, metrics: Option<EpisodeMetrics>, parameters: Vec<f32>) -> Result<Self, Error> {
+    pub fn new(
+        config: TrainConfig,
+        env_steps: u64,
+        metrics: Option<EpisodeMetrics>,
+        parameters: Vec<f32>,
+    ) -> Result<Self, Error> {
         config.validate()?;
-        let layout = layout(&config);
+        let layout = parameter_layout(&config);
         if parameters.len() != layout.len() {
             return Err(
                 Invalid::new("parameters", format!("{} numbers", parameters.len()), format!("{} numbers", layout.len())).into()
@@ -58,11 +63,11 @@ impl Checkpoint {
         }
         for p in layout.parameters() {
             let values = &parameters[p.range.clone()];
-            if let Some(index) = values.iter().position(|x| x.is_nan() || x.abs() > LARGEST) {
+            if let Some(index) = values.iter().position(|x| x.is_nan() || x.abs() > MAX_MAGNITUDE) {
                 return Err(Error::Value { name: p.name.clone(), index, found: values[index] });
             }
         }
-        Ok(Self { config, step, metrics, parameters })
+        Ok(Self { config, env_steps, metrics, parameters })
     }
 
     /// The resolved configuration of the run.
@@ -71,16 +76,16 @@ impl Checkpoint {
     }
 
     /// Environment steps of the training run when the checkpoint was taken.
-    pub fn step(&self) -> u64 {
-        self.step
+    pub fn env_steps(&self) -> u64 {
+        self.env_steps
     }
 
-    /// Metrics on the validation layouts, if the weights were evaluated.
+    /// Metrics on the validation layouts, if the parameters were evaluated.
     pub fn metrics(&self) -> Option<&EpisodeMetrics> {
         self.metrics.as_ref()
     }
 
-    /// The flat vector in the order of [`layout`]. Without `mixer.*` in the file, it ends after `agent.*`.
+    /// The flat vector in the order of [`parameter_layout`]. Without `mixer.*` in the file, it ends after `agent.*`.
     pub fn parameters(&self) -> &[f32] {
         &self.parameters
     }
@@ -105,12 +110,12 @@ impl Checkpoint {
             ("format", FORMAT.to_owned()),
             ("version", VERSION.to_owned()),
             ("config", json(serde_json::to_string(&self.config))),
-            ("step", self.step.to_string()),
+            ("step", self.env_steps.to_string()),
         ]);
         if let Some(metrics) = &self.metrics {
             metadata.insert("metrics", json(serde_json::to_string(metrics)));
         }
-        let layout = layout(&self.config);
+        let layout = parameter_layout(&self.config);
         let held = layout.parameters().iter().filter(|p| p.range.end <= self.parameters.len());
         let tensors: Vec<Tensor> = held
             .map(|p| Tensor { name: p.name.clone(), shape: p.shape.clone(), values: self.parameters[p.range.clone()].to_vec() })
@@ -137,17 +142,18 @@ impl Checkpoint {
             serde_json::from_str(&entry("config").ok_or_else(|| missing("config"))?).map_err(unreadable("config"))?;
         config.validate()?;
         let step = entry("step").ok_or_else(|| missing("step"))?;
-        let step = step.parse().map_err(|_| Error::Metadata { field: "step", reason: format!("{step:?} is not a count") })?;
+        let env_steps =
+            step.parse().map_err(|_| Error::Metadata { field: "step", reason: format!("{step:?} is not a count") })?;
         let metrics = entry("metrics").map(|m| serde_json::from_str(&m).map_err(unreadable("metrics"))).transpose()?;
         let parameters = flatten(&config, tensors)?;
-        Ok(Self { config, step, metrics, parameters })
+        Ok(Self { config, env_steps, metrics, parameters })
     }
 }
 
 /// The flat vector of the tensors of a file: all of `agent.*`, and all or none of `mixer.*`.
 fn flatten(config: &TrainConfig, tensors: Vec<Tensor>) -> Result<Vec<f32>, Error> {
     let mut named: BTreeMap<String, Tensor> = tensors.into_iter().map(|t| (t.name.clone(), t)).collect();
-    let layout = layout(config);
+    let layout = parameter_layout(config);
     let trainable = named.keys().any(|name| name.starts_with("mixer."));
     let mut flat = Vec::new();
     for p in layout.parameters().iter().filter(|p| trainable || p.name.starts_with("agent.")) {

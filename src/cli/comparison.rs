@@ -75,9 +75,11 @@ impl Comparison {
     /// # Errors
     /// Two policies have different numbers of episodes.
     pub fn gaps(&self, name: &str) -> anyhow::Result<Vec<Pair<'_>>> {
-        let Some(reference) = self.policies.iter().find(|f| f.name == name) else { return Ok(Vec::new()) };
+        let Some(reference) = self.policies.iter().find(|policy| policy.name == name) else { return Ok(Vec::new()) };
         let policies = self.best_first().into_iter();
-        policies.map(|f| Ok((f, reference, difference(&f.evaluation.episodes, &reference.evaluation.episodes)?))).collect()
+        policies
+            .map(|policy| Ok((policy, reference, difference(&policy.evaluation.episodes, &reference.evaluation.episodes)?)))
+            .collect()
     }
 
     /// The conditions of the evaluation in one line.
@@ -102,15 +104,17 @@ impl Comparison {
     /// Two policies have different numbers of episodes.
     pub fn json(&self) -> anyhow::Result<Value> {
         let rows = |reference: bool| -> Vec<Value> {
-            let policies = self.policies.iter().filter(|f| f.reference == reference);
-            policies.map(|f| json!({"policy": f.name, "summary": f.summary})).collect()
+            let policies = self.policies.iter().filter(|policy| policy.reference == reference);
+            policies.map(|policy| json!({"policy": policy.name, "summary": policy.summary})).collect()
         };
         let pairs = self.pairs()?;
         let pairs = pairs.iter().map(|(a, b, d)| json!({"first": a.name, "second": b.name, "difference": d}));
         let mut gaps = Vec::new();
         for name in Self::REFERENCES {
-            let others = self.gaps(name)?.into_iter().filter(|(f, reference, _)| f.name != reference.name);
-            gaps.extend(others.map(|(f, r, d)| json!({"policy": f.name, "reference": r.name, "difference": d})));
+            let others = self.gaps(name)?.into_iter().filter(|(policy, reference, _)| policy.name != reference.name);
+            gaps.extend(
+                others.map(|(policy, reference, d)| json!({"policy": policy.name, "reference": reference.name, "difference": d})),
+            );
         }
         Ok(json!({
             "layouts": self.layouts.name,

@@ -133,8 +133,8 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
         return Ok(());
     }
     outln!("{}; AoI in slots", comparison.conditions())?;
-    let requested = comparison.policies.iter().filter(|f| !f.reference);
-    outln!("{}", table::policy_table(&requested.map(|f| (f.name.clone(), f.summary)).collect::<Vec<_>>()))?;
+    let requested = comparison.policies.iter().filter(|policy| !policy.reference);
+    outln!("{}", table::policy_table(&requested.map(|policy| (policy.name.clone(), policy.summary)).collect::<Vec<_>>()))?;
     if let Some(directory) = &args.report {
         outln!("Report: {}", directory.join("index.html").display())?;
     }

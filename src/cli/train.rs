@@ -115,12 +115,12 @@ fn train(args: &TrainArgs, mut trainer: Trainer, threads: usize) -> anyhow::Resu
         }
         match event {
             Event::Iteration(i) => {
-                bar.set_position(i.step.min(config.training.steps));
+                bar.set_position(i.env_steps.min(config.training.steps));
                 bar.set_message(format!("epsilon {:.2}, train {:.1}", i.epsilon, i.mean_aoi));
             }
-            Event::Evaluation(Evaluation { step, metrics }) => {
+            Event::Evaluation(Evaluation { env_steps, metrics }) => {
                 evaluations.push(metrics.mean_aoi);
-                let line = format!("step {step:>8}  mean AoI {:6.2}  {}", metrics.mean_aoi, table::sparkline(&evaluations));
+                let line = format!("step {env_steps:>8}  mean AoI {:6.2}  {}", metrics.mean_aoi, table::sparkline(&evaluations));
                 // Without a terminal there is no bar.
                 if bar.is_hidden() {
                     errln!("{line}");
@@ -131,8 +131,8 @@ fn train(args: &TrainArgs, mut trainer: Trainer, threads: usize) -> anyhow::Resu
                     write_atomic(path, &trainer.snapshot())?;
                 }
             }
-            Event::Diverged { step } => {
-                bail!("training diverged at step {step}: a parameter is no longer finite; try a smaller learning rate")
+            Event::Diverged { env_steps } => {
+                bail!("training diverged at step {env_steps}: a parameter is no longer finite; try a smaller learning rate")
             }
             Event::Finished { .. } => finished = true,
         }
@@ -154,7 +154,7 @@ fn report(config: &TrainConfig, checkpoint: &Checkpoint, out: &Path, threads: us
     let list = layout_list("eval-v1")?;
     let episodes = evaluate(&checkpoint.policy(), &config.environment, &list.seeds(256), threads)?;
     let rows: Vec<(String, Summary)> = vec![(out.display().to_string(), summarize(&episodes)?)];
-    outln!("best weights by validation, from step {}; on {}:", checkpoint.step(), list.name)?;
+    outln!("best weights by validation, from step {}; on {}:", checkpoint.env_steps(), list.name)?;
     outln!("{}", table::policy_table(&rows))?;
     Ok(())
 }

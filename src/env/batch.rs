@@ -35,8 +35,8 @@ pub struct BatchEnv {
     moves: Vec<Point>,
     /// Per-user weights, scaled to mean 1.
     weights: Vec<f64>,
-    /// (M) whether the UAV neither moves nor collects.
-    grounded: Vec<bool>,
+    /// (M) whether the UAV is lost: it neither moves nor collects.
+    lost: Vec<bool>,
     uav_xy: Vec<f32>,
     user_xy: Vec<f32>,
     aoi: Vec<f32>,
@@ -59,9 +59,9 @@ impl BatchEnv {
         let mut env = Self {
             copies,
             slot: 0,
-            moves: DIRECTIONS[..config.headings()].iter().map(|d| [d[0] * config.speed, d[1] * config.speed]).collect(),
+            moves: DIRECTIONS[..config.actions()].iter().map(|d| [d[0] * config.speed, d[1] * config.speed]).collect(),
             weights: config.user_weights(),
-            grounded: vec![false; m],
+            lost: vec![false; m],
             uav_xy: vec![0.0; copies * m * 2],
             user_xy: vec![0.0; copies * n * 2],
             aoi: vec![0.0; copies * n],
@@ -83,7 +83,7 @@ impl BatchEnv {
         assert_eq!(seeds.len(), self.copies, "one seed per copy");
         let (m, n) = (self.config.uavs, self.config.users);
         self.slot = 0;
-        self.grounded.fill(false);
+        self.lost.fill(false);
         self.aoi.fill(0.0);
         self.reward.fill(0.0);
         self.counter.clear();
@@ -114,7 +114,7 @@ impl BatchEnv {
         assert!(self.slot < self.config.slots, "the episode has ended");
         assert_eq!(actions.len(), self.copies * self.config.uavs, "one action per UAV");
         let clamp = self.config.boundary == Boundary::Clamp;
-        let flying = self.grounded.iter().cycle().map(|grounded| !grounded);
+        let flying = self.lost.iter().cycle().map(|lost| !lost);
         for ((xy, &action), flying) in self.uav_xy.chunks_exact_mut(2).zip(actions).zip(flying) {
             if !flying {
                 continue;
@@ -159,7 +159,7 @@ impl BatchEnv {
     fn collect(&mut self) {
         let (m, n) = (self.config.uavs, self.config.users);
         let range = self.config.transmission_range * self.config.transmission_range;
-        let factor = self.config.reward_factor();
+        let factor = self.config.effective_reward_scale();
         for b in 0..self.copies {
             let uavs = &self.uav_xy[b * m * 2..(b + 1) * m * 2];
             let users = &self.user_xy[b * n * 2..(b + 1) * n * 2];
@@ -167,9 +167,9 @@ impl BatchEnv {
             let mut sum = 0.0;
             for ((user, age), weight) in users.chunks_exact(2).zip(aoi.iter_mut()).zip(&self.weights) {
                 let (x, y) = (f64::from(user[0]), f64::from(user[1]));
-                let collected = uavs.chunks_exact(2).zip(&self.grounded).any(|(uav, grounded)| {
+                let collected = uavs.chunks_exact(2).zip(&self.lost).any(|(uav, lost)| {
                     let (dx, dy) = (f64::from(uav[0]) - x, f64::from(uav[1]) - y);
-                    dx * dx + dy * dy <= range && !grounded
+                    dx * dx + dy * dy <= range && !lost
                 });
                 *age = if collected { 0.0 } else { *age + 1.0 };
                 sum += weight * f64::from(*age);
@@ -183,8 +183,8 @@ impl BatchEnv {
     ///
     /// # Panics
     /// If `uav` is not below M.
-    pub fn ground(&mut self, uav: usize) {
-        self.grounded[uav] = true;
+    pub fn lose_uav(&mut self, uav: usize) {
+        self.lost[uav] = true;
     }
 
     /// Mean AoI over the users of copy `b` in the current slot, weighted if users have weights, in slots.

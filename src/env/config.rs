@@ -97,7 +97,7 @@ impl EnvConfig {
     pub const COMPASS: usize = 8;
 
     /// A, the number of actions: 8 headings, and hovering if `hover` is set.
-    pub fn headings(&self) -> usize {
+    pub fn actions(&self) -> usize {
         Self::COMPASS + usize::from(self.hover)
     }
 
@@ -107,7 +107,7 @@ impl EnvConfig {
     }
 
     /// `reward_scale`, or its default 1/K.
-    pub fn reward_factor(&self) -> f64 {
+    pub fn effective_reward_scale(&self) -> f64 {
         self.reward_scale.unwrap_or(1.0 / self.slots as f64)
     }
 

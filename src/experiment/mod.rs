@@ -14,7 +14,7 @@ mod summary;
 mod tables;
 
 pub use curve::TrainingCurve;
-pub use plan::{Experiment, PlotKind, Run, SweepPoint};
+pub use plan::{Experiment, ExperimentPoint, PlotKind, Run};
 pub use plots::plots;
 pub use run_result::{EvaluatedWeights, RunResult};
 pub use settings::Overrides;

@@ -29,7 +29,7 @@ pub enum PlotKind {
 
 /// A point: settings that the experiment varies besides the series.
 #[derive(Clone, Debug, PartialEq)]
-pub struct SweepPoint {
+pub struct ExperimentPoint {
     /// Its name; empty if the experiment has no points.
     pub name: String,
     /// Its position on the x axis.
@@ -71,7 +71,7 @@ pub struct Experiment {
     /// Names of the series.
     pub series: Vec<String>,
     /// The points; one without a name if the document has none.
-    pub points: Vec<SweepPoint>,
+    pub points: Vec<ExperimentPoint>,
     /// All runs, ordered by seed, then point, then series, so that every series has a result early.
     pub runs: Vec<Run>,
 }
@@ -113,12 +113,12 @@ impl Experiment {
         }
         let mut points = select("points", named_settings(&mut top, "points", &["x"])?, &overrides.points)?;
         if points.is_empty() {
-            points.push(NamedSettings { name: String::new(), x: Some(0.0), section: RunSettings::default() });
+            points.push(NamedSettings { name: String::new(), x: Some(0.0), settings: RunSettings::default() });
         }
         let x = top.optional("x")?.unwrap_or_default();
-        let over = RunSettings::overrides(overrides);
+        let command_line = RunSettings::overrides(overrides);
 
-        let mut sweep_points = Vec::new();
+        let mut experiment_points = Vec::new();
         for (i, point) in points.iter().enumerate() {
             let x = match (point.x, plot) {
                 (None, PlotKind::Parameter) => {
@@ -126,21 +126,21 @@ impl Experiment {
                 }
                 (x, _) => x.unwrap_or(i as f64),
             };
-            let shared = RunSettings::resolve(&[&run, &point.section, &over], 1)?;
-            sweep_points.push(SweepPoint { name: point.name.clone(), x, environment: shared.environment });
+            let shared = RunSettings::resolve(&[&run, &point.settings, &command_line], 1)?;
+            experiment_points.push(ExperimentPoint { name: point.name.clone(), x, environment: shared.environment });
         }
         let mut runs = Vec::new();
         for &seed in &seeds {
             for (p, point) in points.iter().enumerate() {
                 for (s, series) in series.iter().enumerate() {
-                    let config = RunSettings::resolve(&[&run, &series.section, &point.section, &over], seed)?;
+                    let config = RunSettings::resolve(&[&run, &series.settings, &point.settings, &command_line], seed)?;
                     let folder = folder(&series.name, &point.name, &config);
                     runs.push(Run { series: s, point: p, folder, config });
                 }
             }
         }
         let series: Vec<String> = series.into_iter().map(|row| row.name).collect();
-        Ok(Self { title, plot, x, seeds, layouts, layout_seeds, baselines, series, points: sweep_points, runs })
+        Ok(Self { title, plot, x, seeds, layouts, layout_seeds, baselines, series, points: experiment_points, runs })
     }
 
     /// The label of a run in logs: series, point, seed.
@@ -155,7 +155,7 @@ impl Experiment {
 struct NamedSettings {
     name: String,
     x: Option<f64>,
-    section: RunSettings,
+    settings: RunSettings,
 }
 
 fn named_settings(top: &mut TableReader, field: &str, more: &[&str]) -> Result<Vec<NamedSettings>, Invalid> {
@@ -164,7 +164,7 @@ fn named_settings(top: &mut TableReader, field: &str, more: &[&str]) -> Result<V
     let mut rows: Vec<NamedSettings> = Vec::new();
     for (i, value) in tables.into_iter().enumerate() {
         let mut table = TableReader::new(&format!("{field}[{i}]"), value, &known)?;
-        let row = NamedSettings { name: table.name("name")?, x: table.optional("x")?, section: RunSettings::read(&mut table)? };
+        let row = NamedSettings { name: table.name("name")?, x: table.optional("x")?, settings: RunSettings::read(&mut table)? };
         // Folders and plots are named after it.
         if rows.iter().any(|other| slug(&other.name) == slug(&row.name)) || slug(&row.name).is_empty() {
             return Err(Invalid::new(table.at("name"), format!("{:?}", row.name), "a distinct name with letters or digits"));

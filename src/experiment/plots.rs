@@ -53,7 +53,7 @@ fn convergence(experiment: &Experiment, summary: &ExperimentSummary, curves: &[T
         };
         files.push((file_name("convergence", &point.name), lines(&chart)));
         let bar = |name: &str, aoi: &Interval| Bar { name: name.to_owned(), mean: aoi.mean, low: aoi.low, high: aoi.high };
-        let reached: Vec<Bar> = (summary.rows.iter().filter(|row| row.point == point.name))
+        let reached: Vec<Bar> = (summary.series_summaries.iter().filter(|row| row.point == point.name))
             .map(|row| bar(&row.series, &row.mean_aoi))
             .chain(summary.baselines.iter().filter(|b| b.point == point.name).map(|b| bar(&b.name, &b.mean_aoi)))
             .collect();
@@ -72,10 +72,9 @@ fn parameter(experiment: &Experiment, summary: &ExperimentSummary) -> String {
         let (points, band) = all.into_iter().unzip();
         Series { name: name.to_owned(), points, band: Some(band) }
     };
-    let series = experiment
-        .series
-        .iter()
-        .map(|name| along(name, summary.rows.iter().filter(|row| &row.series == name).map(|row| row.mean_aoi).collect()));
+    let series = experiment.series.iter().map(|name| {
+        along(name, summary.series_summaries.iter().filter(|row| &row.series == name).map(|row| row.mean_aoi).collect())
+    });
     let baselines = experiment
         .baselines
         .iter()

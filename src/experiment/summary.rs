@@ -21,8 +21,9 @@ pub struct ExperimentSummary {
     pub episodes: usize,
     /// Seeds of the runs.
     pub seeds: Vec<u64>,
-    /// Series at points, over all seeds.
-    pub rows: Vec<SeriesSummary>,
+    /// Every series at every point, over all seeds.
+    #[serde(rename = "rows")]
+    pub series_summaries: Vec<SeriesSummary>,
     /// Baselines at points.
     pub baselines: Vec<BaselineSummary>,
     /// Pairs at each point: series with series, then series with baselines.
@@ -111,19 +112,21 @@ impl ExperimentSummary {
     /// If there is not one result per run.
     pub fn new(experiment: &Experiment, results: &[RunResult], baseline_episodes: &[Vec<Vec<EpisodeMetrics>>]) -> Self {
         assert_eq!(results.len(), experiment.runs.len(), "one result per run");
-        let mut rows = Vec::new();
+        let mut series_summaries = Vec::new();
         let mut baselines = Vec::new();
         let mut differences = Vec::new();
         for (p, (point, baseline_episodes)) in experiment.points.iter().zip(baseline_episodes).enumerate() {
             let point = &point.name;
             let mut values: Vec<(&str, Vec<Vec<f64>>)> = Vec::new();
             for (s, series) in experiment.series.iter().enumerate() {
-                let of = |(run, _): &(&Run, &RunResult)| run.series == s && run.point == p;
-                let all: Vec<&RunResult> = experiment.runs.iter().zip(results).filter(of).map(|(_, result)| result).collect();
+                let belongs = |(run, _): &(&Run, &RunResult)| run.series == s && run.point == p;
+                let all: Vec<&RunResult> =
+                    experiment.runs.iter().zip(results).filter(belongs).map(|(_, result)| result).collect();
                 let best: Vec<Vec<f64>> = all.iter().map(|result| aoi(&result.best.episodes)).collect();
-                let last: Option<Vec<Vec<f64>>> = all.iter().map(|o| o.last.as_ref().map(|last| aoi(&last.episodes))).collect();
+                let last: Option<Vec<Vec<f64>>> =
+                    all.iter().map(|result| result.last.as_ref().map(|last| aoi(&last.episodes))).collect();
                 let episodes: Vec<EpisodeMetrics> = all.iter().flat_map(|result| result.best.episodes.iter().copied()).collect();
-                rows.push(SeriesSummary {
+                series_summaries.push(SeriesSummary {
                     series: series.clone(),
                     point: point.clone(),
                     mean_aoi: interval(&best),
@@ -177,7 +180,7 @@ impl ExperimentSummary {
             layouts: experiment.layouts.clone(),
             episodes: experiment.layout_seeds.len(),
             seeds: experiment.seeds.clone(),
-            rows,
+            series_summaries,
             baselines,
             differences,
             runs: runs.collect(),

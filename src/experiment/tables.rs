@@ -29,7 +29,7 @@ pub fn readme(experiment: &Experiment, summary: &ExperimentSummary, command: &st
     let seeds: Vec<String> = summary.seeds.iter().map(|seed| format!("seed {seed}")).collect();
     let header = ["point", "series", "mean AoI", "95 % interval", "last weights", "p95", "peak", "coverage", "fairness"];
     page.head(points, header.into_iter().chain(seeds.iter().map(String::as_str)));
-    for row in &summary.rows {
+    for row in &summary.series_summaries {
         let last = row.last_mean_aoi.map_or("diverged".to_owned(), |last| format!("{:.2}", last.mean));
         let [aoi, interval, others @ ..] = metric_cells(&row.mean_aoi, &row.mean);
         let cells = [row.point.clone(), row.series.clone(), aoi, interval, last];

@@ -8,7 +8,7 @@ use sha2::{Digest, Sha256};
 
 use crate::invalid::{Invalid, in_range};
 use crate::store::{JobKind, JobSpec};
-use crate::train_config::{Algorithm, Preset, TrainConfig, integral};
+use crate::train_config::{Algorithm, Preset, TrainConfig, floats_to_integers};
 
 /// A job as it is submitted; what is absent has a default.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -53,7 +53,7 @@ impl JobRequest {
     /// # Errors
     /// The first field that is unknown or of the wrong type.
     pub fn from_json(mut document: Value) -> Result<Self, Invalid> {
-        integral(&mut document);
+        floats_to_integers(&mut document);
         if !document.is_object() {
             return Err(Invalid::schema("job", document, "an object"));
         }
@@ -63,7 +63,7 @@ impl JobRequest {
     /// SHA-256 of the request in canonical form, by which the same request is recognised.
     pub fn digest(&self) -> [u8; 32] {
         let mut document = serde_json::to_value(self).expect("a request is plain data");
-        integral(&mut document);
+        floats_to_integers(&mut document);
         // Objects are ordered by key, so this is canonical.
         Sha256::digest(document.to_string()).into()
     }
@@ -90,7 +90,7 @@ impl JobRequest {
         check_labels(&labels)?;
         let [environment, training] = [self.environment, self.training].map(|section| {
             let mut fields = section.unwrap_or_default();
-            fields.values_mut().for_each(integral);
+            fields.values_mut().for_each(floats_to_integers);
             fields
         });
         let (algorithm, preset) = (self.algorithm.unwrap_or_default(), self.preset.unwrap_or_default());

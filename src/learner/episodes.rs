@@ -27,7 +27,7 @@ pub struct Episodes {
     /// (B, K) rewards.
     pub reward: Vec<f32>,
     /// (B, M, 4) identity tokens, drawn per episode.
-    pub token: Vec<f32>,
+    pub identity_token: Vec<f32>,
 }
 
 /// A symmetry of the square: optionally mirrored left to right, then rotated counter-clockwise by quarter turns.
@@ -41,8 +41,8 @@ impl Symmetry {
     /// Number of symmetries.
     pub const COUNT: u8 = 8;
 
-    /// The symmetry with number `i`, from 0 (the identity) to 7.
-    pub fn number(i: u8) -> Self {
+    /// The symmetry of index `i`, from 0 (the identity) to 7.
+    pub fn from_index(i: u8) -> Self {
         Self { mirror: i & 4 != 0, quarters: i & 3 }
     }
 
@@ -78,8 +78,9 @@ impl Episodes {
         let points = |xy: &mut [f32], s: Symmetry| {
             xy.as_chunks_mut().0.iter_mut().for_each(|p| *p = s.point(*p));
         };
-        let share = |len: usize| len / self.len;
-        let (uavs, users, actions) = (share(self.uav_xy.len()), share(self.user_xy.len()), share(self.actions.len()));
+        let len_per_episode = |len: usize| len / self.len;
+        let (uavs, users, actions) =
+            (len_per_episode(self.uav_xy.len()), len_per_episode(self.user_xy.len()), len_per_episode(self.actions.len()));
         for (e, &s) in symmetries.iter().enumerate() {
             points(&mut self.uav_xy[e * uavs..][..uavs], s);
             points(&mut self.user_xy[e * users..][..users], s);
@@ -96,7 +97,7 @@ mod tests {
     #[test]
     fn headings_rotate_with_positions() {
         let middle = [0.5, 0.5];
-        for s in (0..Symmetry::COUNT).map(Symmetry::number) {
+        for s in (0..Symmetry::COUNT).map(Symmetry::from_index) {
             assert_eq!(s.point(middle), middle);
             assert_eq!(s.heading(8), 8, "hovering is unchanged");
             for (h, d) in DIRECTIONS.iter().take(EnvConfig::COMPASS).enumerate() {
@@ -107,7 +108,7 @@ mod tests {
             }
         }
         let images: std::collections::BTreeSet<_> =
-            (0..8).map(|i| Symmetry::number(i).point([0.25, 0.125]).map(f32::to_bits)).collect();
+            (0..8).map(|i| Symmetry::from_index(i).point([0.25, 0.125]).map(f32::to_bits)).collect();
         assert_eq!(images.len(), 8, "eight different symmetries");
     }
 }

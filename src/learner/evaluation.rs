@@ -6,7 +6,7 @@
 use super::disturbance::Disturbance;
 use crate::env::{BatchEnv, EnvConfig, EpisodeMetrics, Point, points};
 use crate::invalid::{Invalid, in_range};
-use crate::policy::{FleetStep, Policy, Slot};
+use crate::policy::{FleetGraph, FleetStep, Policy};
 
 /// Runs `policy` on the episodes with these seeds, split among `threads`. Returns the metrics in the order of `seeds`. A policy
 /// with fewer actions than the environment uses the first ones.
@@ -116,8 +116,8 @@ impl Observer for Recorder {
     }
 }
 
-/// Runs all `seeds`, one share per thread, and returns the shares in order, each with its observer. `observer` makes an observer
-/// from the number of seeds before the share.
+/// Runs all `seeds`, one part per thread, and returns the parts in order, each with its observer. `observer` makes an observer
+/// from the number of seeds before the part.
 fn run_parallel<O: Observer + Send>(
     policy: &dyn Policy,
     env: &EnvConfig,
@@ -129,21 +129,21 @@ fn run_parallel<O: Observer + Send>(
     env.validate()?;
     disturbance.validate(env)?;
     policy.check_fleet(env.uavs, env.users)?;
-    if policy.actions() > env.headings() {
-        let expected = format!("at most {}, the headings of the environment", env.headings());
+    if policy.actions() > env.actions() {
+        let expected = format!("at most {}, the headings of the environment", env.actions());
         return Err(Invalid::new("policy.actions", policy.actions(), expected));
     }
-    let share = seeds.len().div_ceil(threads.max(1)).max(1);
-    let run_share = |(i, seeds): (usize, &[u64])| {
-        let mut observer = observer(i * share);
+    let part_len = seeds.len().div_ceil(threads.max(1)).max(1);
+    let run_part = |(i, seeds): (usize, &[u64])| {
+        let mut observer = observer(i * part_len);
         run(policy, env, seeds, disturbance, &mut observer).map(|metrics| (metrics, observer))
     };
-    if seeds.len() <= share {
-        return seeds.chunks(share).enumerate().map(run_share).collect();
+    if seeds.len() <= part_len {
+        return seeds.chunks(part_len).enumerate().map(run_part).collect();
     }
-    let run_share = &run_share;
+    let run_part = &run_part;
     std::thread::scope(|scope| {
-        let threads: Vec<_> = seeds.chunks(share).enumerate().map(|part| scope.spawn(move || run_share(part))).collect();
+        let threads: Vec<_> = seeds.chunks(part_len).enumerate().map(|part| scope.spawn(move || run_part(part))).collect();
         threads.into_iter().map(|t| t.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))).collect()
     })
 }
@@ -165,28 +165,28 @@ fn run(
     for (memory, &seed) in memories.iter_mut().zip(seeds) {
         policy.start(m, n, seed, memory);
     }
-    let mut slots = vec![Slot::default(); seeds.len()];
+    let mut graphs = vec![FleetGraph::default(); seeds.len()];
     let mut headings = vec![0; seeds.len() * m];
     let (mut uavs, mut users): (Vec<Point>, Vec<Point>) = (Vec::with_capacity(m), Vec::with_capacity(n));
     observer.observe(&env);
     while !env.done() {
         let step = env.slot();
         if let Some(uav) = disturbance.lost(step) {
-            env.ground(uav);
+            env.lose_uav(uav);
         }
-        for ((b, slot), &seed) in slots.iter_mut().enumerate().zip(seeds) {
+        for ((b, graph), &seed) in graphs.iter_mut().enumerate().zip(seeds) {
             uavs.clear();
             uavs.extend(points(&env.uav_xy()[b * m * 2..][..m * 2]));
             users.clear();
             users.extend(points(&env.user_xy()[b * n * 2..][..n * 2]));
             disturbance.distort(config, seed, step, &mut uavs, &mut users);
-            slot.set_scene(&uavs, &users, &env.aoi()[b * n..(b + 1) * n], config.detection_range);
+            graph.set_scene(&uavs, &users, &env.aoi()[b * n..(b + 1) * n], config.detection_range);
         }
-        let mut steps: Vec<FleetStep<'_>> = slots
+        let mut steps: Vec<FleetStep<'_>> = graphs
             .iter()
             .zip(&mut memories)
             .zip(headings.chunks_exact_mut(m))
-            .map(|((slot, memory), headings)| FleetStep { slot, step: step as u64, memory, headings, q_values: None })
+            .map(|((graph, memory), headings)| FleetStep { graph, step: step as u64, memory, headings, q_values: None })
             .collect();
         policy.act(&mut steps);
         env.step(&headings);

@@ -4,22 +4,22 @@ use serde::{Deserialize, Serialize};
 
 use crate::env::EpisodeMetrics;
 
-/// An event of a training run. `step` is the number of environment steps made.
+/// An event of a training run.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Event {
     /// Episodes were collected and the networks updated.
     Iteration(Iteration),
     /// The greedy policy was evaluated on the validation layouts.
     Evaluation(Evaluation),
-    /// A weight is not finite or too large. The run has ended; the best weights so far remain available.
+    /// A parameter is not finite or too large. The run has ended; the best parameters so far remain available.
     Diverged {
         /// Environment steps made.
-        step: u64,
+        env_steps: u64,
     },
     /// All steps are made. The run has ended.
     Finished {
         /// Environment steps made.
-        step: u64,
+        env_steps: u64,
     },
 }
 
@@ -28,7 +28,8 @@ pub enum Event {
 #[serde(deny_unknown_fields)]
 pub struct Evaluation {
     /// Environment steps made when it was taken.
-    pub step: u64,
+    #[serde(rename = "step")]
+    pub env_steps: u64,
     /// Mean over the layouts.
     pub metrics: EpisodeMetrics,
 }
@@ -37,7 +38,7 @@ pub struct Evaluation {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Iteration {
     /// Environment steps after it.
-    pub step: u64,
+    pub env_steps: u64,
     /// Episodes collected after it.
     pub episodes: u64,
     /// Updates made after it.
@@ -55,21 +56,21 @@ pub struct Iteration {
 }
 
 impl Event {
-    /// The event as metrics: (step, name, value), with the names used by servers and CSV files.
+    /// The event as metrics: (environment step, name, value), with the names used by servers and CSV files.
     pub fn rows(&self) -> Vec<(u64, &'static str, f64)> {
         match self {
             Self::Iteration(i) => {
-                let mut rows = vec![(i.step, "epsilon", i.epsilon), (i.step, "train/mean_aoi", i.mean_aoi)];
+                let mut rows = vec![(i.env_steps, "epsilon", i.epsilon), (i.env_steps, "train/mean_aoi", i.mean_aoi)];
                 let optional = [("loss", i.loss), ("grad_norm", i.grad_norm), ("q_tot", i.q_tot)];
-                rows.extend(optional.into_iter().filter_map(|(name, value)| Some((i.step, name, value?))));
+                rows.extend(optional.into_iter().filter_map(|(name, value)| Some((i.env_steps, name, value?))));
                 rows
             }
-            Self::Evaluation(Evaluation { step, metrics: m }) => vec![
-                (*step, "eval/mean_aoi", m.mean_aoi),
-                (*step, "eval/p95_aoi", m.p95_aoi),
-                (*step, "eval/peak_aoi", m.peak_aoi),
-                (*step, "eval/coverage", m.coverage),
-                (*step, "eval/fairness", m.fairness),
+            Self::Evaluation(Evaluation { env_steps, metrics: m }) => vec![
+                (*env_steps, "eval/mean_aoi", m.mean_aoi),
+                (*env_steps, "eval/p95_aoi", m.p95_aoi),
+                (*env_steps, "eval/peak_aoi", m.peak_aoi),
+                (*env_steps, "eval/coverage", m.coverage),
+                (*env_steps, "eval/fairness", m.fairness),
             ],
             Self::Diverged { .. } | Self::Finished { .. } => Vec::new(),
         }

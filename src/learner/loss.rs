@@ -66,8 +66,8 @@ pub struct Loss<T: Real> {
     mixer: Mixer,
     layout: ParameterLayout,
     td_lambda: TdLambda,
-    /// Transposed weights of the online and the target networks, see [`Weights`].
-    transposed: [Vec<T>; 2],
+    /// Prepared forms of the parameters of the online and the target networks, see [`Weights`].
+    prepared: [Vec<T>; 2],
     chunks: Vec<Chunk<T>>,
     workspaces: Vec<Mutex<Workspace<T>>>,
     gradient: Vec<T>,
@@ -88,7 +88,7 @@ struct Chunk<T> {
 struct Workspace<T: Real> {
     geometry: Geometry,
     last: Vec<u8>,
-    token: Vec<f32>,
+    identity_token: Vec<f32>,
     position: Vec<f32>,
     states: Batch<T>,
     online: AgentCache<T>,
@@ -100,12 +100,13 @@ struct Workspace<T: Real> {
     total: Batch<T>,
     target_total: Batch<T>,
     td_target: Batch<T>,
+    d_total: Batch<T>,
     d_chosen: Batch<T>,
     dq: Batch<T>,
 }
 
 impl<T: Real> Loss<T> {
-    /// The loss for these networks; `threads` is the largest number of threads that evaluate it.
+    /// The loss for these networks; `threads` is the maximum number of threads that compute it.
     pub fn new(config: AgentConfig, dims: Dims, mixer: MixerKind, td_lambda: TdLambda, threads: usize) -> Self {
         let agent = Agent::new(config, dims);
         let mut layout = agent.layout().clone();
@@ -116,7 +117,7 @@ impl<T: Real> Loss<T> {
             mixer,
             layout,
             td_lambda,
-            transposed: [vec![T::ZERO; len], vec![T::ZERO; len]],
+            prepared: [vec![T::ZERO; len], vec![T::ZERO; len]],
             chunks: Vec::new(),
             workspaces: (0..threads.max(1)).map(|_| Mutex::default()).collect(),
             gradient: vec![T::ZERO; len],
@@ -143,14 +144,24 @@ impl<T: Real> Loss<T> {
     ///
     /// # Panics
     /// If the sizes of the episodes are not those of the networks, or there are no episodes.
-    pub fn evaluate(&mut self, online: &[T], target: &[T], episodes: &Episodes, trace: Option<&mut Trace<T>>) -> LossMetrics {
+    pub fn compute_gradient(
+        &mut self,
+        online: &[T],
+        target: &[T],
+        episodes: &Episodes,
+        trace: Option<&mut Trace<T>>,
+    ) -> LossMetrics {
         let dims = *self.agent.dims();
         assert!(episodes.len > 0, "a batch of at least one episode");
-        assert_eq!((episodes.uavs, episodes.users, episodes.slots), (dims.uavs, dims.users, dims.slots), "episodes of M, N, K");
-        let [transposed_online, transposed_target] = &mut self.transposed;
-        for (flat, transposed) in [(online, &mut *transposed_online), (target, &mut *transposed_target)] {
-            self.agent.prepare(flat, transposed);
-            self.mixer.prepare(flat, transposed);
+        assert_eq!(
+            (episodes.uavs, episodes.users, episodes.slots),
+            (dims.uavs, dims.users, dims.episode_slots),
+            "episodes of M, N, K"
+        );
+        let [prepared_online, prepared_target] = &mut self.prepared;
+        for (params, prepared) in [(online, &mut *prepared_online), (target, &mut *prepared_target)] {
+            self.agent.prepare(params, prepared);
+            self.mixer.prepare(params, prepared);
         }
         let per_chunk = episodes_per_chunk(dims.uavs);
         let count = episodes.len.div_ceil(per_chunk);
@@ -162,8 +173,8 @@ impl<T: Real> Loss<T> {
         let pass = Pass {
             agent: &self.agent,
             mixer: &self.mixer,
-            online: Weights { flat: online, transposed: transposed_online },
-            target: Weights { flat: target, transposed: transposed_target },
+            online: Weights { params: online, prepared: prepared_online },
+            target: Weights { params: target, prepared: prepared_target },
             td_lambda: self.td_lambda,
             episodes,
             traced: trace.is_some(),
@@ -188,7 +199,7 @@ impl<T: Real> Loss<T> {
             let join = |part: fn(&Trace<T>) -> &[T]| chunks.iter().flat_map(|c| part(&c.trace)).copied().collect();
             *trace = Trace { q: join(|t| &t.q), q_tot: join(|t| &t.q_tot), target: join(|t| &t.target) };
         }
-        let count = (episodes.len * dims.slots * self.mixer.values()) as f64;
+        let count = (episodes.len * dims.episode_slots * self.mixer.joint_values_per_slot()) as f64;
         LossMetrics {
             loss: 0.5 * chunks.iter().map(|c| c.loss).sum::<f64>() / count,
             grad_norm: self.norms.iter().sum::<f64>().sqrt(),
@@ -209,73 +220,79 @@ struct Pass<'a, T> {
 }
 
 impl<T: Real> Pass<'_, T> {
-    fn run(&self, range: std::ops::Range<usize>, w: &mut Workspace<T>, out: &mut Chunk<T>) {
+    fn run(&self, range: std::ops::Range<usize>, ws: &mut Workspace<T>, out: &mut Chunk<T>) {
         let ep = self.episodes;
         let (m, k, b) = (ep.uavs, ep.slots, range.len());
         let (slots, per_slot) = (k + 1, b * m);
-        w.load(self.agent, ep, range.clone());
-        let inputs = Inputs { geometry: &w.geometry, last: &w.last, token: &w.token, position: &w.position };
-        for (weights, cache) in [(self.online, &mut w.online), (self.target, &mut w.target)] {
+        ws.load(self.agent, ep, range.clone());
+        let inputs =
+            Inputs { geometry: &ws.geometry, last: &ws.last, identity_token: &ws.identity_token, position: &ws.position };
+        for (weights, cache) in [(self.online, &mut ws.online), (self.target, &mut ws.target)] {
             cache.begin(per_slot, slots).fill(T::ZERO);
             self.agent.forward(weights, &inputs, slots, cache);
         }
 
         // Double Q-learning: the online network chooses the action, the target network gives its value. Slot 0 is not needed.
         let actions = self.agent.dims().actions;
-        let action = |row: usize| usize::from(ep.actions[((range.start + row / m % b) * k + row / per_slot) * m + row % m]);
-        w.best.reset(m, k * b);
-        for (best, row) in w.best.as_mut_slice().iter_mut().zip(per_slot..) {
-            *best = w.target.q.row(row)[argmax(w.online.q.row(row))];
+        // Row (slot, episode, UAV) of the batch, and the action in the order (episode, slot, UAV).
+        let action = |row: usize| {
+            let (slot, episode, uav) = (row / per_slot, range.start + row / m % b, row % m);
+            usize::from(ep.actions[(episode * k + slot) * m + uav])
+        };
+        ws.best.resize(m, k * b);
+        for (best, row) in ws.best.as_mut_slice().iter_mut().zip(per_slot..) {
+            *best = ws.target.q.row(row)[argmax(ws.online.q.row(row))];
         }
-        w.chosen.reset(m, k * b);
-        for (chosen, row) in w.chosen.as_mut_slice().iter_mut().zip(0..) {
-            *chosen = w.online.q.row(row)[action(row)];
+        ws.chosen.resize(m, k * b);
+        for (chosen, row) in ws.chosen.as_mut_slice().iter_mut().zip(0..) {
+            *chosen = ws.online.q.row(row)[action(row)];
         }
-        let values = self.mixer.values();
-        w.target_total.reset(values, k * b);
-        w.total.reset(values, k * b);
-        let future = (w.states.range(b..slots * b), w.best.rows());
-        self.mixer.forward(self.target, future, &mut w.target_mixer, w.target_total.rows_mut());
-        let present = (w.states.range(0..k * b), w.chosen.rows());
-        self.mixer.forward(self.online, present, &mut w.online_mixer, w.total.rows_mut());
+        let values = self.mixer.joint_values_per_slot();
+        ws.target_total.resize(values, k * b);
+        ws.total.resize(values, k * b);
+        let next_inputs = (ws.states.range(b..slots * b), ws.best.rows());
+        self.mixer.forward(self.target, next_inputs, &mut ws.target_mixer, ws.target_total.rows_mut());
+        let mixer_inputs = (ws.states.range(0..k * b), ws.chosen.rows());
+        self.mixer.forward(self.online, mixer_inputs, &mut ws.online_mixer, ws.total.rows_mut());
 
-        w.td_target.reset(values, k * b);
-        self.td_targets(range.start, b, w.target_total.as_slice(), w.td_target.as_mut_slice());
+        ws.td_target.resize(values, k * b);
+        self.td_targets(range.start, b, ws.target_total.as_slice(), ws.td_target.as_mut_slice());
         if self.traced {
-            record_trace(w, (b, slots, m), &mut out.trace);
+            record_trace(ws, (b, slots, m), &mut out.trace);
         }
-        let share = T::from_f64(1.0 / (ep.len * k * values) as f64);
+        let scale = T::from_f64(1.0 / (ep.len * k * values) as f64);
         (out.loss, out.q_tot) = (0.0, 0.0);
-        // This loop replaces `total` by the gradient of the loss with respect to it.
-        for (total, &td_target) in w.total.as_mut_slice().iter_mut().zip(w.td_target.as_slice()) {
+        ws.d_total.resize(values, k * b);
+        let errors = ws.total.as_slice().iter().zip(ws.td_target.as_slice());
+        for (d_total, (&total, &td_target)) in ws.d_total.as_mut_slice().iter_mut().zip(errors) {
             out.q_tot += total.to_f64();
-            *total -= td_target;
-            out.loss += total.to_f64() * total.to_f64();
-            *total *= share;
+            let error = total - td_target;
+            out.loss += error.to_f64() * error.to_f64();
+            *d_total = error * scale;
         }
 
         out.grads.fill(T::ZERO);
-        let gradients = (&mut out.grads[..], &mut w.d_chosen);
-        self.mixer.backward(self.online, present, &mut w.online_mixer, w.total.as_slice(), gradients);
-        w.dq.reset_zero(actions, slots * per_slot);
-        for (row, &d) in w.d_chosen.as_slice().iter().enumerate() {
-            w.dq.row_mut(row)[action(row)] = d;
+        let gradients = (&mut out.grads[..], &mut ws.d_chosen);
+        self.mixer.backward(self.online, mixer_inputs, &mut ws.online_mixer, ws.d_total.as_slice(), gradients);
+        ws.dq.resize_zero(actions, slots * per_slot);
+        for (row, &d) in ws.d_chosen.as_slice().iter().enumerate() {
+            ws.dq.row_mut(row)[action(row)] = d;
         }
-        self.agent.backward(self.online, (&inputs, slots), w.dq.rows(), &mut w.online, &mut out.grads);
+        self.agent.backward(self.online, (&inputs, slots), ws.dq.rows(), &mut ws.online, &mut out.grads);
     }
 
-    /// Computes TD(lambda) targets from the last slot backwards; `future` starts at slot 1.
-    fn td_targets(&self, first: usize, b: usize, future: &[T], td_target: &mut [T]) {
+    /// Computes TD(lambda) targets from the last slot backwards; `next_values` starts at slot 1.
+    fn td_targets(&self, first: usize, b: usize, next_values: &[T], td_target: &mut [T]) {
         let k = self.episodes.slots;
-        let stride = b * self.mixer.values();
+        let stride = b * self.mixer.joint_values_per_slot();
         let gamma = T::from_f64(self.td_lambda.gamma);
-        let (keep, cut) = (T::from_f64(self.td_lambda.lambda), T::from_f64(1.0 - self.td_lambda.lambda));
+        let (lambda, one_minus_lambda) = (T::from_f64(self.td_lambda.lambda), T::from_f64(1.0 - self.td_lambda.lambda));
         for t in (0..k).rev() {
             for i in 0..stride {
-                let reward = T::from_f64(self.episodes.reward[(first + i / self.mixer.values()) * k + t].into());
-                let value = future[t * stride + i];
+                let reward = T::from_f64(self.episodes.reward[(first + i / self.mixer.joint_values_per_slot()) * k + t].into());
+                let value = next_values[t * stride + i];
                 let next = if t + 1 == k { value } else { td_target[(t + 1) * stride + i] };
-                td_target[t * stride + i] = reward + gamma * (keep * next + cut * value);
+                td_target[t * stride + i] = reward + gamma * (lambda * next + one_minus_lambda * value);
             }
         }
     }
@@ -285,13 +302,13 @@ impl<T: Real> Workspace<T> {
     /// Loads the episodes `range`, time-major.
     fn load(&mut self, agent: &Agent, ep: &Episodes, range: std::ops::Range<usize>) {
         let (m, n, k) = (ep.uavs, ep.users, ep.slots);
-        let config = agent.geometry();
+        let config = agent.geometry_config();
         let slots = k + 1;
         self.geometry.clear();
         self.last.clear();
-        self.token.clear();
+        self.identity_token.clear();
         self.position.clear();
-        self.states.reset(2 * m + 3 * n, slots * range.len());
+        self.states.resize(2 * m + 3 * n, slots * range.len());
         let mut states = self.states.as_mut_slice().chunks_exact_mut(2 * m + 3 * n);
         for t in 0..slots {
             for e in range.clone() {
@@ -304,7 +321,7 @@ impl<T: Real> Workspace<T> {
                     0 => self.last.resize(self.last.len() + m, NO_ACTION),
                     t => self.last.extend_from_slice(&ep.actions[(e * k + t - 1) * m..][..m]),
                 }
-                self.token.extend_from_slice(&ep.token[e * m * TOKEN..][..m * TOKEN]);
+                self.identity_token.extend_from_slice(&ep.identity_token[e * m * TOKEN..][..m * TOKEN]);
                 self.position.extend_from_slice(uav_xy);
                 flat_state(uav_xy, user_xy, aoi, k, states.next().expect("one state per slot"));
             }
@@ -314,7 +331,7 @@ impl<T: Real> Workspace<T> {
 }
 
 /// Writes the trace of a chunk, episode-major.
-fn record_trace<T: Real>(w: &Workspace<T>, (b, slots, m): (usize, usize, usize), out: &mut Trace<T>) {
+fn record_trace<T: Real>(ws: &Workspace<T>, (b, slots, m): (usize, usize, usize), out: &mut Trace<T>) {
     let reorder = |from: &[T], slots: usize, to: &mut Vec<T>| {
         to.clear();
         let width = from.len() / (slots * b);
@@ -322,8 +339,8 @@ fn record_trace<T: Real>(w: &Workspace<T>, (b, slots, m): (usize, usize, usize),
             (0..slots).for_each(|t| to.extend_from_slice(&from[(t * b + e) * width..][..width]));
         }
     };
-    debug_assert_eq!(w.online.q.len(), slots * b * m);
-    reorder(w.online.q.as_slice(), slots, &mut out.q);
-    reorder(w.total.as_slice(), slots - 1, &mut out.q_tot);
-    reorder(w.td_target.as_slice(), slots - 1, &mut out.target);
+    debug_assert_eq!(ws.online.q.len(), slots * b * m);
+    reorder(ws.online.q.as_slice(), slots, &mut out.q);
+    reorder(ws.total.as_slice(), slots - 1, &mut out.q_tot);
+    reorder(ws.td_target.as_slice(), slots - 1, &mut out.target);
 }

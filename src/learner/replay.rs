@@ -41,7 +41,7 @@ pub(super) struct ReplayArrays {
     pub aoi: Vec<u16>,
     pub actions: Vec<u8>,
     pub reward: Vec<f32>,
-    pub token: Vec<f32>,
+    pub identity_token: Vec<f32>,
 }
 
 impl EpisodeShape {
@@ -58,8 +58,8 @@ impl EpisodeShape {
     /// Values per episode of each array of [`ReplayArrays`], in its order.
     fn widths(&self) -> [usize; 6] {
         let (m, n, k) = (self.uavs, self.users, self.slots);
-        let moments = if self.users_move { k + 1 } else { 1 };
-        [(k + 1) * m * 2, moments * n * 2, (k + 1) * n, k * m, k, m * crate::policy::TOKEN]
+        let position_slots = if self.users_move { k + 1 } else { 1 };
+        [(k + 1) * m * 2, position_slots * n * 2, (k + 1) * n, k * m, k, m * crate::policy::TOKEN]
     }
 
     /// An empty batch of this shape.
@@ -77,7 +77,7 @@ impl Replay {
 
     /// A replay with this content; `None` if the sizes contradict each other.
     pub(super) fn from_parts(shape: EpisodeShape, capacity: usize, next: usize, arrays: ReplayArrays) -> Option<Self> {
-        let [uavs, users, aoi, actions, reward, token] = shape.widths();
+        let [uavs, users, aoi, actions, reward, identity_token] = shape.widths();
         let len = arrays.reward.len() / reward.max(1);
         let fits = [
             arrays.uav_xy.len() == len * uavs,
@@ -85,7 +85,7 @@ impl Replay {
             arrays.aoi.len() == len * aoi,
             arrays.actions.len() == len * actions,
             arrays.reward.len() == len * reward,
-            arrays.token.len() == len * token,
+            arrays.identity_token.len() == len * identity_token,
             len <= capacity,
             next == if len < capacity { len } else { next.min(capacity - 1) },
         ];
@@ -116,7 +116,11 @@ impl Replay {
     /// Bytes held.
     pub fn bytes(&self) -> usize {
         let d = &self.arrays;
-        4 * (d.uav_xy.capacity() + d.user_xy.capacity() + d.reward.capacity() + d.token.capacity() + self.order.capacity())
+        4 * (d.uav_xy.capacity()
+            + d.user_xy.capacity()
+            + d.reward.capacity()
+            + d.identity_token.capacity()
+            + self.order.capacity())
             + 2 * d.aoi.capacity()
             + d.actions.capacity()
     }
@@ -127,7 +131,7 @@ impl Replay {
     /// If the episodes have another shape.
     pub fn push(&mut self, batch: &Episodes) {
         assert_eq!(EpisodeShape::of(batch), self.shape, "all episodes of a replay have one shape");
-        let [uavs, users, aoi, actions, reward, token] = self.shape.widths();
+        let [uavs, users, aoi, actions, reward, identity_token] = self.shape.widths();
         for b in 0..batch.len {
             let at = self.next;
             put(&mut self.arrays.uav_xy, at, &batch.uav_xy[b * uavs..][..uavs], |x| x);
@@ -135,7 +139,7 @@ impl Replay {
             put(&mut self.arrays.aoi, at, &batch.aoi[b * aoi..][..aoi], |x| x as u16);
             put(&mut self.arrays.actions, at, &batch.actions[b * actions..][..actions], |x| x);
             put(&mut self.arrays.reward, at, &batch.reward[b * reward..][..reward], |x| x);
-            put(&mut self.arrays.token, at, &batch.token[b * token..][..token], |x| x);
+            put(&mut self.arrays.identity_token, at, &batch.identity_token[b * identity_token..][..identity_token], |x| x);
             if self.len < self.capacity {
                 self.order.push(self.len as u32);
                 self.len += 1;
@@ -153,7 +157,7 @@ impl Replay {
         let shape = self.shape;
         (batch.uavs, batch.users, batch.slots, batch.users_move) = (shape.uavs, shape.users, shape.slots, shape.users_move);
         batch.len = count;
-        for array in [&mut batch.uav_xy, &mut batch.user_xy, &mut batch.aoi, &mut batch.reward, &mut batch.token] {
+        for array in [&mut batch.uav_xy, &mut batch.user_xy, &mut batch.aoi, &mut batch.reward, &mut batch.identity_token] {
             array.clear();
         }
         batch.actions.clear();
@@ -164,7 +168,7 @@ impl Replay {
             self.order.swap(i, j);
             swaps.push(j);
         }
-        let [uavs, users, aoi, actions, reward, token] = shape.widths();
+        let [uavs, users, aoi, actions, reward, identity_token] = shape.widths();
         for &e in &self.order[..count] {
             let (e, arrays) = (e as usize, &self.arrays);
             batch.uav_xy.extend_from_slice(&arrays.uav_xy[e * uavs..][..uavs]);
@@ -172,7 +176,7 @@ impl Replay {
             batch.aoi.extend(arrays.aoi[e * aoi..][..aoi].iter().map(|&a| f32::from(a)));
             batch.actions.extend_from_slice(&arrays.actions[e * actions..][..actions]);
             batch.reward.extend_from_slice(&arrays.reward[e * reward..][..reward]);
-            batch.token.extend_from_slice(&arrays.token[e * token..][..token]);
+            batch.identity_token.extend_from_slice(&arrays.identity_token[e * identity_token..][..identity_token]);
         }
         for (i, j) in swaps.into_iter().enumerate().rev() {
             self.order.swap(i, j);
@@ -201,7 +205,7 @@ mod tests {
 
     /// Episodes in which every value is the number of the episode.
     fn numbered(shape: EpisodeShape, numbers: std::ops::Range<usize>) -> Episodes {
-        let [uavs, users, aoi, actions, reward, token] = shape.widths();
+        let [uavs, users, aoi, actions, reward, identity_token] = shape.widths();
         let fill = |width: usize| -> Vec<f32> { numbers.clone().flat_map(|e| vec![e as f32; width]).collect() };
         Episodes {
             len: numbers.len(),
@@ -210,7 +214,7 @@ mod tests {
             aoi: fill(aoi),
             actions: fill(actions).into_iter().map(|x| x as u8).collect(),
             reward: fill(reward),
-            token: fill(token),
+            identity_token: fill(identity_token),
             ..shape.episodes()
         }
     }
@@ -249,7 +253,7 @@ mod tests {
                 joined.aoi.extend(e.aoi);
                 joined.actions.extend(e.actions);
                 joined.reward.extend(e.reward);
-                joined.token.extend(e.token);
+                joined.identity_token.extend(e.identity_token);
             }
             assert_eq!(batch, joined);
         }

@@ -21,18 +21,18 @@ use super::{Episodes, TrainConfig};
 use crate::env::BatchEnv;
 use crate::invalid::Invalid;
 use crate::nn::argmax;
-use crate::policy::{Actor, Agent, StepInput, TOKEN};
+use crate::policy::{Agent, BatchedAgent, StepInput, TOKEN};
 use crate::rng;
 
-/// The environments and the actor of a training run, and the last collected episodes.
+/// The environments and the agents of a training run, and the last collected episodes.
 #[derive(Debug)]
 pub struct Rollout {
     seed: u64,
     env: BatchEnv,
-    actor: Actor,
+    batched_agent: BatchedAgent,
     episodes: Episodes,
     seeds: Vec<u64>,
-    explorers: Vec<ChaCha8Rng>,
+    exploration_rngs: Vec<ChaCha8Rng>,
     actions: Vec<u8>,
     /// With shaping: per user reward_scale / (1 - gamma) * w_i / N.
     shaping_factors: Option<Vec<f64>>,
@@ -48,27 +48,27 @@ impl Rollout {
         let (m, n, k) = (environment.uavs, environment.users, environment.slots);
         let env = BatchEnv::new(environment, fleets)?;
         let shape = EpisodeShape::of_environment(environment);
-        let moments = if shape.users_move { k + 1 } else { 1 };
+        let position_slots = if shape.users_move { k + 1 } else { 1 };
         let episodes = Episodes {
             len: fleets,
             uav_xy: vec![0.0; fleets * (k + 1) * m * 2],
-            user_xy: vec![0.0; fleets * moments * n * 2],
+            user_xy: vec![0.0; fleets * position_slots * n * 2],
             aoi: vec![0.0; fleets * (k + 1) * n],
             actions: vec![0; fleets * k * m],
             reward: vec![0.0; fleets * k],
-            token: vec![0.0; fleets * m * TOKEN],
+            identity_token: vec![0.0; fleets * m * TOKEN],
             ..shape.episodes()
         };
         Ok(Self {
             seed: config.seed,
             env,
-            actor: Actor::new(agent, fleets),
+            batched_agent: BatchedAgent::new(agent, fleets),
             episodes,
             seeds: Vec::with_capacity(fleets),
-            explorers: Vec::with_capacity(fleets),
+            exploration_rngs: Vec::with_capacity(fleets),
             actions: vec![0; fleets * m],
             shaping_factors: config.training.shaping.then(|| {
-                let factor = environment.reward_factor() / (1.0 - config.training.gamma) / n as f64;
+                let factor = environment.effective_reward_scale() / (1.0 - config.training.gamma) / n as f64;
                 environment.user_weights().iter().map(|w| w * factor).collect()
             }),
         })
@@ -79,27 +79,26 @@ impl Rollout {
         let numbers = first..first + self.env.copies() as u64;
         self.seeds.clear();
         self.seeds.extend(numbers.clone().map(|e| rng::training_episode_seed(self.seed, e)));
-        self.explorers.clear();
-        self.explorers.extend(numbers.map(|e| rng::stream(self.seed, "explore", e)));
-        let tokens = self.episodes.token.chunks_exact_mut(self.env.config().uavs * TOKEN);
-        for (token, &seed) in tokens.zip(&self.seeds) {
+        self.exploration_rngs.clear();
+        self.exploration_rngs.extend(numbers.map(|e| rng::stream(self.seed, "explore", e)));
+        let tokens = self.episodes.identity_token.chunks_exact_mut(self.env.config().uavs * TOKEN);
+        for (identity_token, &seed) in tokens.zip(&self.seeds) {
             let mut rng = rng::stream(seed, "token", 0);
-            token.fill_with(|| rng.random_range(-1.0..=1.0));
+            identity_token.fill_with(|| rng.random_range(-1.0..=1.0));
         }
         self.env.reset(&self.seeds);
-        self.actor.begin(agent, parameters, &self.episodes.token);
-        let headings = self.env.config().headings();
+        self.batched_agent.begin(agent, parameters, &self.episodes.identity_token);
+        let actions = self.env.config().actions();
         let uavs = self.env.config().uavs;
         self.record_scene();
         while !self.env.done() {
             let input = StepInput { uav_xy: self.env.uav_xy(), user_xy: self.env.user_xy(), aoi: self.env.aoi() };
-            let q = self.actor.step(agent, input);
-            for (i, (action, q)) in self.actions.iter_mut().zip(q.chunks_exact(headings)).enumerate() {
-                let explorer = &mut self.explorers[i / uavs];
-                *action =
-                    if explorer.random::<f64>() < epsilon { explorer.random_range(0..headings as u8) } else { argmax(q) as u8 };
+            let q = self.batched_agent.step(agent, input);
+            for (i, (action, q)) in self.actions.iter_mut().zip(q.chunks_exact(actions)).enumerate() {
+                let rng = &mut self.exploration_rngs[i / uavs];
+                *action = if rng.random::<f64>() < epsilon { rng.random_range(0..actions as u8) } else { argmax(q) as u8 };
             }
-            self.actor.record_actions(&self.actions);
+            self.batched_agent.record_actions(&self.actions);
             self.env.step(&self.actions);
             self.record_step();
             self.record_scene();
@@ -191,7 +190,7 @@ mod tests {
                     }
                 }
             }
-            assert!(e.token.iter().all(|t| (-1.0..=1.0).contains(t)));
+            assert!(e.identity_token.iter().all(|t| (-1.0..=1.0).contains(t)));
         }
     }
 
@@ -230,7 +229,7 @@ mod tests {
         let (eight, three) = (collect_episodes(&config(8, 0.0), 1.0, 0), collect_episodes(&config(3, 0.0), 1.0, 4));
         let width = eight.slots * eight.uavs;
         assert_eq!(eight.actions[4 * width..7 * width], three.actions);
-        assert_eq!(eight.token[4 * 12..7 * 12], three.token);
+        assert_eq!(eight.identity_token[4 * 12..7 * 12], three.identity_token);
     }
 
     #[test]

@@ -56,7 +56,8 @@ pub(super) struct Snapshot {
 #[serde(deny_unknown_fields)]
 struct Head {
     config: TrainConfig,
-    progress: Counters,
+    #[serde(rename = "progress")]
+    counters: Counters,
     latest: Option<Evaluation>,
     best: Option<Evaluation>,
     adam_steps: u64,
@@ -66,7 +67,7 @@ struct Head {
 pub(super) fn encode(config: &TrainConfig, run: &RunState, learner: &LearnerState, replay: &Replay) -> Vec<u8> {
     let head = Head {
         config: config.clone(),
-        progress: run.counters,
+        counters: run.counters,
         latest: run.latest,
         best: run.best.as_ref().map(|(evaluation, _)| *evaluation),
         adam_steps: learner.adam_steps,
@@ -76,12 +77,12 @@ pub(super) fn encode(config: &TrainConfig, run: &RunState, learner: &LearnerStat
     bytes.extend(MAGIC);
     bytes.extend(VERSION.to_le_bytes());
     push_section(&mut bytes, &serde_json::to_vec(&head).expect("plain data with string keys"));
-    let best = run.best.as_ref().map_or(&[][..], |(_, weights)| weights);
+    let best = run.best.as_ref().map_or(&[][..], |(_, parameters)| parameters);
     for array in [&learner.online, &learner.target, &learner.adam_m, &learner.adam_v, &learner.average, best] {
         push_floats(&mut bytes, array);
     }
     let arrays = replay.arrays();
-    for array in [&arrays.uav_xy, &arrays.user_xy, &arrays.reward, &arrays.token] {
+    for array in [&arrays.uav_xy, &arrays.user_xy, &arrays.reward, &arrays.identity_token] {
         push_floats(&mut bytes, array);
     }
     let aoi: Vec<u8> = arrays.aoi.iter().flat_map(|a| a.to_le_bytes()).collect();
@@ -115,15 +116,16 @@ pub(super) fn decode(bytes: &[u8]) -> Result<Snapshot, SnapshotError> {
         average: sections.floats()?,
         adam_steps: head.adam_steps,
     };
-    let weights = sections.floats()?;
-    let expected = checkpoint::layout(&head.config).len();
-    if head.best.is_some() && weights.len() != expected {
-        return Err(inconsistent(format!("{} best weights; expected {expected}", weights.len())));
+    let parameters = sections.floats()?;
+    let expected = checkpoint::parameter_layout(&head.config).len();
+    if head.best.is_some() && parameters.len() != expected {
+        return Err(inconsistent(format!("{} best parameters; expected {expected}", parameters.len())));
     }
-    let (uav_xy, user_xy, reward, token) = (sections.floats()?, sections.floats()?, sections.floats()?, sections.floats()?);
+    let (uav_xy, user_xy, reward, identity_token) =
+        (sections.floats()?, sections.floats()?, sections.floats()?, sections.floats()?);
     let aoi = sections.take()?.chunks_exact(2).map(|a| u16::from_le_bytes([a[0], a[1]])).collect();
-    let arrays = ReplayArrays { uav_xy, user_xy, aoi, actions: sections.take()?.to_vec(), reward, token };
-    if arrays.actions.iter().any(|&a| usize::from(a) >= head.config.environment.headings()) {
+    let arrays = ReplayArrays { uav_xy, user_xy, aoi, actions: sections.take()?.to_vec(), reward, identity_token };
+    if arrays.actions.iter().any(|&a| usize::from(a) >= head.config.environment.actions()) {
         return Err(inconsistent("an action is out of range"));
     }
     if !sections.0.is_empty() {
@@ -132,10 +134,10 @@ pub(super) fn decode(bytes: &[u8]) -> Result<Snapshot, SnapshotError> {
     let shape = EpisodeShape::of_environment(&head.config.environment);
     let replay = Replay::from_parts(shape, head.config.training.buffer, head.replay_next, arrays)
         .ok_or_else(|| inconsistent("the replay does not have the size of the configuration"))?;
-    if !head.progress.is_consistent(&head.config, replay.len()) {
+    if !head.counters.is_consistent(&head.config, replay.len()) {
         return Err(inconsistent("the counters contradict each other"));
     }
-    let run = RunState { counters: head.progress, latest: head.latest, best: head.best.map(|e| (e, weights)) };
+    let run = RunState { counters: head.counters, latest: head.latest, best: head.best.map(|e| (e, parameters)) };
     Ok(Snapshot { config: head.config, run, learner, replay })
 }
 

@@ -10,8 +10,12 @@ use super::{Evaluation, TrainConfig};
 pub(super) enum Phase {
     Evaluate,
     Iterate,
-    Finish,
-    Finished,
+    /// Yields [`super::Event::Finished`].
+    #[serde(rename = "finish")]
+    YieldFinished,
+    /// Yields no more events.
+    #[serde(rename = "finished")]
+    Done,
 }
 
 /// Counters of a run, and the phase that comes next.
@@ -20,13 +24,15 @@ pub(super) enum Phase {
 pub(super) struct Counters {
     pub phase: Phase,
     /// Environment steps made.
-    pub step: u64,
+    #[serde(rename = "step")]
+    pub env_steps: u64,
     /// Episodes collected.
     pub episodes: u64,
     /// Updates made.
     pub updates: u64,
     /// `episodes` when the target networks were last copied.
-    pub copied: u64,
+    #[serde(rename = "copied")]
+    pub targets_copied_at_episode: u64,
     /// Environment step of the next evaluation.
     pub next_evaluation: u64,
 }
@@ -37,7 +43,7 @@ pub(super) struct RunState {
     pub counters: Counters,
     /// The last evaluation.
     pub latest: Option<Evaluation>,
-    /// The evaluation with the lowest mean AoI, and the weights that reached it.
+    /// The evaluation with the lowest mean AoI, and the parameters that reached it.
     pub best: Option<(Evaluation, Vec<f32>)>,
 }
 
@@ -45,11 +51,11 @@ impl Counters {
     /// Whether a run of this configuration can reach these counters with `held` episodes in replay.
     pub(super) fn is_consistent(&self, config: &TrainConfig, held: usize) -> bool {
         let t = &config.training;
-        self.episodes.checked_mul(config.environment.slots as u64) == Some(self.step)
-            && self.step < t.steps + (t.envs * config.environment.slots) as u64
-            && self.copied <= self.episodes
+        self.episodes.checked_mul(config.environment.slots as u64) == Some(self.env_steps)
+            && self.env_steps < t.steps + (t.envs * config.environment.slots) as u64
+            && self.targets_copied_at_episode <= self.episodes
             && self.updates <= self.episodes.saturating_mul(t.updates_per_iteration as u64)
-            && self.next_evaluation <= (self.step / t.eval_every + 1) * t.eval_every
+            && self.next_evaluation <= (self.env_steps / t.eval_every + 1) * t.eval_every
             && held as u64 == self.episodes.min(t.buffer as u64)
     }
 }
@@ -57,7 +63,14 @@ impl Counters {
 impl RunState {
     /// A run that has not begun.
     pub(super) fn new() -> Self {
-        let counters = Counters { phase: Phase::Evaluate, step: 0, episodes: 0, updates: 0, copied: 0, next_evaluation: 0 };
+        let counters = Counters {
+            phase: Phase::Evaluate,
+            env_steps: 0,
+            episodes: 0,
+            updates: 0,
+            targets_copied_at_episode: 0,
+            next_evaluation: 0,
+        };
         Self { counters, latest: None, best: None }
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! An iteration collects `envs` episodes, makes its updates, and copies the target networks when due. The greedy policy is evaluated
 //! at step 0, every `eval_every` steps and at the end, on `valid-v1`; training never uses `eval-v1`. (configuration, seed) fixes
-//! every event and weight, whatever the number of threads. A run restored from a snapshot yields the same events and weights as a
+//! every event and parameter, whatever the number of threads. A run restored from a snapshot yields the same events and parameters as a
 //! run without interruption.
 
 use std::sync::Arc;
@@ -84,98 +84,103 @@ impl Trainer {
     }
 
     /// Environment steps made.
-    pub fn step(&self) -> u64 {
-        self.run.counters.step
+    pub fn env_steps(&self) -> u64 {
+        self.run.counters.env_steps
     }
 
     /// Whether the run has ended: all steps are made, or training diverged.
     pub fn finished(&self) -> bool {
-        self.run.counters.phase == Phase::Finished
+        self.run.counters.phase == Phase::Done
     }
 
-    /// The current weights, with metrics if they were just evaluated.
+    /// The current parameters, with metrics if they were just evaluated.
     ///
     /// # Errors
     /// [`checkpoint::Error::Value`] if training diverged.
     pub fn checkpoint(&self) -> Result<Checkpoint, checkpoint::Error> {
-        let latest = self.run.latest.filter(|e| e.step == self.run.counters.step);
-        let weights = self.learner.published().to_vec();
-        Checkpoint::new(self.config.clone(), self.run.counters.step, latest.map(|e| e.metrics), weights)
+        let latest = self.run.latest.filter(|e| e.env_steps == self.run.counters.env_steps);
+        let parameters = self.learner.published_parameters().to_vec();
+        Checkpoint::new(self.config.clone(), self.run.counters.env_steps, latest.map(|e| e.metrics), parameters)
     }
 
-    /// The weights with the lowest mean AoI on the validation layouts so far; `None` before the first evaluation.
+    /// The parameters with the lowest mean AoI on the validation layouts so far; `None` before the first evaluation.
     ///
     /// # Errors
     /// [`checkpoint::Error::Value`] if training diverged.
     pub fn best(&self) -> Result<Option<Checkpoint>, checkpoint::Error> {
         let best = self.run.best.as_ref();
-        best.map(|(e, weights)| Checkpoint::new(self.config.clone(), e.step, Some(e.metrics), weights.clone())).transpose()
+        best.map(|(e, parameters)| Checkpoint::new(self.config.clone(), e.env_steps, Some(e.metrics), parameters.clone()))
+            .transpose()
     }
 
-    /// The evaluation of the best weights.
+    /// The evaluation of the best parameters.
     pub fn best_evaluation(&self) -> Option<Evaluation> {
         self.run.best.as_ref().map(|(e, _)| *e)
     }
 
     fn evaluate(&mut self) -> Event {
         let t = &self.config.training;
-        let weights = self.learner.published()[..self.learner.agent().layout().len()].to_vec();
-        let policy = LearnedPolicy::new(self.config.agent(), self.config.dims(), weights)
-            .expect("the weights have the length of the agent's layout");
+        let parameters = self.learner.published_parameters()[..self.learner.agent().layout().len()].to_vec();
+        let policy = LearnedPolicy::new(self.config.agent(), self.config.dims(), parameters)
+            .expect("the parameters have the length of the agent's layout");
         let seeds = layout_list("valid-v1").expect("valid-v1 exists").seeds(t.eval_episodes);
         let metrics = evaluate(&policy, &self.config.environment, &seeds, self.threads).expect("an agent fits its environment");
-        let now = Evaluation { step: self.run.counters.step, metrics: EpisodeMetrics::mean(&metrics) };
+        let now = Evaluation { env_steps: self.run.counters.env_steps, metrics: EpisodeMetrics::mean(&metrics) };
         self.run.latest = Some(now);
         if self.run.best.as_ref().is_none_or(|(best, _)| now.metrics.mean_aoi < best.metrics.mean_aoi) {
-            self.run.best = Some((now, self.learner.published().to_vec()));
+            self.run.best = Some((now, self.learner.published_parameters().to_vec()));
         }
-        let p = &mut self.run.counters;
-        p.next_evaluation = (p.step / t.eval_every + 1) * t.eval_every;
-        p.phase = if p.step >= t.steps { Phase::Finish } else { Phase::Iterate };
+        let counters = &mut self.run.counters;
+        counters.next_evaluation = (counters.env_steps / t.eval_every + 1) * t.eval_every;
+        counters.phase = if counters.env_steps >= t.steps { Phase::YieldFinished } else { Phase::Iterate };
         Event::Evaluation(now)
     }
 
     fn iterate(&mut self) -> Event {
         let t = &self.config.training;
-        let p = &mut self.run.counters;
-        let epsilon = epsilon(t, p.step);
-        let learning_rate = learning_rate(t, p.step);
-        let episodes = self.rollout.collect(self.learner.agent(), self.learner.agent_parameters(), epsilon, p.episodes);
-        p.step += (episodes.len * episodes.slots) as u64;
-        p.episodes += episodes.len as u64;
+        let counters = &mut self.run.counters;
+        let epsilon = epsilon(t, counters.env_steps);
+        let learning_rate = learning_rate(t, counters.env_steps);
+        let episodes = self.rollout.collect(self.learner.agent(), self.learner.agent_parameters(), epsilon, counters.episodes);
+        counters.env_steps += (episodes.len * episodes.slots) as u64;
+        counters.episodes += episodes.len as u64;
         self.replay.push(episodes);
         let (mut loss, mut grad_norm, mut q_tot) = (0.0, 0.0, 0.0);
         let learning = self.replay.len() >= t.batch;
         if learning {
             for _ in 0..t.updates_per_iteration {
-                let mut draw = rng::stream(self.config.seed, "replay", p.updates);
+                let mut draw = rng::stream(self.config.seed, "replay", counters.updates);
                 self.replay.sample(t.batch, &mut draw, &mut self.batch);
                 if t.augment {
                     let symmetries: Vec<_> =
-                        (0..t.batch).map(|_| Symmetry::number(draw.random_range(0..Symmetry::COUNT))).collect();
+                        (0..t.batch).map(|_| Symmetry::from_index(draw.random_range(0..Symmetry::COUNT))).collect();
                     self.batch.transform(&symmetries);
                 }
                 let update = self.learner.update(&self.batch, learning_rate);
                 loss += update.loss;
                 grad_norm += update.grad_norm;
                 q_tot += update.q_tot;
-                p.updates += 1;
+                counters.updates += 1;
             }
-            if t.target_tau == 0.0 && p.episodes - p.copied >= t.target_every {
+            if t.target_tau == 0.0 && counters.episodes - counters.targets_copied_at_episode >= t.target_every {
                 self.learner.sync_targets();
-                p.copied = p.episodes;
+                counters.targets_copied_at_episode = counters.episodes;
             }
         }
-        if self.learner.parameters().iter().any(|x| x.is_nan() || x.abs() > checkpoint::LARGEST) {
-            p.phase = Phase::Finished;
-            return Event::Diverged { step: p.step };
+        if self.learner.parameters().iter().any(|x| x.is_nan() || x.abs() > checkpoint::MAX_MAGNITUDE) {
+            counters.phase = Phase::Done;
+            return Event::Diverged { env_steps: counters.env_steps };
         }
         let mean = |sum: f64| learning.then(|| sum / t.updates_per_iteration as f64);
-        p.phase = if p.step >= t.steps || p.step >= p.next_evaluation { Phase::Evaluate } else { Phase::Iterate };
+        counters.phase = if counters.env_steps >= t.steps || counters.env_steps >= counters.next_evaluation {
+            Phase::Evaluate
+        } else {
+            Phase::Iterate
+        };
         Event::Iteration(Iteration {
-            step: p.step,
-            episodes: p.episodes,
-            updates: p.updates,
+            env_steps: counters.env_steps,
+            episodes: counters.episodes,
+            updates: counters.updates,
             epsilon,
             mean_aoi: self.rollout.mean_aoi(),
             loss: mean(loss),
@@ -195,27 +200,27 @@ impl Iterator for Trainer {
         Some(match self.run.counters.phase {
             Phase::Evaluate => self.evaluate(),
             Phase::Iterate => self.iterate(),
-            Phase::Finish => {
-                self.run.counters.phase = Phase::Finished;
-                Event::Finished { step: self.run.counters.step }
+            Phase::YieldFinished => {
+                self.run.counters.phase = Phase::Done;
+                Event::Finished { env_steps: self.run.counters.env_steps }
             }
-            Phase::Finished => return None,
+            Phase::Done => return None,
         })
     }
 }
 
-/// The learning rate at an environment step. It falls linearly to `learning_rate_decay` of its start value.
-fn learning_rate(t: &Training, step: u64) -> f64 {
-    let done = (step as f64 / t.steps as f64).min(1.0);
+/// The learning rate after `env_steps` environment steps. It falls linearly to `learning_rate_decay` of its start value.
+fn learning_rate(t: &Training, env_steps: u64) -> f64 {
+    let done = (env_steps as f64 / t.steps as f64).min(1.0);
     t.learning_rate * (1.0 - (1.0 - t.learning_rate_decay) * done)
 }
 
-/// Epsilon at an environment step. It falls linearly from 1 to `epsilon_end`, then is constant.
-fn epsilon(t: &Training, step: u64) -> f64 {
-    if step >= t.epsilon_anneal {
+/// Epsilon after `env_steps` environment steps. It falls linearly from 1 to `epsilon_end`, then is constant.
+fn epsilon(t: &Training, env_steps: u64) -> f64 {
+    if env_steps >= t.epsilon_anneal {
         return t.epsilon_end;
     }
-    1.0 - (1.0 - t.epsilon_end) * step as f64 / t.epsilon_anneal as f64
+    1.0 - (1.0 - t.epsilon_end) * env_steps as f64 / t.epsilon_anneal as f64
 }
 
 #[cfg(test)]
@@ -235,7 +240,7 @@ mod tests {
         let mut state = trainer.learner.state();
         state.online.fill(1e30);
         trainer.learner.restore(state).unwrap();
-        assert_eq!(trainer.next(), Some(Event::Diverged { step: 40 }));
+        assert_eq!(trainer.next(), Some(Event::Diverged { env_steps: 40 }));
         assert!(trainer.finished() && trainer.next().is_none());
         assert!(trainer.checkpoint().is_err());
         assert_eq!(trainer.best().unwrap(), Some(best));

@@ -10,7 +10,7 @@ use crate::policy::Agent;
 use crate::rng;
 use crate::train_config::TrainConfig;
 
-/// The state of a learner in a snapshot. Vectors have the length of [`Learner::layout`].
+/// The state of a learner in a snapshot. Vectors have the length of [`Learner::parameter_layout`].
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LearnerState {
     /// Parameters of the online networks.
@@ -34,11 +34,18 @@ pub struct Learner {
     online: Vec<f32>,
     target: Vec<f32>,
     adam: Adam<f32>,
-    /// Averaged parameters and the number of updates they average over; empty without averaging.
-    average: (Vec<f32>, u64),
+    average: Option<AveragedParameters>,
     clip: f64,
     tau: f32,
     pool: ThreadPool,
+}
+
+/// An exponential moving average of the online parameters.
+#[derive(Debug)]
+struct AveragedParameters {
+    parameters: Vec<f32>,
+    /// Number of updates that the average covers.
+    updates: u64,
 }
 
 impl Learner {
@@ -65,7 +72,7 @@ impl Learner {
             target: online.clone(),
             adam: Adam::new(online.len()),
             loss,
-            average: if training.average > 1 { (online.clone(), training.average) } else { (Vec::new(), 0) },
+            average: (training.average > 1).then(|| AveragedParameters { parameters: online.clone(), updates: training.average }),
             online,
             tau: training.target_tau as f32,
             clip: training.clip,
@@ -79,15 +86,15 @@ impl Learner {
     /// If the sizes of the episodes are not those of the configuration, or there are no episodes.
     pub fn update(&mut self, episodes: &Episodes, learning_rate: f64) -> LossMetrics {
         let Self { loss, online, target, adam, pool, .. } = self;
-        let metrics = pool.install(|| loss.evaluate(online, target, episodes, None));
+        let metrics = pool.install(|| loss.compute_gradient(online, target, episodes, None));
         adam.step(online, loss.gradient(), learning_rate, (metrics.grad_norm, self.clip));
         if self.tau > 0.0 {
             blend(&mut self.target, &self.online, self.tau);
         }
-        if self.average.1 > 0 {
+        if let Some(average) = &mut self.average {
             // The first averages are over the updates so far, and exclude the initial parameters.
-            let seen = self.adam.steps.min(self.average.1);
-            blend(&mut self.average.0, &self.online, 1.0 / seen as f32);
+            let updates = self.adam.steps.min(average.updates);
+            blend(&mut average.parameters, &self.online, 1.0 / updates as f32);
         }
         metrics
     }
@@ -103,7 +110,7 @@ impl Learner {
     }
 
     /// Names, shapes and ranges of the flat vectors: `agent.*`, then `mixer.*`.
-    pub fn layout(&self) -> &ParameterLayout {
+    pub fn parameter_layout(&self) -> &ParameterLayout {
         self.loss.layout()
     }
 
@@ -113,8 +120,8 @@ impl Learner {
     }
 
     /// The parameters that are evaluated and published: the averaged ones, or those of the online networks without averaging.
-    pub fn published(&self) -> &[f32] {
-        if self.average.1 > 0 { &self.average.0 } else { &self.online }
+    pub fn published_parameters(&self) -> &[f32] {
+        self.average.as_ref().map_or(&self.online, |average| &average.parameters)
     }
 
     /// The agents' parameters: the first part of [`Learner::parameters`].
@@ -130,7 +137,7 @@ impl Learner {
             adam_m: self.adam.m.clone(),
             adam_v: self.adam.v.clone(),
             adam_steps: self.adam.steps,
-            average: self.average.0.clone(),
+            average: self.average.as_ref().map_or_else(Vec::new, |average| average.parameters.clone()),
         }
     }
 
@@ -146,14 +153,13 @@ impl Learner {
                 return Err(Invalid::new(name, format!("{} numbers", part.len()), format!("{len} numbers")));
             }
         }
-        if state.average.len() != self.average.0.len() {
-            return Err(Invalid::new(
-                "average",
-                format!("{} numbers", state.average.len()),
-                format!("{} numbers", self.average.0.len()),
-            ));
+        let averaged = if self.average.is_some() { len } else { 0 };
+        if state.average.len() != averaged {
+            return Err(Invalid::new("average", format!("{} numbers", state.average.len()), format!("{averaged} numbers")));
         }
-        self.average.0 = state.average;
+        if let Some(average) = &mut self.average {
+            average.parameters = state.average;
+        }
         self.online = state.online;
         self.target = state.target;
         self.adam = Adam { m: state.adam_m, v: state.adam_v, steps: state.adam_steps };
@@ -161,7 +167,7 @@ impl Learner {
     }
 }
 
-/// Moves `to` towards `from` by `share` of the difference.
-fn blend(to: &mut [f32], from: &[f32], share: f32) {
-    to.iter_mut().zip(from).for_each(|(t, f)| *t += share * (f - *t));
+/// Moves `to` towards `from` by the fraction `tau` of the difference.
+fn blend(to: &mut [f32], from: &[f32], tau: f32) {
+    to.iter_mut().zip(from).for_each(|(t, f)| *t += tau * (f - *t));
 }

@@ -1,5 +1,5 @@
-//! Activations of many samples. The storage is nalgebra's, which is column-major: one column per sample, so that a sample is
-//! contiguous. ARCHITECTURE.md says why products are not nalgebra's.
+//! Activations of many samples. A row is one sample, and the numbers of a row are contiguous. ARCHITECTURE.md says why products are
+//! not computed by nalgebra.
 
 use std::ops::Range;
 
@@ -8,9 +8,12 @@ use nalgebra::DMatrix;
 use super::real::Real;
 use super::simd::simd;
 
-/// Activations: `width` numbers for each of `len` samples. Resizing keeps the allocation.
+/// Activations: `len` rows of `width` numbers. Resizing keeps the allocation.
 #[derive(Clone, Debug)]
-pub struct Batch<T: Real>(DMatrix<T>);
+pub struct Batch<T: Real>(
+    // nalgebra stores matrices by column, so a row of the batch is a column of the matrix.
+    DMatrix<T>,
+);
 
 impl<T: Real> Default for Batch<T> {
     fn default() -> Self {
@@ -18,30 +21,30 @@ impl<T: Real> Default for Batch<T> {
     }
 }
 
-/// A view of samples: sample i starts at `data[i * stride]`. The width is known from the context.
+/// A view of rows: row i starts at `data[i * stride]`. The width is known from the context.
 #[derive(Clone, Copy, Debug)]
 pub struct Rows<'a, T> {
-    /// From the first number of the first sample on.
+    /// From the first number of the first row on.
     pub data: &'a [T],
-    /// Distance between the starts of samples.
+    /// Distance between the starts of rows.
     pub stride: usize,
-    /// Number of samples.
+    /// Number of rows.
     pub len: usize,
 }
 
-/// A mutable view of samples.
+/// A mutable view of rows.
 #[derive(Debug)]
 pub struct RowsMut<'a, T> {
-    /// From the first number of the first sample on.
+    /// From the first number of the first row on.
     pub data: &'a mut [T],
-    /// Distance between the starts of samples.
+    /// Distance between the starts of rows.
     pub stride: usize,
-    /// Number of samples.
+    /// Number of rows.
     pub len: usize,
 }
 
 impl<T> Rows<'_, T> {
-    /// The same samples without their first `from` numbers.
+    /// The same rows without their first `from` numbers.
     #[must_use]
     pub fn from_column(self, from: usize) -> Self {
         Self { data: &self.data[from.min(self.data.len())..], ..self }
@@ -49,8 +52,8 @@ impl<T> Rows<'_, T> {
 }
 
 impl<T: Real> Batch<T> {
-    /// Changes the shape. The content is unspecified afterwards.
-    pub fn reset(&mut self, width: usize, len: usize) {
+    /// Changes the shape. Afterwards the numbers are arbitrary: the caller overwrites them.
+    pub fn resize(&mut self, width: usize, len: usize) {
         if (self.0.nrows(), self.0.ncols()) != (width, len) {
             let mut data: Vec<T> = std::mem::take(self).0.data.into();
             data.resize(width * len, T::ZERO);
@@ -59,17 +62,17 @@ impl<T: Real> Batch<T> {
     }
 
     /// Changes the shape and sets all numbers to 0.
-    pub fn reset_zero(&mut self, width: usize, len: usize) {
-        self.reset(width, len);
+    pub fn resize_zero(&mut self, width: usize, len: usize) {
+        self.resize(width, len);
         self.as_mut_slice().fill(T::ZERO);
     }
 
-    /// Numbers per sample.
+    /// Numbers per row.
     pub fn width(&self) -> usize {
         self.0.nrows()
     }
 
-    /// Number of samples.
+    /// Number of rows.
     pub fn len(&self) -> usize {
         self.0.ncols()
     }
@@ -79,46 +82,46 @@ impl<T: Real> Batch<T> {
         self.0.is_empty()
     }
 
-    /// All numbers, sample by sample.
+    /// All numbers, row by row.
     pub fn as_slice(&self) -> &[T] {
         self.0.as_slice()
     }
 
-    /// All numbers, sample by sample.
+    /// All numbers, row by row.
     pub fn as_mut_slice(&mut self) -> &mut [T] {
         self.0.as_mut_slice()
     }
 
-    /// Sample i.
+    /// Row i.
     pub fn row(&self, i: usize) -> &[T] {
         let w = self.width();
         &self.0.as_slice()[i * w..(i + 1) * w]
     }
 
-    /// Sample i.
+    /// Row i.
     pub fn row_mut(&mut self, i: usize) -> &mut [T] {
         let w = self.width();
         &mut self.0.as_mut_slice()[i * w..(i + 1) * w]
     }
 
-    /// All samples.
+    /// All rows.
     pub fn rows(&self) -> Rows<'_, T> {
         Rows { data: self.as_slice(), stride: self.width(), len: self.len() }
     }
 
-    /// All samples.
+    /// All rows.
     pub fn rows_mut(&mut self) -> RowsMut<'_, T> {
         let (stride, len) = (self.width(), self.len());
         RowsMut { data: self.as_mut_slice(), stride, len }
     }
 
-    /// Samples `range`.
+    /// Rows `range`.
     pub fn range(&self, range: Range<usize>) -> Rows<'_, T> {
         let w = self.width();
         Rows { data: &self.as_slice()[range.start * w..range.end * w], stride: w, len: range.len() }
     }
 
-    /// Samples `range`.
+    /// Rows `range`.
     pub fn range_mut(&mut self, range: Range<usize>) -> RowsMut<'_, T> {
         let w = self.width();
         RowsMut { stride: w, len: range.len(), data: &mut self.as_mut_slice()[range.start * w..range.end * w] }

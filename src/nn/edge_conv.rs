@@ -16,7 +16,7 @@ use super::batch::{Batch, Rows, RowsMut};
 use super::graph::Graph;
 use super::layer_norm::{self, Affine, LayerNorm, Stats};
 use super::linear::Linear;
-use super::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
+use super::matmul::{InitialValue, Lhs, Out, Rhs, matmul};
 use super::params::{ParameterLayout, Weights};
 use super::real::Real;
 use super::simd::simd;
@@ -72,11 +72,11 @@ impl EdgeNet {
         }
     }
 
-    /// Writes the transposed matrices of u and v, (H, W) each, and the last layer's transposed weight.
-    pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
-        self.last.prepare(flat, transposed);
-        let (own, neighbour) = self.first.weight_grad(transposed).split_at_mut(H * W);
-        for (o, row) in self.first.weight(flat).as_chunks::<{ 2 * H }>().0.iter().enumerate() {
+    /// Writes Wa - Wb (or Wa) and Wb transposed, (H, W) each, and the last layer's transposed weight.
+    pub fn prepare<T: Real>(&self, params: &[T], prepared: &mut [T]) {
+        self.last.prepare(params, prepared);
+        let (own, neighbour) = self.first.weight_mut(prepared).split_at_mut(H * W);
+        for (o, row) in self.first.weight(params).as_chunks::<{ 2 * H }>().0.iter().enumerate() {
             for i in 0..H {
                 own[i * W + o] = if self.pairing == Pairing::Difference { row[i] - row[H + i] } else { row[i] };
                 neighbour[i * W + o] = row[H + i];
@@ -84,9 +84,9 @@ impl EdgeNet {
         }
     }
 
-    /// The matrix products of a forward pass that reads `read` nodes and computes `made`, each as (rows, k, columns).
-    pub fn products(&self, (read, made): (usize, usize)) -> [[usize; 3]; 3] {
-        [[made, H, W], [read, H, W], self.last.product(made)]
+    /// The matrix products of a forward pass that reads `inputs` nodes and computes `outputs`, each as (rows, k, columns).
+    pub fn products(&self, (inputs, outputs): (usize, usize)) -> [[usize; 3]; 3] {
+        [[outputs, H, W], [inputs, H, W], self.last.product(outputs)]
     }
 
     /// Writes x' of the first `y.len` nodes, from x of all nodes.
@@ -99,17 +99,17 @@ impl EdgeNet {
         y: RowsMut<'_, T>,
     ) {
         let nodes = y.len;
-        cache.u.reset(W, nodes);
-        cache.v.reset(W, x.len);
-        cache.a.reset(W, nodes);
+        cache.u.resize(W, nodes);
+        cache.v.resize(W, x.len);
+        cache.a.resize(W, nodes);
         cache.stats.resize(graph.offsets[nodes] as usize, [T::ZERO; 2]);
         let (own, neighbour) = self.first.weight_transposed(w).split_at(H * W);
         let lhs = Lhs::rows(x.data, x.stride);
         let out = Out { data: cache.u.as_mut_slice(), stride: W };
-        matmul((nodes, H, W), lhs, Rhs { data: own, stride: W }, out, Accumulate::Bias(self.first.bias(w)));
+        matmul((nodes, H, W), lhs, Rhs { data: own, stride: W }, out, InitialValue::Bias(self.first.bias(w)));
         let out = Out { data: cache.v.as_mut_slice(), stride: W };
-        matmul((x.len, H, W), lhs, Rhs { data: neighbour, stride: W }, out, Accumulate::Zero);
-        let affine = self.norm.affine(w.flat);
+        matmul((x.len, H, W), lhs, Rhs { data: neighbour, stride: W }, out, InitialValue::Zero);
+        let affine = self.norm.affine(w.params);
         let EdgeCache { u, v, a, stats } = cache;
         let (u, v) = (u.as_slice().as_chunks().0, v.as_slice().as_chunks().0);
         simd(
@@ -134,7 +134,7 @@ impl EdgeNet {
     /// Adds the gradients of the parameters and writes dx of all nodes read. Overwrites `dy`.
     pub fn backward<T: Real>(
         &self,
-        flat: &[T],
+        params: &[T],
         (graph, x, cache): (&Graph, Rows<'_, T>, &EdgeCache<T>),
         dy: &mut Batch<T>,
         scratch: &mut EdgeScratch<T>,
@@ -142,18 +142,18 @@ impl EdgeNet {
     ) {
         let nodes = dy.len();
         let EdgeScratch { da, du, dv } = scratch;
-        da.reset(W, nodes);
-        du.reset(W, nodes);
-        dv.reset_zero(W, x.len);
-        let bias: &mut [T; H] = self.last.bias_grad(grads).try_into().expect("H numbers");
+        da.resize(W, nodes);
+        du.resize(W, nodes);
+        dv.resize_zero(W, x.len);
+        let bias: &mut [T; H] = self.last.bias_mut(grads).try_into().expect("H numbers");
         simd(
             #[inline(always)]
             || last_bias_back(graph, self.mean, dy.as_mut_slice().as_chunks_mut().0, bias),
         );
         self.last.backward_part((0, W), cache.a.rows(), dy.rows(), grads);
-        self.last.backward_input(flat, (0, W), dy.rows(), da.rows_mut(), Accumulate::Zero);
+        self.last.backward_input(params, (0, W), dy.rows(), da.rows_mut(), InitialValue::Zero);
 
-        let affine = self.norm.affine(flat);
+        let affine = self.norm.affine(params);
         let mut sums = Affine::zero();
         let (u, v) = (cache.u.as_slice().as_chunks().0, cache.v.as_slice().as_chunks().0);
         let (du_rows, dv_rows) = (du.as_mut_slice().as_chunks_mut().0, dv.as_mut_slice().as_chunks_mut().0);
@@ -175,9 +175,9 @@ impl EdgeNet {
             );
         }
         self.first.backward_part((H, H), x, dv.rows(), grads);
-        dx.reset(H, x.len);
-        self.first.backward_input(flat, (H, H), dv.rows(), dx.rows_mut(), Accumulate::Zero);
-        self.first.backward_input(flat, (0, H), du.rows(), dx.range_mut(0..nodes), Accumulate::Add);
+        dx.resize(H, x.len);
+        self.first.backward_input(params, (H, H), dv.rows(), dx.rows_mut(), InitialValue::Zero);
+        self.first.backward_input(params, (0, H), du.rows(), dx.range_mut(0..nodes), InitialValue::Previous);
     }
 }
 
@@ -219,14 +219,14 @@ fn aggregate<T: Real>(
             let s = layer_norm::stats(&x);
             *stats = [s.mean, s.rstd];
             let mut y = [T::ZERO; W];
-            layer_norm::forward(&x, s, affine, &mut y);
+            layer_norm::norm_relu(&x, s, affine, &mut y);
             for c in 0..W {
                 sum[c] += y[c];
             }
         }
-        let share = share(neighbours, mean);
+        let weight = edge_weight(neighbours, mean);
         for c in 0..W {
-            a[c] = sum[c] * share;
+            a[c] = sum[c] * weight;
         }
     }
 }
@@ -243,10 +243,10 @@ fn aggregate_back<T: Real>(
     let mut stats = stats.iter();
     for (i, ((u, da), du)) in u.iter().zip(da).zip(du).enumerate() {
         let neighbours = graph.neighbours(i);
-        let share = share(neighbours, mean);
+        let weight = edge_weight(neighbours, mean);
         let mut da = *da;
         for d in &mut da {
-            *d *= share;
+            *d *= weight;
         }
         let mut sum = [T::ZERO; W];
         for (&j, stats) in neighbours.iter().zip(&mut stats) {
@@ -256,7 +256,7 @@ fn aggregate_back<T: Real>(
                 x[c] = u[c] + v[c];
             }
             let s = Stats { mean: stats[0], rstd: stats[1] };
-            let d = layer_norm::backward(&x, s, affine, &da, sums);
+            let d = layer_norm::norm_relu_back(&x, s, affine, &da, sums);
             let dv = &mut dv[j as usize];
             for c in 0..W {
                 sum[c] += d[c];
@@ -269,6 +269,6 @@ fn aggregate_back<T: Real>(
 
 /// Weight of one neighbour in the aggregation.
 #[inline(always)]
-fn share<T: Real>(neighbours: &[u32], mean: bool) -> T {
+fn edge_weight<T: Real>(neighbours: &[u32], mean: bool) -> T {
     if mean { T::ONE / T::from_f64(neighbours.len().max(1) as f64) } else { T::ONE }
 }

@@ -11,9 +11,9 @@ use super::real::Real;
 #[derive(Clone, Copy, Debug)]
 pub struct Embedding<const F: usize>(Linear);
 
-/// The weights of an embedding as rows of 64, or the sums of their gradients.
+/// The parameters of an embedding as rows of 64, or the sums of their gradients.
 #[derive(Clone, Copy, Debug)]
-pub struct EmbeddingGrad<T, const F: usize> {
+pub struct EmbeddingParams<T, const F: usize> {
     weight: [[T; H]; F],
     bias: [T; H],
 }
@@ -25,26 +25,26 @@ impl<const F: usize> Embedding<F> {
     }
 
     /// See [`Linear::prepare`].
-    pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
-        self.0.prepare(flat, transposed);
+    pub fn prepare<T: Real>(&self, params: &[T], prepared: &mut [T]) {
+        self.0.prepare(params, prepared);
     }
 
-    /// The weights, for [`EmbeddingGrad::add`] and [`EmbeddingGrad::backward`].
-    pub fn load<T: Real>(&self, w: Weights<'_, T>) -> EmbeddingGrad<T, F> {
+    /// The parameters, for [`EmbeddingParams::add`] and [`EmbeddingParams::backward`].
+    pub fn params<T: Real>(&self, w: Weights<'_, T>) -> EmbeddingParams<T, F> {
         let rows = self.0.weight_transposed(w).as_chunks::<H>().0;
-        EmbeddingGrad { weight: rows.try_into().expect("F rows"), bias: self.0.bias(w).try_into().expect("64 numbers") }
+        EmbeddingParams { weight: rows.try_into().expect("F rows"), bias: self.0.bias(w).try_into().expect("64 numbers") }
     }
 
     /// Adds the gradients in `sums` to `grads`.
-    pub fn add_grads<T: Real>(&self, sums: &EmbeddingGrad<T, F>, grads: &mut [T]) {
-        for (o, row) in self.0.weight_grad(grads).chunks_exact_mut(F).enumerate() {
+    pub fn add_grads<T: Real>(&self, sums: &EmbeddingParams<T, F>, grads: &mut [T]) {
+        for (o, row) in self.0.weight_mut(grads).chunks_exact_mut(F).enumerate() {
             row.iter_mut().zip(&sums.weight).for_each(|(g, s)| *g += s[o]);
         }
-        self.0.bias_grad(grads).iter_mut().zip(&sums.bias).for_each(|(g, &s)| *g += s);
+        self.0.bias_mut(grads).iter_mut().zip(&sums.bias).for_each(|(g, &s)| *g += s);
     }
 }
 
-impl<T: Real, const F: usize> EmbeddingGrad<T, F> {
+impl<T: Real, const F: usize> EmbeddingParams<T, F> {
     /// All zeros.
     pub fn zero() -> Self {
         Self { weight: [[T::ZERO; H]; F], bias: [T::ZERO; H] }

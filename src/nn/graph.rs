@@ -29,7 +29,7 @@ impl Graph {
     }
 
     /// Number of nodes of the first kind.
-    pub fn first_kind(&self) -> usize {
+    pub fn first_kind_count(&self) -> usize {
         self.reach[0]
     }
 

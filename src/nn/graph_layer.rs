@@ -4,7 +4,7 @@ use super::HIDDEN as H;
 use super::batch::{Batch, Rows, RowsMut};
 use super::edge_conv::{EdgeCache, EdgeNet, EdgeScratch, Pairing};
 use super::graph::Graph;
-use super::matmul::Accumulate;
+use super::matmul::InitialValue;
 use super::mlp::{Mlp, MlpCache};
 use super::params::{ParameterLayout, Weights};
 use super::real::Real;
@@ -18,10 +18,10 @@ const W: usize = 96;
 pub enum GraphLayer {
     /// The layer of Qedgix.
     EdgeConv(EdgeNet),
-    /// The paper's Algorithm 3: x'_i = update(x_i || mean_j com(x_i || x_j)).
+    /// The paper's Algorithm 3: x'_i = update(x_i || mean_j message(x_i || x_j)).
     AggGnn {
         /// Network of the messages.
-        com: EdgeNet,
+        message: EdgeNet,
         /// Network that combines a node with its mean message.
         update: Mlp<W>,
     },
@@ -33,7 +33,7 @@ pub enum GraphLayer {
 #[derive(Debug, Default)]
 pub struct LayerCache<T: Real> {
     edge: EdgeCache<T>,
-    message: Batch<T>,
+    mean_message: Batch<T>,
     update: MlpCache<T>,
     rgcn: RgcnCache<T>,
 }
@@ -42,7 +42,7 @@ pub struct LayerCache<T: Real> {
 #[derive(Debug, Default)]
 pub struct LayerScratch<T: Real> {
     edge: EdgeScratch<T>,
-    message: Batch<T>,
+    d_mean_message: Batch<T>,
 }
 
 impl GraphLayer {
@@ -53,8 +53,8 @@ impl GraphLayer {
 
     /// Adds the parameters `name.com.*` and `name.update.*`.
     pub fn agg_gnn(layout: &mut ParameterLayout, name: &str) -> Self {
-        let com = EdgeNet::new(layout, &format!("{name}.com"), Pairing::Plain, true);
-        Self::AggGnn { com, update: Mlp::new(layout, &format!("{name}.update"), 2 * H, H) }
+        let message = EdgeNet::new(layout, &format!("{name}.com"), Pairing::Plain, true);
+        Self::AggGnn { message, update: Mlp::new(layout, &format!("{name}.update"), 2 * H, H) }
     }
 
     /// Adds the parameters `name.root.*` and `name.rel`.
@@ -63,24 +63,24 @@ impl GraphLayer {
     }
 
     /// See [`Weights`].
-    pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
+    pub fn prepare<T: Real>(&self, params: &[T], prepared: &mut [T]) {
         match self {
-            Self::EdgeConv(net) => net.prepare(flat, transposed),
-            Self::AggGnn { com, update } => {
-                com.prepare(flat, transposed);
-                update.prepare(flat, transposed);
+            Self::EdgeConv(net) => net.prepare(params, prepared),
+            Self::AggGnn { message, update } => {
+                message.prepare(params, prepared);
+                update.prepare(params, prepared);
             }
-            Self::Rgcn(net) => net.prepare(flat, transposed),
+            Self::Rgcn(net) => net.prepare(params, prepared),
         }
     }
 
-    /// The matrix products of a forward pass that reads `read` nodes and computes `made`, each as (rows, k, columns).
-    pub fn products(&self, (read, made): (usize, usize)) -> Vec<[usize; 3]> {
+    /// The matrix products of a forward pass that reads `inputs` nodes and computes `outputs`, each as (rows, k, columns).
+    pub fn products(&self, (inputs, outputs): (usize, usize)) -> Vec<[usize; 3]> {
         match self {
-            Self::EdgeConv(net) => net.products((read, made)).to_vec(),
-            Self::AggGnn { com, update } => [&com.products((read, made))[..], &update.products(made)].concat(),
+            Self::EdgeConv(net) => net.products((inputs, outputs)).to_vec(),
+            Self::AggGnn { message, update } => [&message.products((inputs, outputs))[..], &update.products(outputs)].concat(),
             // The node itself and the means over both kinds of neighbours.
-            Self::Rgcn(_) => vec![[made, H, H]; 3],
+            Self::Rgcn(_) => vec![[outputs, H, H]; 3],
         }
     }
 
@@ -88,11 +88,11 @@ impl GraphLayer {
     pub fn forward<T: Real>(&self, w: Weights<'_, T>, graph: &Graph, x: Rows<'_, T>, c: &mut LayerCache<T>, y: RowsMut<'_, T>) {
         match self {
             Self::EdgeConv(net) => net.forward(w, graph, x, &mut c.edge, y),
-            Self::AggGnn { com, update } => {
-                c.message.reset(H, y.len);
-                com.forward(w, graph, x, &mut c.edge, c.message.rows_mut());
+            Self::AggGnn { message, update } => {
+                c.mean_message.resize(H, y.len);
+                message.forward(w, graph, x, &mut c.edge, c.mean_message.rows_mut());
                 let own = Rows { len: y.len, ..x };
-                update.forward(w, (own, c.message.rows(), H), &mut c.update, y);
+                update.forward(w, (own, c.mean_message.rows(), H), &mut c.update, y);
             }
             Self::Rgcn(net) => net.forward(w, graph, x, &mut c.rgcn, y),
         }
@@ -108,15 +108,15 @@ impl GraphLayer {
         (grads, dx): (&mut [T], &mut Batch<T>),
     ) {
         match self {
-            Self::EdgeConv(net) => net.backward(w.flat, (graph, x, &c.edge), dy, &mut s.edge, (grads, dx)),
-            Self::AggGnn { com, update } => {
+            Self::EdgeConv(net) => net.backward(w.params, (graph, x, &c.edge), dy, &mut s.edge, (grads, dx)),
+            Self::AggGnn { message, update } => {
                 let own = Rows { len: dy.len(), ..x };
-                update.backward(w.flat, (own, c.message.rows(), H), dy.rows(), &mut c.update, grads);
+                update.backward(w.params, (own, c.mean_message.rows(), H), dy.rows(), &mut c.update, grads);
                 let d = update.d_first(&c.update);
-                s.message.reset(H, dy.len());
-                update.first.backward_input(w.flat, (H, H), d, s.message.rows_mut(), Accumulate::Zero);
-                com.backward(w.flat, (graph, x, &c.edge), &mut s.message, &mut s.edge, (grads, dx));
-                update.first.backward_input(w.flat, (0, H), d, dx.range_mut(0..dy.len()), Accumulate::Add);
+                s.d_mean_message.resize(H, dy.len());
+                update.first.backward_input(w.params, (H, H), d, s.d_mean_message.rows_mut(), InitialValue::Zero);
+                message.backward(w.params, (graph, x, &c.edge), &mut s.d_mean_message, &mut s.edge, (grads, dx));
+                update.first.backward_input(w.params, (0, H), d, dx.range_mut(0..dy.len()), InitialValue::Previous);
             }
             Self::Rgcn(net) => net.backward(w, (graph, x, &mut c.rgcn), dy.rows(), (grads, dx)),
         }

@@ -38,8 +38,8 @@ impl<const W: usize> LayerNorm<W> {
         Self { scale, shift }
     }
 
-    pub(super) fn affine<T: Real>(&self, flat: &[T]) -> Affine<T, W> {
-        let at = |from: usize| flat[from..from + W].try_into().expect("W numbers");
+    pub(super) fn affine<T: Real>(&self, params: &[T]) -> Affine<T, W> {
+        let at = |from: usize| params[from..from + W].try_into().expect("W numbers");
         Affine { scale: at(self.scale), shift: at(self.shift) }
     }
 
@@ -71,14 +71,14 @@ fn fold<T: Real>(mut lanes: [T; LANES]) -> T {
 
 #[inline(always)]
 pub(super) fn stats<T: Real, const W: usize>(x: &[T; W]) -> Stats<T> {
-    let share = T::from_f64(1.0 / W as f64);
+    let inverse_width = T::from_f64(1.0 / W as f64);
     let mut sum = [T::ZERO; LANES];
     for c in x.chunks_exact(LANES) {
         for l in 0..LANES {
             sum[l] += c[l];
         }
     }
-    let mean = fold(sum) * share;
+    let mean = fold(sum) * inverse_width;
     let mut square = [T::ZERO; LANES];
     for c in x.chunks_exact(LANES) {
         for l in 0..LANES {
@@ -86,13 +86,13 @@ pub(super) fn stats<T: Real, const W: usize>(x: &[T; W]) -> Stats<T> {
             square[l] = d.mul_add(d, square[l]);
         }
     }
-    let variance = fold(square) * share;
+    let variance = fold(square) * inverse_width;
     Stats { mean, rstd: T::ONE / (variance + T::from_f64(EPS)).sqrt() }
 }
 
-/// y = relu(g n + b).
+/// LayerNorm and ReLU: y = relu(g n + b).
 #[inline(always)]
-pub(super) fn forward<T: Real, const W: usize>(x: &[T; W], s: Stats<T>, p: &Affine<T, W>, y: &mut [T; W]) {
+pub(super) fn norm_relu<T: Real, const W: usize>(x: &[T; W], s: Stats<T>, p: &Affine<T, W>, y: &mut [T; W]) {
     for c in 0..W {
         let n = (x[c] - s.mean) * s.rstd;
         y[c] = n.mul_add(p.scale[c], p.shift[c]).relu();
@@ -101,14 +101,14 @@ pub(super) fn forward<T: Real, const W: usize>(x: &[T; W], s: Stats<T>, p: &Affi
 
 /// Returns dx from x and dy, and adds the gradients of scale and shift.
 #[inline(always)]
-pub(super) fn backward<T: Real, const W: usize>(
+pub(super) fn norm_relu_back<T: Real, const W: usize>(
     x: &[T; W],
     s: Stats<T>,
     p: &Affine<T, W>,
     dy: &[T; W],
     grads: &mut Affine<T, W>,
 ) -> [T; W] {
-    let share = T::from_f64(1.0 / W as f64);
+    let inverse_width = T::from_f64(1.0 / W as f64);
     let mut n = [T::ZERO; W];
     let mut e = [T::ZERO; W];
     for c in 0..W {
@@ -126,7 +126,7 @@ pub(super) fn backward<T: Real, const W: usize>(
             product[l] = e[l].mul_add(n[l], product[l]);
         }
     }
-    let (mean, slope) = (fold(sum) * share, fold(product) * share);
+    let (mean, slope) = (fold(sum) * inverse_width, fold(product) * inverse_width);
     let mut dx = [T::ZERO; W];
     for c in 0..W {
         dx[c] = s.rstd * ((e[c] - mean) - n[c] * slope);

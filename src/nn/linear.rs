@@ -2,7 +2,7 @@
 
 use super::batch::add_rows;
 use super::batch::{Rows, RowsMut};
-use super::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
+use super::matmul::{InitialValue, Lhs, Out, Rhs, matmul};
 use super::params::{Init, ParameterLayout, Weights};
 use super::real::Real;
 
@@ -26,10 +26,10 @@ impl Linear {
         Self { weight, bias, inputs, outputs }
     }
 
-    /// Writes the transposed weight to `transposed`.
-    pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
+    /// Writes the transposed weight to `prepared`.
+    pub fn prepare<T: Real>(&self, params: &[T], prepared: &mut [T]) {
         let n = self.inputs * self.outputs;
-        transpose(&flat[self.weight..][..n], self.inputs, &mut transposed[self.weight..][..n]);
+        transpose(&params[self.weight..][..n], self.inputs, &mut prepared[self.weight..][..n]);
     }
 
     /// The matrix product of a forward pass over `rows` samples, as (rows, k, columns).
@@ -38,85 +38,85 @@ impl Linear {
     }
 
     /// W, (outputs, inputs).
-    pub fn weight<'a, T>(&self, flat: &'a [T]) -> &'a [T] {
-        &flat[self.weight..][..self.inputs * self.outputs]
+    pub fn weight<'a, T>(&self, params: &'a [T]) -> &'a [T] {
+        &params[self.weight..][..self.inputs * self.outputs]
     }
 
     /// W transposed, (inputs, outputs).
     pub fn weight_transposed<'a, T>(&self, w: Weights<'a, T>) -> &'a [T] {
-        &w.transposed[self.weight..][..self.inputs * self.outputs]
+        &w.prepared[self.weight..][..self.inputs * self.outputs]
     }
 
     /// b.
     pub fn bias<'a, T>(&self, w: Weights<'a, T>) -> &'a [T] {
-        &w.flat[self.bias..][..self.outputs]
+        &w.params[self.bias..][..self.outputs]
     }
 
-    /// The weight's gradient, (outputs, inputs).
-    pub fn weight_grad<'a, T>(&self, grads: &'a mut [T]) -> &'a mut [T] {
-        &mut grads[self.weight..][..self.inputs * self.outputs]
+    /// The place of W, (outputs, inputs), in a vector of parameters, prepared forms or gradients.
+    pub fn weight_mut<'a, T>(&self, vector: &'a mut [T]) -> &'a mut [T] {
+        &mut vector[self.weight..][..self.inputs * self.outputs]
     }
 
-    /// The bias's gradient.
-    pub fn bias_grad<'a, T>(&self, grads: &'a mut [T]) -> &'a mut [T] {
-        &mut grads[self.bias..][..self.outputs]
+    /// The place of b in a vector of parameters or gradients.
+    pub fn bias_mut<'a, T>(&self, vector: &'a mut [T]) -> &'a mut [T] {
+        &mut vector[self.bias..][..self.outputs]
     }
 
     /// y = W x + b.
     pub fn forward<T: Real>(&self, w: Weights<'_, T>, x: Rows<'_, T>, y: RowsMut<'_, T>) {
-        self.forward_part(w, (0, self.inputs), x, y, Accumulate::Bias(self.bias(w)));
+        self.forward_part(w, (0, self.inputs), x, y, InitialValue::Bias(self.bias(w)));
     }
 
-    /// y = start + W[:, from..from + width] x, with start from `accumulate`: the contribution of some inputs.
+    /// y = start + W[:, from..from + width] x, with start from `initial`: the contribution of some inputs.
     pub fn forward_part<T: Real>(
         &self,
         w: Weights<'_, T>,
         (from, width): (usize, usize),
         x: Rows<'_, T>,
         y: RowsMut<'_, T>,
-        accumulate: Accumulate<'_, T>,
+        initial: InitialValue<'_, T>,
     ) {
         debug_assert_eq!(x.len, y.len);
         let b = Rhs { data: &self.weight_transposed(w)[from * self.outputs..], stride: self.outputs };
         let c = Out { data: y.data, stride: y.stride };
-        matmul((x.len, width, self.outputs), Lhs::rows(x.data, x.stride), b, c, accumulate);
+        matmul((x.len, width, self.outputs), Lhs::rows(x.data, x.stride), b, c, initial);
     }
 
     /// Adds the gradients of W and b. Writes dx if it is given.
-    pub fn backward<T: Real>(&self, flat: &[T], x: Rows<'_, T>, dy: Rows<'_, T>, grads: &mut [T], dx: Option<RowsMut<'_, T>>) {
+    pub fn backward<T: Real>(&self, params: &[T], x: Rows<'_, T>, dy: Rows<'_, T>, grads: &mut [T], dx: Option<RowsMut<'_, T>>) {
         self.backward_bias(dy, grads);
         self.backward_part((0, self.inputs), x, dy, grads);
         if let Some(dx) = dx {
-            self.backward_input(flat, (0, self.inputs), dy, dx, Accumulate::Zero);
+            self.backward_input(params, (0, self.inputs), dy, dx, InitialValue::Zero);
         }
     }
 
     /// Adds the gradient of b.
     pub fn backward_bias<T: Real>(&self, dy: Rows<'_, T>, grads: &mut [T]) {
-        add_rows(dy, self.bias_grad(grads));
+        add_rows(dy, self.bias_mut(grads));
     }
 
     /// Adds the gradient of W[:, from..from + width], for as many samples as `dy` has.
     pub fn backward_part<T: Real>(&self, (from, width): (usize, usize), x: Rows<'_, T>, dy: Rows<'_, T>, grads: &mut [T]) {
         debug_assert!(x.len >= dy.len);
         let stride = self.inputs;
-        let c = Out { data: &mut self.weight_grad(grads)[from..], stride };
+        let c = Out { data: &mut self.weight_mut(grads)[from..], stride };
         let b = Rhs { data: x.data, stride: x.stride };
-        matmul((self.outputs, dy.len, width), Lhs::transposed(dy.data, dy.stride), b, c, Accumulate::Add);
+        matmul((self.outputs, dy.len, width), Lhs::transposed(dy.data, dy.stride), b, c, InitialValue::Previous);
     }
 
-    /// dx = start + dy W[:, from..from + width], with start from `accumulate`.
+    /// dx = start + dy W[:, from..from + width], with start from `initial`.
     pub fn backward_input<T: Real>(
         &self,
-        flat: &[T],
+        params: &[T],
         (from, width): (usize, usize),
         dy: Rows<'_, T>,
         dx: RowsMut<'_, T>,
-        accumulate: Accumulate<'_, T>,
+        initial: InitialValue<'_, T>,
     ) {
-        let b = Rhs { data: &self.weight(flat)[from..], stride: self.inputs };
+        let b = Rhs { data: &self.weight(params)[from..], stride: self.inputs };
         let c = Out { data: dx.data, stride: dx.stride };
-        matmul((dy.len, self.outputs, width), Lhs::rows(dy.data, dy.stride), b, c, accumulate);
+        matmul((dy.len, self.outputs, width), Lhs::rows(dy.data, dy.stride), b, c, initial);
     }
 }
 

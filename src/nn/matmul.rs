@@ -13,23 +13,23 @@ use pulp::{Arch, Simd, WithSimd};
 
 use super::real::Real;
 
-/// A: element (i, k) is `data[i * row + k * col]`; one of the strides is 1.
+/// A: element (i, k) is `data[i * row_stride + k * col_stride]`; one of the strides is 1.
 #[derive(Clone, Copy, Debug)]
 pub struct Lhs<'a, T> {
     data: &'a [T],
-    row: usize,
-    col: usize,
+    row_stride: usize,
+    col_stride: usize,
 }
 
 impl<'a, T> Lhs<'a, T> {
     /// Rows of `stride` numbers each.
     pub fn rows(data: &'a [T], stride: usize) -> Self {
-        Self { data, row: stride, col: 1 }
+        Self { data, row_stride: stride, col_stride: 1 }
     }
 
     /// The transpose of rows of `stride` numbers each.
     pub fn transposed(data: &'a [T], stride: usize) -> Self {
-        Self { data, row: 1, col: stride }
+        Self { data, row_stride: 1, col_stride: stride }
     }
 }
 
@@ -53,19 +53,19 @@ pub struct Out<'a, T> {
 
 /// Initial value of the sum over k.
 #[derive(Clone, Copy, Debug)]
-pub enum Accumulate<'a, T> {
+pub enum InitialValue<'a, T> {
     /// 0.
     Zero,
     /// A bias per column.
     Bias(&'a [T]),
     /// The previous content of C.
-    Add,
+    Previous,
 }
 
 /// Number of terms summed before a tile is stored: a panel of B of this height fits into the first-level cache.
 const DEPTH: usize = 144;
 
-/// C = start + A B for A (m, k), B (k, n), with start from `accumulate`.
+/// C = start + A B for A (m, k), B (k, n), with start from `initial`.
 ///
 /// # Panics
 /// If a slice is too short for its shape.
@@ -74,18 +74,18 @@ pub fn matmul<T: Real>(
     a: Lhs<'_, T>,
     b: Rhs<'_, T>,
     c: Out<'_, T>,
-    accumulate: Accumulate<'_, T>,
+    initial: InitialValue<'_, T>,
 ) {
     if m == 0 || n == 0 {
         return;
     }
     assert!(c.data.len() >= (m - 1) * c.stride + n && c.stride >= n, "C is too short");
-    assert!(k == 0 || a.data.len() > (m - 1) * a.row + (k - 1) * a.col, "A is too short");
+    assert!(k == 0 || a.data.len() > (m - 1) * a.row_stride + (k - 1) * a.col_stride, "A is too short");
     assert!(k == 0 || b.data.len() >= (k - 1) * b.stride + n, "B is too short");
-    if let Accumulate::Bias(bias) = accumulate {
+    if let InitialValue::Bias(bias) = initial {
         assert!(bias.len() >= n, "the bias is too short");
     }
-    Arch::new().dispatch(Product { m, k, n, a, b, c, accumulate });
+    Arch::new().dispatch(Product { m, k, n, a, b, c, initial });
 }
 
 struct Product<'a, T> {
@@ -95,7 +95,7 @@ struct Product<'a, T> {
     a: Lhs<'a, T>,
     b: Rhs<'a, T>,
     c: Out<'a, T>,
-    accumulate: Accumulate<'a, T>,
+    initial: InitialValue<'a, T>,
 }
 
 impl<T: Real> WithSimd for Product<'_, T> {
@@ -127,7 +127,7 @@ impl<T: Real> WithSimd for Product<'_, T> {
             if k0 >= self.k {
                 return;
             }
-            self.accumulate = Accumulate::Add;
+            self.initial = InitialValue::Previous;
         }
     }
 }
@@ -164,9 +164,9 @@ impl<T: Real> Product<'_, T> {
         let lanes = T::lanes::<S>();
         let last = width - (V - 1) * lanes;
         let mut sums = [[T::splat(simd, T::ZERO); V]; R];
-        match self.accumulate {
-            Accumulate::Zero => {}
-            Accumulate::Bias(bias) => {
+        match self.initial {
+            InitialValue::Zero => {}
+            InitialValue::Bias(bias) => {
                 for v in 0..V {
                     let at = j + v * lanes;
                     let x = T::load(simd, &bias[at..at + if v + 1 < V { lanes } else { last }]);
@@ -175,7 +175,7 @@ impl<T: Real> Product<'_, T> {
                     }
                 }
             }
-            Accumulate::Add => {
+            InitialValue::Previous => {
                 for (r, row) in sums.iter_mut().enumerate() {
                     let c = &self.c.data[(i + r) * self.c.stride + j..][..width];
                     for (v, x) in row.iter_mut().enumerate() {
@@ -188,10 +188,10 @@ impl<T: Real> Product<'_, T> {
             let b = &self.b.data[k0 * self.b.stride + j..];
             let b_row = |k: usize| &b[k * self.b.stride..][..width];
             let mut odd = [[T::splat(simd, T::ZERO); V]; R];
-            if self.a.col == 1 {
+            if self.a.col_stride == 1 {
                 let mut rows: [&[T]; R] = [&[]; R];
                 for (r, row) in rows.iter_mut().enumerate() {
-                    *row = &self.a.data[(i + r) * self.a.row + k0..][..depth];
+                    *row = &self.a.data[(i + r) * self.a.row_stride + k0..][..depth];
                 }
                 let mut k = 0;
                 while k + 1 < depth {
@@ -203,8 +203,8 @@ impl<T: Real> Product<'_, T> {
                     accumulate(simd, |r| rows[r][k], b_row(k), &mut sums);
                 }
             } else {
-                let a = &self.a.data[i + k0 * self.a.col..];
-                let a_row = |k: usize| -> &[T; R] { a[k * self.a.col..][..R].try_into().expect("R numbers") };
+                let a = &self.a.data[i + k0 * self.a.col_stride..];
+                let a_row = |k: usize| -> &[T; R] { a[k * self.a.col_stride..][..R].try_into().expect("R numbers") };
                 let mut k = 0;
                 while k + 1 < depth {
                     let (a, next) = (a_row(k), a_row(k + 1));
@@ -274,7 +274,7 @@ mod tests {
                     let (a, b) = (draw(m.max(k) * (wide_a + m)), draw(k.max(1) * wide_b));
                     let (before, bias) = (draw(m * wide_c), draw(n));
                     for (lhs, place) in [(Lhs::rows(&a, wide_a), (wide_a, 1)), (Lhs::transposed(&a, m + 1), (1, m + 1))] {
-                        for start in [Accumulate::Zero, Accumulate::Bias(&bias), Accumulate::Add] {
+                        for start in [InitialValue::Zero, InitialValue::Bias(&bias), InitialValue::Previous] {
                             let mut c = before.clone();
                             let (rhs, out) = (Rhs { data: &b, stride: wide_b }, Out { data: &mut c, stride: wide_c });
                             matmul((m, k, n), lhs, rhs, out, start);
@@ -285,9 +285,9 @@ mod tests {
                                     continue;
                                 }
                                 let start = match start {
-                                    Accumulate::Zero => T::ZERO,
-                                    Accumulate::Bias(bias) => bias[j],
-                                    Accumulate::Add => before,
+                                    InitialValue::Zero => T::ZERO,
+                                    InitialValue::Bias(bias) => bias[j],
+                                    InitialValue::Previous => before,
                                 };
                                 let exact = naive(k, |k| a[i * place.0 + k * place.1], |k| b[k * wide_b + j], start);
                                 assert!((c.to_f64() - exact).abs() <= tolerance * (1.0 + k as f64), "{m} {k} {n}: {c} {exact}");
@@ -315,7 +315,13 @@ mod tests {
         let product = |rows: std::ops::Range<usize>| {
             let mut c = vec![0.0; rows.len() * 33];
             let a = Lhs::rows(&data[rows.start * 64..], 64);
-            matmul((rows.len(), 64, 33), a, Rhs { data: &data, stride: 33 }, Out { data: &mut c, stride: 33 }, Accumulate::Zero);
+            matmul(
+                (rows.len(), 64, 33),
+                a,
+                Rhs { data: &data, stride: 33 },
+                Out { data: &mut c, stride: 33 },
+                InitialValue::Zero,
+            );
             c
         };
         let whole = product(0..50);

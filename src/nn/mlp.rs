@@ -5,7 +5,7 @@
 use super::batch::{Batch, Rows, RowsMut};
 use super::layer_norm::{self, Affine, LayerNorm, Stats};
 use super::linear::Linear;
-use super::matmul::Accumulate;
+use super::matmul::InitialValue;
 use super::params::{ParameterLayout, Weights};
 use super::real::Real;
 use super::simd::simd;
@@ -22,9 +22,11 @@ pub struct Mlp<const W: usize> {
 /// Values that backward needs, and its buffers.
 #[derive(Debug, Default)]
 pub struct MlpCache<T: Real> {
-    before: Batch<T>,
+    /// Output of the first layer; backward replaces it by its gradient.
+    pre_norm_or_grad: Batch<T>,
     stats: Batch<T>,
-    hidden: Batch<T>,
+    /// Output of LayerNorm and ReLU; backward replaces it by its gradient.
+    hidden_or_grad: Batch<T>,
 }
 
 impl<const W: usize> Mlp<W> {
@@ -38,9 +40,9 @@ impl<const W: usize> Mlp<W> {
     }
 
     /// See [`Linear::prepare`].
-    pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
-        self.first.prepare(flat, transposed);
-        self.last.prepare(flat, transposed);
+    pub fn prepare<T: Real>(&self, params: &[T], prepared: &mut [T]) {
+        self.first.prepare(params, prepared);
+        self.last.prepare(params, prepared);
     }
 
     /// The matrix products of a forward pass over `rows` samples, each as (rows, k, columns).
@@ -57,40 +59,54 @@ impl<const W: usize> Mlp<W> {
         y: RowsMut<'_, T>,
     ) {
         let first = &self.first;
-        cache.before.reset(W, a.len);
-        cache.stats.reset(2, a.len);
-        cache.hidden.reset(W, a.len);
-        first.forward_part(w, (0, split), a, cache.before.rows_mut(), Accumulate::Bias(first.bias(w)));
-        first.forward_part(w, (split, first.inputs - split), b, cache.before.rows_mut(), Accumulate::Add);
-        let affine = self.norm.affine(w.flat);
+        cache.pre_norm_or_grad.resize(W, a.len);
+        cache.stats.resize(2, a.len);
+        cache.hidden_or_grad.resize(W, a.len);
+        first.forward_part(w, (0, split), a, cache.pre_norm_or_grad.rows_mut(), InitialValue::Bias(first.bias(w)));
+        first.forward_part(w, (split, first.inputs - split), b, cache.pre_norm_or_grad.rows_mut(), InitialValue::Previous);
+        let affine = self.norm.affine(w.params);
         simd(
             #[inline(always)]
-            || normalise(cache.before.as_slice(), &affine, cache.stats.as_mut_slice(), cache.hidden.as_mut_slice()),
+            || {
+                norm_relu_rows(
+                    cache.pre_norm_or_grad.as_slice(),
+                    &affine,
+                    cache.stats.as_mut_slice(),
+                    cache.hidden_or_grad.as_mut_slice(),
+                )
+            },
         );
-        self.last.forward(w, cache.hidden.rows(), y);
+        self.last.forward(w, cache.hidden_or_grad.rows(), y);
     }
 
     /// Adds the gradients of the parameters. Afterwards [`Mlp::d_first`] is the gradient at the output of the first layer.
     pub fn backward<T: Real>(
         &self,
-        flat: &[T],
+        params: &[T],
         (a, b, split): (Rows<'_, T>, Rows<'_, T>, usize),
         dy: Rows<'_, T>,
         cache: &mut MlpCache<T>,
         grads: &mut [T],
     ) {
         self.last.backward_bias(dy, grads);
-        self.last.backward_part((0, W), cache.hidden.rows(), dy, grads);
-        // The gradient of the hidden layer overwrites `hidden`, and then that of the first layer overwrites `before`.
-        self.last.backward_input(flat, (0, W), dy, cache.hidden.rows_mut(), Accumulate::Zero);
-        let affine = self.norm.affine(flat);
+        self.last.backward_part((0, W), cache.hidden_or_grad.rows(), dy, grads);
+        self.last.backward_input(params, (0, W), dy, cache.hidden_or_grad.rows_mut(), InitialValue::Zero);
+        let affine = self.norm.affine(params);
         let mut sums = Affine::zero();
         simd(
             #[inline(always)]
-            || normalise_back(cache.before.as_mut_slice(), &affine, cache.stats.as_slice(), cache.hidden.as_slice(), &mut sums),
+            || {
+                norm_relu_rows_back(
+                    cache.pre_norm_or_grad.as_mut_slice(),
+                    &affine,
+                    cache.stats.as_slice(),
+                    cache.hidden_or_grad.as_slice(),
+                    &mut sums,
+                )
+            },
         );
         self.norm.add_grads(&sums, grads);
-        let d = cache.before.rows();
+        let d = cache.pre_norm_or_grad.rows();
         self.first.backward_bias(d, grads);
         self.first.backward_part((0, split), a, d, grads);
         self.first.backward_part((split, self.first.inputs - split), b, d, grads);
@@ -98,24 +114,24 @@ impl<const W: usize> Mlp<W> {
 
     /// After [`Mlp::backward`]: the gradient at the output of the first layer.
     pub fn d_first<'a, T: Real>(&self, cache: &'a MlpCache<T>) -> Rows<'a, T> {
-        cache.before.rows()
+        cache.pre_norm_or_grad.rows()
     }
 }
 
 #[inline(always)]
-fn normalise<T: Real, const W: usize>(x: &[T], p: &Affine<T, W>, stats: &mut [T], y: &mut [T]) {
+fn norm_relu_rows<T: Real, const W: usize>(x: &[T], p: &Affine<T, W>, stats: &mut [T], y: &mut [T]) {
     let rows = x.as_chunks::<W>().0.iter().zip(y.as_chunks_mut::<W>().0);
     for ((x, y), stats) in rows.zip(stats.as_chunks_mut::<2>().0) {
         let s = layer_norm::stats(x);
         *stats = [s.mean, s.rstd];
-        layer_norm::forward(x, s, p, y);
+        layer_norm::norm_relu(x, s, p, y);
     }
 }
 
 #[inline(always)]
-fn normalise_back<T: Real, const W: usize>(x: &mut [T], p: &Affine<T, W>, stats: &[T], dy: &[T], sums: &mut Affine<T, W>) {
+fn norm_relu_rows_back<T: Real, const W: usize>(x: &mut [T], p: &Affine<T, W>, stats: &[T], dy: &[T], sums: &mut Affine<T, W>) {
     let rows = x.as_chunks_mut::<W>().0.iter_mut().zip(dy.as_chunks::<W>().0);
     for ((x, dy), stats) in rows.zip(stats.as_chunks::<2>().0) {
-        *x = layer_norm::backward(x, Stats { mean: stats[0], rstd: stats[1] }, p, dy, sums);
+        *x = layer_norm::norm_relu_back(x, Stats { mean: stats[0], rstd: stats[1] }, p, dy, sums);
     }
 }

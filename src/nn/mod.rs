@@ -31,7 +31,7 @@ pub use activations::{argmax, elu, elu_slope, leaky_relu, leaky_relu_back, relu,
 pub use adam::{Adam, norm_squared};
 pub use batch::{Batch, Rows, RowsMut};
 pub use edge_conv::{EdgeCache, EdgeNet, EdgeScratch, Pairing};
-pub use embedding::{Embedding, EmbeddingGrad};
+pub use embedding::{Embedding, EmbeddingParams};
 pub use graph::Graph;
 pub use graph_layer::{GraphLayer, LayerCache, LayerScratch};
 pub use gru::Gru;

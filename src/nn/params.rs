@@ -35,13 +35,13 @@ pub struct ParameterLayout {
     parameters: Vec<Parameter>,
 }
 
-/// A network's flat vector, and the forms derived from it that products use. Each layer's `prepare` writes its own forms.
+/// The parameters of a network, and the forms derived from them that products use. Each layer's `prepare` writes its own forms.
 #[derive(Clone, Copy, Debug)]
 pub struct Weights<'a, T> {
-    /// The parameters.
-    pub flat: &'a [T],
-    /// Weights transposed, and other derived forms, each at the range of the parameter in `flat`.
-    pub transposed: &'a [T],
+    /// The parameters, as one flat vector.
+    pub params: &'a [T],
+    /// Transposed weights, differences of weights and sums of biases, each at the range of a parameter in `params`.
+    pub prepared: &'a [T],
 }
 
 impl ParameterLayout {
@@ -70,10 +70,10 @@ impl ParameterLayout {
 
     /// Draws every parameter, in order.
     pub fn initialise<T: Real>(&self, rng: &mut impl Rng) -> Vec<T> {
-        let mut flat = Vec::with_capacity(self.len());
+        let mut params = Vec::with_capacity(self.len());
         for p in &self.parameters {
             for _ in p.range.clone() {
-                flat.push(T::from_f64(match p.init {
+                params.push(T::from_f64(match p.init {
                     Init::Constant(x) => x,
                     Init::Uniform(bound) => bound * (2.0 * rng.random::<f64>() - 1.0),
                     Init::Normal(deviation) => {
@@ -84,6 +84,6 @@ impl ParameterLayout {
                 }));
             }
         }
-        flat
+        params
     }
 }

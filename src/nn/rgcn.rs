@@ -7,7 +7,7 @@ use super::HIDDEN as H;
 use super::batch::{Batch, Rows, RowsMut};
 use super::graph::Graph;
 use super::linear::{Linear, transpose};
-use super::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
+use super::matmul::{InitialValue, Lhs, Out, Rhs, matmul};
 use super::params::{Init, ParameterLayout, Weights};
 use super::real::Real;
 use super::simd::simd;
@@ -16,7 +16,8 @@ use super::simd::simd;
 #[derive(Clone, Copy, Debug)]
 pub struct Rgcn {
     root: Linear,
-    rel: usize,
+    /// Offset of the weights of the relations, (3, H, H).
+    relations: usize,
 }
 
 /// Means over the neighbours of the first and of the second kind; in backward their gradients.
@@ -29,20 +30,20 @@ impl Rgcn {
     /// Adds the parameters `name.root` and `name.rel` (3, H, H). `rel` multiplies from the right.
     pub fn new(layout: &mut ParameterLayout, name: &str) -> Self {
         let root = Linear::new(layout, &format!("{name}.root"), H, H);
-        Self { root, rel: layout.add(format!("{name}.rel"), &[3, H, H], Init::Normal(1.0 / (H as f64).sqrt())) }
+        Self { root, relations: layout.add(format!("{name}.rel"), &[3, H, H], Init::Normal(1.0 / (H as f64).sqrt())) }
     }
 
     /// Transposes all weights. Those of the relations are needed in backward only.
-    pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
-        self.root.prepare(flat, transposed);
-        for at in (self.rel..).step_by(H * H).take(3) {
-            transpose(&flat[at..][..H * H], H, &mut transposed[at..][..H * H]);
+    pub fn prepare<T: Real>(&self, params: &[T], prepared: &mut [T]) {
+        self.root.prepare(params, prepared);
+        for at in (self.relations..).step_by(H * H).take(3) {
+            transpose(&params[at..][..H * H], H, &mut prepared[at..][..H * H]);
         }
     }
 
     /// The range of nodes of each kind, with its relations to nodes of the first and of the second kind.
-    fn runs(graph: &Graph, nodes: usize) -> [(std::ops::Range<usize>, [usize; 2]); 2] {
-        let first = graph.first_kind().min(nodes);
+    fn kind_ranges(graph: &Graph, nodes: usize) -> [(std::ops::Range<usize>, [usize; 2]); 2] {
+        let first = graph.first_kind_count().min(nodes);
         [(0..first, [0, 1]), (first..nodes, [1, 2])]
     }
 
@@ -56,25 +57,31 @@ impl Rgcn {
         y: RowsMut<'_, T>,
     ) {
         let nodes = y.len;
-        cache.means.reset_zero(2 * H, nodes);
+        cache.means.resize_zero(2 * H, nodes);
         let means = cache.means.as_mut_slice().as_chunks_mut::<H>().0;
         simd(
             #[inline(always)]
             || {
                 for (i, means) in means.chunks_exact_mut(2).enumerate() {
-                    for (kind, j, share) in neighbours(graph, i) {
-                        add_share(&x.data[j * x.stride..][..H], share, &mut means[kind]);
+                    for (kind, j, weight) in neighbours(graph, i) {
+                        add_scaled(&x.data[j * x.stride..][..H], weight, &mut means[kind]);
                     }
                 }
             },
         );
         let stride = y.stride;
         self.root.forward(w, Rows { len: nodes, ..x }, RowsMut { data: &mut *y.data, ..y });
-        for (run, relations) in Self::runs(graph, nodes) {
+        for (range, relations) in Self::kind_ranges(graph, nodes) {
             for (kind, r) in relations.into_iter().enumerate() {
-                let means = Lhs::rows(cache.means.range(run.clone()).from_column(kind * H).data, 2 * H);
-                let rel = Rhs { data: &w.flat[self.rel + r * H * H..][..H * H], stride: H };
-                matmul((run.len(), H, H), means, rel, Out { data: &mut y.data[run.start * stride..], stride }, Accumulate::Add);
+                let means = Lhs::rows(cache.means.range(range.clone()).from_column(kind * H).data, 2 * H);
+                let weight = Rhs { data: &w.params[self.relations + r * H * H..][..H * H], stride: H };
+                matmul(
+                    (range.len(), H, H),
+                    means,
+                    weight,
+                    Out { data: &mut y.data[range.start * stride..], stride },
+                    InitialValue::Previous,
+                );
             }
         }
     }
@@ -87,20 +94,20 @@ impl Rgcn {
         dy: Rows<'_, T>,
         (grads, dx): (&mut [T], &mut Batch<T>),
     ) {
-        dx.reset_zero(H, x.len);
-        self.root.backward(w.flat, Rows { len: dy.len, ..x }, dy, grads, Some(dx.range_mut(0..dy.len)));
-        for (run, relations) in Self::runs(graph, dy.len) {
+        dx.resize_zero(H, x.len);
+        self.root.backward(w.params, Rows { len: dy.len, ..x }, dy, grads, Some(dx.range_mut(0..dy.len)));
+        for (range, relations) in Self::kind_ranges(graph, dy.len) {
             for (kind, r) in relations.into_iter().enumerate() {
-                let at = self.rel + r * H * H;
-                let d = &dy.data[run.start * dy.stride..];
-                let means = cache.means.range_mut(run.clone());
+                let at = self.relations + r * H * H;
+                let d = &dy.data[range.start * dy.stride..];
+                let means = cache.means.range_mut(range.clone());
                 let column = (kind * H).min(means.data.len());
                 let out = Out { data: &mut grads[at..][..H * H], stride: H };
                 let rhs = Rhs { data: d, stride: dy.stride };
-                matmul((H, run.len(), H), Lhs::transposed(&means.data[column..], 2 * H), rhs, out, Accumulate::Add);
+                matmul((H, range.len(), H), Lhs::transposed(&means.data[column..], 2 * H), rhs, out, InitialValue::Previous);
                 let out = Out { data: &mut means.data[column..], stride: 2 * H };
-                let transposed = Rhs { data: &w.transposed[at..][..H * H], stride: H };
-                matmul((run.len(), H, H), Lhs::rows(d, dy.stride), transposed, out, Accumulate::Zero);
+                let transposed = Rhs { data: &w.prepared[at..][..H * H], stride: H };
+                matmul((range.len(), H, H), Lhs::rows(d, dy.stride), transposed, out, InitialValue::Zero);
             }
         }
         let means = cache.means.as_slice().as_chunks::<H>().0;
@@ -108,8 +115,8 @@ impl Rgcn {
             #[inline(always)]
             || {
                 for (i, means) in means.chunks_exact(2).enumerate() {
-                    for (kind, j, share) in neighbours(graph, i) {
-                        add_share(&means[kind], share, dx.row_mut(j));
+                    for (kind, j, weight) in neighbours(graph, i) {
+                        add_scaled(&means[kind], weight, dx.row_mut(j));
                     }
                 }
             },
@@ -117,11 +124,11 @@ impl Rgcn {
     }
 }
 
-/// Adds `share` times `from` to `to`, both of width H.
+/// Adds `weight` times `from` to `to`, both of width H.
 #[inline(always)]
-fn add_share<T: Real>(from: &[T], share: T, to: &mut [T]) {
+fn add_scaled<T: Real>(from: &[T], weight: T, to: &mut [T]) {
     for (to, &from) in to[..H].iter_mut().zip(&from[..H]) {
-        *to = from.mul_add(share, *to);
+        *to = from.mul_add(weight, *to);
     }
 }
 
@@ -129,11 +136,11 @@ fn add_share<T: Real>(from: &[T], share: T, to: &mut [T]) {
 #[inline(always)]
 fn neighbours<T: Real>(graph: &Graph, i: usize) -> impl Iterator<Item = (usize, usize, T)> {
     let all = graph.neighbours(i);
-    let kind = |&&j: &&u32| usize::from(j as usize >= graph.first_kind());
+    let kind = |&&j: &&u32| usize::from(j as usize >= graph.first_kind_count());
     let second = all.iter().filter(|j| kind(j) == 1).count();
-    let shares = [all.len() - second, second].map(|n| T::from_f64(1.0 / n.max(1) as f64));
+    let weights = [all.len() - second, second].map(|n| T::from_f64(1.0 / n.max(1) as f64));
     all.iter().map(move |j| {
-        let kind = usize::from(*j as usize >= graph.first_kind());
-        (kind, *j as usize, shares[kind])
+        let kind = usize::from(*j as usize >= graph.first_kind_count());
+        (kind, *j as usize, weights[kind])
     })
 }

@@ -12,20 +12,20 @@ const ROW: u32 = 38;
 /// Width of the labels in pixels.
 const NAMES: u32 = 190;
 
-/// Bars as SVG. `y` labels the axis, with the unit. The height depends on the number of bars.
-pub fn bars(title: &str, y: &str, bars: &[Bar]) -> String {
+/// Bars as SVG. `value_label` labels the axis of the values, with the unit. The height depends on the number of bars.
+pub fn bars(title: &str, value_label: &str, bars: &[Bar]) -> String {
     let ends = bars.iter().flat_map(|b| [b.mean, b.low, b.high]);
     let Some(range) = extent(ends.clone()) else { return canvas::no_data(SIZE, title) };
     let range = extent([0.0, range.start, range.end].into_iter()).unwrap_or(0.0..1.0);
     // Space for the value behind the longest bar, and before a negative bar.
     let span = range.end - range.start;
     let axis = if range.start < 0.0 { range.start - 0.04 * span } else { 0.0 }..range.end + 0.14 * span;
-    let rows = bars.len().min(MOST);
+    let rows = bars.len().min(MAX_BARS);
     let size = (SIZE.0, canvas::TOP + 62 + ROW * rows as u32);
     canvas::draw(size, |sheet| {
         canvas::heading(sheet, title)?;
         // Bar i is at y = -i, so that the first is on top.
-        let mut plot = canvas::axes(sheet, [axis, 0.5 - rows as f64..0.5], [y, ""], (NAMES, 24))?;
+        let mut plot = canvas::axes(sheet, [axis, 0.5 - rows as f64..0.5], [value_label, ""], (NAMES, 24))?;
         let left = 12 + NAMES as i32;
         for (i, bar) in bars[..rows].iter().enumerate() {
             let at = -(i as f64);
@@ -52,5 +52,5 @@ pub fn bars(title: &str, y: &str, bars: &[Bar]) -> String {
     })
 }
 
-/// Largest number of bars that are drawn.
-const MOST: usize = 60;
+/// Maximum number of bars that are drawn.
+const MAX_BARS: usize = 60;

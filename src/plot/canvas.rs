@@ -163,13 +163,13 @@ pub(super) fn legend(sheet: &Sheet, entries: &[(Key, String)]) -> Drawn {
     Ok(())
 }
 
-/// `text` shortened to `most` characters. The middle is left out, as file names differ at either end.
-pub(super) fn shorten(text: &str, most: usize) -> String {
+/// `text` shortened to `max_chars` characters. The middle is left out, because file names differ at either end.
+pub(super) fn shorten(text: &str, max_chars: usize) -> String {
     let all: Vec<char> = text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
-    if all.len() <= most {
+    if all.len() <= max_chars {
         return all.into_iter().collect();
     }
-    let head = (most - 1) / 2;
-    let tail = most - 1 - head;
+    let head = (max_chars - 1) / 2;
+    let tail = max_chars - 1 - head;
     all[..head].iter().chain(&['…']).chain(&all[all.len() - tail..]).collect()
 }

@@ -10,13 +10,13 @@ use super::scale::{drawable, extent, value_axis};
 
 /// Curves with bands, or with markers and error bars, as SVG.
 pub fn lines(chart: &Chart) -> String {
-    let all = || chart.series.iter().flat_map(|s| finite(&s.points));
+    let all = || chart.series.iter().flat_map(|s| drawable_points(&s.points));
     let bands = chart.series.iter().flat_map(drawable_pieces).flatten().filter_map(|(_, band)| band).flatten();
     let (Some(x), Some(y)) = (extent(all().map(|p| p[0])), extent(all().map(|p| p[1]).chain(bands))) else {
         return canvas::no_data(SIZE, &chart.title);
     };
     // Markers do not touch the frame.
-    let x = if chart.markers { value_margin(&x) } else { x };
+    let x = if chart.markers { with_margin(&x) } else { x };
     plot(chart, [x, value_axis(&y)])
 }
 
@@ -29,8 +29,8 @@ pub fn distribution(title: &str, x: &str, series: &[(String, Vec<f64>)]) -> Stri
     let curves = series.iter().map(|(name, values)| {
         let mut values: Vec<f64> = values.iter().copied().filter(|&v| drawable(v)).collect();
         values.sort_by(f64::total_cmp);
-        let share = |i: usize| i as f64 / values.len() as f64;
-        let points = values.iter().enumerate().flat_map(|(i, &v)| [[v, share(i)], [v, share(i + 1)]]).collect();
+        let fraction = |i: usize| i as f64 / values.len() as f64;
+        let points = values.iter().enumerate().flat_map(|(i, &v)| [[v, fraction(i)], [v, fraction(i + 1)]]).collect();
         Series { name: name.clone(), points, band: None }
     });
     let chart = Chart {
@@ -107,11 +107,13 @@ fn drawable_pieces(series: &Series) -> Vec<Vec<Banded>> {
     pieces.filter(|piece| !piece.is_empty()).map(<[_]>::to_vec).collect()
 }
 
-fn finite(points: &[[f64; 2]]) -> impl Iterator<Item = [f64; 2]> {
+/// The points with drawable coordinates.
+fn drawable_points(points: &[[f64; 2]]) -> impl Iterator<Item = [f64; 2]> {
     points.iter().copied().filter(|p| p.iter().all(|&x| drawable(x)))
 }
 
-fn value_margin(extent: &Range<f64>) -> Range<f64> {
+/// `extent` with a margin at both ends.
+fn with_margin(extent: &Range<f64>) -> Range<f64> {
     let margin = 0.04 * (extent.end - extent.start);
     extent.start - margin..extent.end + margin
 }

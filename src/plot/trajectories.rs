@@ -15,9 +15,9 @@ const SIZE: (u32, u32) = (12 + AXIS + PLOT + SIDE, canvas::TOP + PLOT + 46 + 8);
 /// Width of the y axis in pixels.
 const AXIS: u32 = 54;
 /// Slots between two arrows.
-const ARROWS: usize = 4;
+const ARROW_INTERVAL: usize = 4;
 /// Users are numbered if there are at most this many.
-const NUMBERED: usize = 60;
+const MAX_NUMBERED: usize = 60;
 const USER: RGBColor = RGBColor(0x55, 0x55, 0x55);
 const START: RGBColor = RGBColor(0x22, 0x22, 0x22);
 
@@ -52,7 +52,7 @@ pub fn trajectories(title: &str, shown: &Trajectories) -> String {
         }
         for (number, [x, y]) in &users {
             area.draw(&Circle::new((*x, *y), 5, USER.filled()))?;
-            if users.len() <= NUMBERED {
+            if users.len() <= MAX_NUMBERED {
                 let label =
                     EmptyElement::at((*x, *y)) + Text::new(number.to_string(), (8, -10), text(15, INK, HPos::Left, VPos::Center));
                 area.draw(&label)?;
@@ -71,7 +71,7 @@ pub fn trajectories(title: &str, shown: &Trajectories) -> String {
 /// Every few slots, an arrow in the middle of the move; `size` is in units of the axes.
 fn arrows(plot: &mut Plot, i: usize, path: &[Point], size: f64) -> Drawn {
     // Paths of several UAVs often overlap, so their arrows are at different slots.
-    for step in path.windows(2).skip((1 + i) % ARROWS).step_by(ARROWS) {
+    for step in path.windows(2).skip((1 + i) % ARROW_INTERVAL).step_by(ARROW_INTERVAL) {
         let [from, to] = [step[0], step[1]];
         let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
         let length = dx.hypot(dy);

@@ -9,11 +9,11 @@
 //! Each layer computes all slots of all fleets at once. UAV rows are time-major: slot, fleet, UAV.
 
 use super::config::{AgentConfig, Aggregation, Gnn, Identity, ObservationKind};
-use super::features::{Inputs, SetEncoder, flat_observation, identity_width, write_rest};
+use super::features::{Inputs, SetEncoder, flat_observation, identity_width, write_action_identity_position};
 use super::geometry::{Geometry, GeometryConfig};
 use super::hop_search::HopSearch;
 use crate::invalid::Invalid;
-use crate::nn::matmul::Accumulate;
+use crate::nn::matmul::InitialValue;
 use crate::nn::{
     Batch, GraphLayer, Gru, HIDDEN, LayerCache, LayerScratch, Linear, Mlp, MlpCache, ParameterLayout, Real, Rows, Weights,
     leaky_relu, leaky_relu_back, relu, relu_back,
@@ -30,8 +30,8 @@ pub struct Dims {
     pub actions: usize,
     /// d.
     pub detection_range: f64,
-    /// K, by which AoI is divided.
-    pub slots: usize,
+    /// K, the slots of an episode, by which AoI is divided.
+    pub episode_slots: usize,
 }
 
 /// An agent's architecture and the layout of its parameters.
@@ -86,7 +86,7 @@ struct Scratch<T: Real> {
 impl<T: Real> AgentCache<T> {
     /// Allocates for `slots` slots of `rows` UAVs, and returns the hidden states before the first slot for the caller to fill in.
     pub fn begin(&mut self, rows: usize, slots: usize) -> &mut [T] {
-        self.h.reset(HIDDEN, rows * (slots + 1));
+        self.h.resize(HIDDEN, rows * (slots + 1));
         &mut self.h.as_mut_slice()[..rows * HIDDEN]
     }
 
@@ -141,10 +141,16 @@ impl Agent {
     }
 
     /// Configuration of geometries for this agent.
-    pub fn geometry(&self) -> GeometryConfig {
+    pub fn geometry_config(&self) -> GeometryConfig {
         let layers = if self.config.gnn == Gnn::None { 0 } else { self.config.layers };
-        let Dims { detection_range, slots, .. } = self.dims;
-        GeometryConfig { range: detection_range, slots, layers, self_loops: self.config.self_loops, hops: self.config.hops }
+        let Dims { detection_range, episode_slots, .. } = self.dims;
+        GeometryConfig {
+            range: detection_range,
+            episode_slots,
+            layers,
+            self_loops: self.config.self_loops,
+            hops: self.config.hops,
+        }
     }
 
     /// Checks whether the agent fits a fleet. With flat observations, M and N must be those that the agent was made for; with one-hot
@@ -173,20 +179,20 @@ impl Agent {
         Ok(())
     }
 
-    /// Fills `transposed` (see [`Weights`]). Both vectors have at least the length of the layout.
-    pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
+    /// Fills `prepared` (see [`Weights`]). Both vectors have at least the length of the layout.
+    pub fn prepare<T: Real>(&self, params: &[T], prepared: &mut [T]) {
         if let Some(sets) = &self.sets {
-            sets.prepare(flat, transposed);
+            sets.prepare(params, prepared);
         }
-        self.fc.prepare(flat, transposed);
-        self.rnn.prepare(flat, transposed);
+        self.fc.prepare(params, prepared);
+        self.rnn.prepare(params, prepared);
         match &self.body {
-            Body::Plain { head } => head.prepare(flat, transposed),
+            Body::Plain { head } => head.prepare(params, prepared),
             Body::Graph { w1, w2, layers, head } => {
-                w1.prepare(flat, transposed);
-                w2.prepare(flat, transposed);
-                layers.iter().for_each(|layer| layer.prepare(flat, transposed));
-                head.prepare(flat, transposed);
+                w1.prepare(params, prepared);
+                w2.prepare(params, prepared);
+                layers.iter().for_each(|layer| layer.prepare(params, prepared));
+                head.prepare(params, prepared);
             }
         }
     }
@@ -208,7 +214,11 @@ impl Agent {
             Some(sets) => sets.forward(w, (geometry, first), search, (out, stride)),
             None => {
                 for (r, out) in out.chunks_exact_mut(stride).enumerate() {
-                    flat_observation(&geometry.view(first + r, search), self.flat_scale(), &mut out[..self.observation_width]);
+                    flat_observation(
+                        &geometry.view_of_row(first + r, search),
+                        self.flat_scale(),
+                        &mut out[..self.observation_width],
+                    );
                 }
             }
         }
@@ -234,33 +244,33 @@ impl Agent {
     pub fn forward<T: Real>(&self, w: Weights<'_, T>, inputs: &Inputs<'_>, slots: usize, c: &mut AgentCache<T>) {
         let uavs = inputs.geometry.uav_rows();
         let rows = inputs.geometry.rows();
-        c.input.reset(self.fc.inputs, uavs);
+        c.input.resize(self.fc.inputs, uavs);
         self.observe(w, (inputs.geometry, 0), &mut c.search, (c.input.as_mut_slice(), self.fc.inputs));
         for (r, input) in c.input.as_mut_slice().chunks_exact_mut(self.fc.inputs).enumerate() {
-            write_rest(&self.config, self.dims.actions, inputs, r, &mut input[self.observation_width..]);
+            write_action_identity_position(&self.config, self.dims.actions, inputs, r, &mut input[self.observation_width..]);
         }
-        c.x.reset(HIDDEN, uavs);
+        c.x.resize(HIDDEN, uavs);
         self.fc.forward(w, c.input.rows(), c.x.rows_mut());
         relu(c.x.as_mut_slice());
         self.rnn.forward(w, c.x.rows(), slots, &mut c.gates, &mut c.h);
         let h = hidden(&c.h, uavs);
-        c.q.reset(self.dims.actions, uavs);
+        c.q.resize(self.dims.actions, uavs);
         match &self.body {
             Body::Plain { head } => head.forward(w, h, c.q.rows_mut()),
             Body::Graph { w1, w2, layers, head } => {
                 let graph = inputs.geometry.graph();
-                c.user_obs.reset(self.observation_width, rows - uavs);
+                c.user_obs.resize(self.observation_width, rows - uavs);
                 let out = (c.user_obs.as_mut_slice(), self.observation_width);
                 self.observe(w, (inputs.geometry, uavs), &mut c.search, out);
                 c.y.resize_with(layers.len() + 1, Batch::default);
                 c.layers.resize_with(layers.len(), LayerCache::default);
-                c.y[0].reset(HIDDEN, rows);
+                c.y[0].resize(HIDDEN, rows);
                 w1.forward(w, h, c.y[0].range_mut(0..uavs));
                 w2.forward(w, c.user_obs.rows(), c.y[0].range_mut(uavs..rows));
                 leaky_relu(c.y[0].as_mut_slice());
                 for (l, layer) in layers.iter().enumerate() {
                     let [x, y] = &mut c.y[l..l + 2] else { unreachable!("one batch more than layers") };
-                    y.reset(HIDDEN, graph.span(l, layers.len()).1);
+                    y.resize(HIDDEN, graph.span(l, layers.len()).1);
                     layer.forward(w, graph, x.rows(), &mut c.layers[l], y.rows_mut());
                     if l + 1 < layers.len() {
                         relu(y.as_mut_slice());
@@ -283,16 +293,16 @@ impl Agent {
         let uavs = inputs.geometry.uav_rows();
         let h = hidden(&c.h, uavs);
         let s = &mut c.scratch;
-        s.dh.reset(HIDDEN, uavs);
+        s.dh.resize(HIDDEN, uavs);
         match &self.body {
-            Body::Plain { head } => head.backward(w.flat, h, dq, grads, Some(s.dh.rows_mut())),
+            Body::Plain { head } => head.backward(w.params, h, dq, grads, Some(s.dh.rows_mut())),
             Body::Graph { w1, w2, layers, head } => {
                 let graph = inputs.geometry.graph();
-                head.backward(w.flat, (h, c.y[layers.len()].rows(), HIDDEN), dq, &mut c.head, grads);
+                head.backward(w.params, (h, c.y[layers.len()].rows(), HIDDEN), dq, &mut c.head, grads);
                 let d = head.d_first(&c.head);
-                head.first.backward_input(w.flat, (0, HIDDEN), d, s.dh.rows_mut(), Accumulate::Zero);
-                s.dy.reset(HIDDEN, uavs);
-                head.first.backward_input(w.flat, (HIDDEN, HIDDEN), d, s.dy.rows_mut(), Accumulate::Zero);
+                head.first.backward_input(w.params, (0, HIDDEN), d, s.dh.rows_mut(), InitialValue::Zero);
+                s.dy.resize(HIDDEN, uavs);
+                head.first.backward_input(w.params, (HIDDEN, HIDDEN), d, s.dy.rows_mut(), InitialValue::Zero);
                 for (l, layer) in layers.iter().enumerate().rev() {
                     if l + 1 < layers.len() {
                         relu_back(c.y[l + 1].as_slice(), s.dy.as_mut_slice());
@@ -305,23 +315,23 @@ impl Agent {
                 let (own, users) = (s.dy.range(0..uavs), s.dy.range(uavs..s.dy.len()));
                 w1.backward_bias(own, grads);
                 w1.backward_part((0, HIDDEN), h, own, grads);
-                w1.backward_input(w.flat, (0, HIDDEN), own, s.dh.rows_mut(), Accumulate::Add);
+                w1.backward_input(w.params, (0, HIDDEN), own, s.dh.rows_mut(), InitialValue::Previous);
                 w2.backward_bias(users, grads);
                 w2.backward_part((0, self.observation_width), c.user_obs.rows(), users, grads);
                 if let Some(sets) = &self.sets {
-                    s.observation.reset(SetEncoder::WIDTH, users.len);
-                    w2.backward_input(w.flat, (0, SetEncoder::WIDTH), users, s.observation.rows_mut(), Accumulate::Zero);
+                    s.observation.resize(SetEncoder::WIDTH, users.len);
+                    w2.backward_input(w.params, (0, SetEncoder::WIDTH), users, s.observation.rows_mut(), InitialValue::Zero);
                     sets.backward(w, (inputs.geometry, uavs), &mut c.search, s.observation.rows(), grads);
                 }
             }
         }
-        self.rnn.backward(w.flat, (c.x.rows(), slots), &c.h, (&mut c.gates, &mut s.dh), grads);
-        self.rnn.backward_input(w.flat, &c.gates, &mut s.dx);
+        self.rnn.backward(w.params, (c.x.rows(), slots), &c.h, (&mut c.gates, &mut s.dh), grads);
+        self.rnn.backward_input(w.params, &c.gates, &mut s.dx);
         relu_back(c.x.as_slice(), s.dx.as_mut_slice());
-        self.fc.backward(w.flat, c.input.rows(), s.dx.rows(), grads, None);
+        self.fc.backward(w.params, c.input.rows(), s.dx.rows(), grads, None);
         if let Some(sets) = &self.sets {
-            s.observation.reset(SetEncoder::WIDTH, uavs);
-            self.fc.backward_input(w.flat, (0, SetEncoder::WIDTH), s.dx.rows(), s.observation.rows_mut(), Accumulate::Zero);
+            s.observation.resize(SetEncoder::WIDTH, uavs);
+            self.fc.backward_input(w.params, (0, SetEncoder::WIDTH), s.dx.rows(), s.observation.rows_mut(), InitialValue::Zero);
             sets.backward(w, (inputs.geometry, 0), &mut c.search, s.observation.rows(), grads);
         }
     }

@@ -3,7 +3,7 @@
 use super::config::{AgentConfig, Identity, TOKEN};
 use super::geometry::{Geometry, NodeView};
 use super::hop_search::HopSearch;
-use crate::nn::{Embedding, EmbeddingGrad, HIDDEN, ParameterLayout, Real, Rows, Weights, simd};
+use crate::nn::{Embedding, EmbeddingParams, HIDDEN, ParameterLayout, Real, Rows, Weights, simd};
 
 /// Last action of a UAV in slot 0.
 pub const NO_ACTION: u8 = u8::MAX;
@@ -16,7 +16,7 @@ pub struct Inputs<'a> {
     /// Last action per UAV row, [`NO_ACTION`] in slot 0.
     pub last: &'a [u8],
     /// Identity token per UAV row; used with identity `token`.
-    pub token: &'a [f32],
+    pub identity_token: &'a [f32],
     /// Own position (x, y) per UAV row; used with `self_position`.
     pub position: &'a [f32],
 }
@@ -29,7 +29,11 @@ pub fn flat_observation<T: Real>(view: &NodeView<'_>, scale: f64, out: &mut [T])
     let scaled = |x: f32| T::from_f64(f64::from(x) * scale);
     let (detected_uavs, detected_users) = out.split_at_mut(2 * uavs);
     let mut user = |j: usize, rel: [f32; 2]| {
-        detected_users[3 * j..3 * j + 3].copy_from_slice(&[scaled(rel[0]), scaled(rel[1]), T::from_f64(view.aoi[j].into())]);
+        detected_users[3 * j..3 * j + 3].copy_from_slice(&[
+            scaled(rel[0]),
+            scaled(rel[1]),
+            T::from_f64(view.aoi_scaled[j].into()),
+        ]);
     };
     if view.node >= uavs {
         user(view.node - uavs, [0.0; 2]);
@@ -43,17 +47,27 @@ pub fn flat_observation<T: Real>(view: &NodeView<'_>, scale: f64, out: &mut [T])
     }
 }
 
-/// Writes the flat state of a fleet, of width 2M + 3N (docs/model.md, "Flat state"). `aoi` is in slots, `slots` is K.
-pub fn flat_state<T: Real>(uav_xy: &[f32], user_xy: &[f32], aoi: &[f32], slots: usize, out: &mut [T]) {
+/// Writes the flat state of a fleet, of width 2M + 3N (docs/model.md, "Flat state"). `aoi` is in slots, `episode_slots` is K.
+pub fn flat_state<T: Real>(uav_xy: &[f32], user_xy: &[f32], aoi: &[f32], episode_slots: usize, out: &mut [T]) {
     let (uavs, users) = out.split_at_mut(uav_xy.len());
     uavs.iter_mut().zip(uav_xy).for_each(|(s, &x)| *s = T::from_f64(x.into()));
     for (user, (xy, a)) in users.chunks_exact_mut(3).zip(user_xy.chunks_exact(2).zip(aoi)) {
-        user.copy_from_slice(&[T::from_f64(xy[0].into()), T::from_f64(xy[1].into()), T::from_f64((a / slots as f32).into())]);
+        user.copy_from_slice(&[
+            T::from_f64(xy[0].into()),
+            T::from_f64(xy[1].into()),
+            T::from_f64((a / episode_slots as f32).into()),
+        ]);
     }
 }
 
-/// Writes the part of a UAV's input that follows the observation (docs/model.md, "UAV input").
-pub(super) fn write_rest<T: Real>(config: &AgentConfig, actions: usize, inputs: &Inputs<'_>, row: usize, out: &mut [T]) {
+/// Writes the part of a UAV's input that follows the observation: last action, identity, own position (docs/model.md, "UAV input").
+pub(super) fn write_action_identity_position<T: Real>(
+    config: &AgentConfig,
+    actions: usize,
+    inputs: &Inputs<'_>,
+    row: usize,
+    out: &mut [T],
+) {
     out.fill(T::ZERO);
     let (last, rest) = out.split_at_mut(actions);
     if inputs.last[row] != NO_ACTION {
@@ -70,7 +84,7 @@ pub(super) fn write_rest<T: Real>(config: &AgentConfig, actions: usize, inputs: 
             own.copy_from_slice(&[T::from_f64(angle.cos()), T::from_f64(angle.sin())]);
         }
         Identity::Token => {
-            let token = &inputs.token[row * TOKEN..][..TOKEN];
+            let token = &inputs.identity_token[row * TOKEN..][..TOKEN];
             own.iter_mut().zip(token).for_each(|(o, &t)| *o = T::from_f64(t.into()));
         }
     }
@@ -109,9 +123,9 @@ impl SetEncoder {
         Self { uav, user: Embedding::new(layout, &format!("{name}.user")), scale: 1.0 / range }
     }
 
-    pub(super) fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
-        self.uav.prepare(flat, transposed);
-        self.user.prepare(flat, transposed);
+    pub(super) fn prepare<T: Real>(&self, params: &[T], prepared: &mut [T]) {
+        self.uav.prepare(params, prepared);
+        self.user.prepare(params, prepared);
     }
 
     /// Writes the observations of rows `first` and following to the first columns of `out`, whose rows are `stride` apart.
@@ -122,13 +136,13 @@ impl SetEncoder {
         search: &mut HopSearch,
         (out, stride): (&mut [T], usize),
     ) {
-        let (uav, user, scale) = (self.uav.load(w), self.user.load(w), self.scale);
+        let (uav, user, scale) = (self.uav.params(w), self.user.params(w), self.scale);
         simd(
             #[inline(always)]
             || {
                 for (r, out) in out.chunks_exact_mut(stride).enumerate() {
                     let [uavs, users] = out[..Self::WIDTH].as_chunks_mut::<HIDDEN>().0 else { unreachable!("two halves") };
-                    encode(&geometry.view(first + r, search), scale, (&uav, &user), (uavs, users));
+                    encode(&geometry.view_of_row(first + r, search), scale, (&uav, &user), (uavs, users));
                 }
             },
         );
@@ -143,15 +157,15 @@ impl SetEncoder {
         d: Rows<'_, T>,
         grads: &mut [T],
     ) {
-        let (uav, user, scale) = (self.uav.load(w), self.user.load(w), self.scale);
-        let (mut uav_sums, mut user_sums) = (EmbeddingGrad::zero(), EmbeddingGrad::zero());
+        let (uav, user, scale) = (self.uav.params(w), self.user.params(w), self.scale);
+        let (mut uav_sums, mut user_sums) = (EmbeddingParams::zero(), EmbeddingParams::zero());
         simd(
             #[inline(always)]
             || {
                 for (r, d) in d.data.chunks(d.stride).take(d.len).enumerate() {
                     let [uavs, users] = d[..Self::WIDTH].as_chunks::<HIDDEN>().0 else { unreachable!("two halves") };
                     let sums = (&mut uav_sums, &mut user_sums);
-                    encode_back(&geometry.view(first + r, search), scale, (&uav, &user), (uavs, users), sums);
+                    encode_back(&geometry.view_of_row(first + r, search), scale, (&uav, &user), (uavs, users), sums);
                 }
             },
         );
@@ -164,7 +178,7 @@ impl SetEncoder {
 fn encode<T: Real>(
     view: &NodeView<'_>,
     scale: f64,
-    (uav, user): (&EmbeddingGrad<T, 2>, &EmbeddingGrad<T, 3>),
+    (uav, user): (&EmbeddingParams<T, 2>, &EmbeddingParams<T, 3>),
     (uav_sum, user_sum): (&mut [T; HIDDEN], &mut [T; HIDDEN]),
 ) {
     let (mut uavs, mut users) = ([T::ZERO; HIDDEN], [T::ZERO; HIDDEN]);
@@ -177,9 +191,9 @@ fn encode<T: Real>(
 fn encode_back<T: Real>(
     view: &NodeView<'_>,
     scale: f64,
-    (uav, user): (&EmbeddingGrad<T, 2>, &EmbeddingGrad<T, 3>),
+    (uav, user): (&EmbeddingParams<T, 2>, &EmbeddingParams<T, 3>),
     (d_uav, d_user): (&[T; HIDDEN], &[T; HIDDEN]),
-    (uav_sums, user_sums): (&mut EmbeddingGrad<T, 2>, &mut EmbeddingGrad<T, 3>),
+    (uav_sums, user_sums): (&mut EmbeddingParams<T, 2>, &mut EmbeddingParams<T, 3>),
 ) {
     for_each_detected(view, scale, |point| uav.backward(point, d_uav, uav_sums), |point| user.backward(point, d_user, user_sums));
 }
@@ -188,7 +202,7 @@ fn encode_back<T: Real>(
 #[inline(always)]
 fn for_each_detected<T: Real>(view: &NodeView<'_>, scale: f64, mut uav: impl FnMut([T; 2]), mut user: impl FnMut([T; 3])) {
     let m = view.fleet.uavs;
-    let aoi = |node: usize| T::from_f64(view.aoi[node - m].into());
+    let aoi = |node: usize| T::from_f64(view.aoi_scaled[node - m].into());
     if view.node >= m {
         user([T::ZERO, T::ZERO, aoi(view.node)]);
     }

@@ -4,9 +4,9 @@
 //! Networks compute *rows*: first all UAVs in the order given, then the users within L links of a UAV, ordered by the number
 //! of links to the nearest UAV, for L graph layers. Other users have no row and are never computed.
 
+use super::fleet_graph::FleetGraph;
 use super::hop_search::HopSearch;
 use super::neighbor_search::{Detection, NeighborSearch};
-use super::slot::Slot;
 use crate::env::{Point, points};
 use crate::nn::Graph;
 
@@ -46,7 +46,7 @@ pub struct NodeView<'a> {
     /// What the node detects, in ascending order of target, without the node itself.
     pub detections: &'a [Detection],
     /// AoI / K of the fleet's users.
-    pub aoi: &'a [f32],
+    pub aoi_scaled: &'a [f32],
 }
 
 /// The graphs of a batch. Rebuilding a geometry keeps its allocations.
@@ -56,7 +56,8 @@ pub struct Geometry {
     /// The detections of node i (over all fleets) are `detections[offsets[i]..offsets[i + 1]]`.
     offsets: Vec<u32>,
     detections: Vec<Detection>,
-    aoi: Vec<f32>,
+    /// AoI / K of all users.
+    aoi_scaled: Vec<f32>,
     rows: Vec<Row>,
     row_of: Vec<u32>,
     graph: Graph,
@@ -70,8 +71,8 @@ pub struct Geometry {
 pub struct GeometryConfig {
     /// d.
     pub range: f64,
-    /// K, by which AoI is divided.
-    pub slots: usize,
+    /// K, the slots of an episode, by which AoI is divided.
+    pub episode_slots: usize,
     /// Number of graph layers; 0 without a graph.
     pub layers: usize,
     /// Whether a node is its own neighbour.
@@ -94,13 +95,13 @@ impl Geometry {
         self.offsets.clear();
         self.offsets.push(0);
         self.detections.clear();
-        self.aoi.clear();
+        self.aoi_scaled.clear();
         self.row_of.clear();
     }
 
     fn add_fleet(&mut self, uavs: usize, users: usize) {
         let first_uav = self.fleets.last().map_or(0, |f| f.first_uav + f.uavs);
-        self.fleets.push(FleetSpan { uavs, users, first_uav, first_node: self.row_of.len(), first_user: self.aoi.len() });
+        self.fleets.push(FleetSpan { uavs, users, first_uav, first_node: self.row_of.len(), first_user: self.aoi_scaled.len() });
         self.row_of.resize(self.row_of.len() + uavs + users, NO_ROW);
     }
 
@@ -114,19 +115,19 @@ impl Geometry {
         let lists = (&mut self.offsets, &mut self.detections);
         self.search.append_detections(&self.points, observers, config.range, lists, usize::MAX);
         self.offsets.resize(self.row_of.len() + 1, self.detections.len() as u32);
-        self.aoi.extend(aoi.iter().map(|a| a / config.slots as f32));
+        self.aoi_scaled.extend(aoi.iter().map(|a| a / config.episode_slots as f32));
     }
 
     /// Adds a fleet from what its nodes detect.
-    pub fn push_slot(&mut self, config: &GeometryConfig, slot: &Slot) {
-        self.add_fleet(slot.uavs(), slot.users());
-        let observers = config.observers(slot.uavs(), slot.users());
+    pub fn push_graph(&mut self, config: &GeometryConfig, graph: &FleetGraph) {
+        self.add_fleet(graph.uavs(), graph.users());
+        let observers = config.observers(graph.uavs(), graph.users());
         for i in 0..observers {
-            self.detections.extend_from_slice(slot.detections(i));
+            self.detections.extend_from_slice(graph.detections(i));
             self.offsets.push(self.detections.len() as u32);
         }
         self.offsets.resize(self.row_of.len() + 1, self.detections.len() as u32);
-        self.aoi.extend(slot.aoi().iter().map(|a| a / config.slots as f32));
+        self.aoi_scaled.extend(graph.aoi().iter().map(|a| a / config.episode_slots as f32));
     }
 
     /// Orders the rows and builds the graph; call it after the last fleet.
@@ -178,7 +179,7 @@ impl Geometry {
 
     /// Number of UAV rows, which come first.
     pub fn uav_rows(&self) -> usize {
-        self.graph.first_kind()
+        self.graph.first_kind_count()
     }
 
     /// Number of rows.
@@ -205,26 +206,26 @@ impl Geometry {
 
     /// What the node of row `r` observes.
     #[inline(always)]
-    pub fn view<'a>(&'a self, r: usize, search: &'a mut HopSearch) -> NodeView<'a> {
+    pub fn view_of_row<'a>(&'a self, r: usize, search: &'a mut HopSearch) -> NodeView<'a> {
         let (fleet, node) = self.node_of_row(r);
         self.view_in(fleet, node, search)
     }
 
     /// What node `node` of fleet number `fleet` observes, whether the node has a row or not.
-    pub fn node<'a>(&'a self, fleet: usize, node: usize, search: &'a mut HopSearch) -> NodeView<'a> {
+    pub fn view_of_node<'a>(&'a self, fleet: usize, node: usize, search: &'a mut HopSearch) -> NodeView<'a> {
         self.view_in(&self.fleets[fleet], node, search)
     }
 
     /// With `hops` > 1 the view is searched for anew each time: kept for all UAVs, the views could hold M x V detections.
     #[inline(always)]
     fn view_in<'a>(&'a self, fleet: &'a FleetSpan, node: usize, search: &'a mut HopSearch) -> NodeView<'a> {
-        let aoi = &self.aoi[fleet.first_user..][..fleet.users];
+        let aoi_scaled = &self.aoi_scaled[fleet.first_user..][..fleet.users];
         let offsets = &self.offsets[fleet.first_node..][..=fleet.uavs + fleet.users];
         let detections = if self.hops > 1 {
             search.find(node, self.hops, offsets, &self.detections)
         } else {
             &self.detections[offsets[node] as usize..offsets[node + 1] as usize]
         };
-        NodeView { fleet, node, detections, aoi }
+        NodeView { fleet, node, detections, aoi_scaled }
     }
 }

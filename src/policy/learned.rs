@@ -19,8 +19,8 @@ use crate::rng;
 #[derive(Debug)]
 pub struct LearnedPolicy {
     agent: Agent,
-    flat: Vec<f32>,
-    transposed: Vec<f32>,
+    params: Vec<f32>,
+    prepared: Vec<f32>,
     /// Buffers of finished calls, for the next calls.
     buffers: Mutex<Vec<Buffers>>,
 }
@@ -30,7 +30,7 @@ struct Buffers {
     geometry: Geometry,
     cache: AgentCache<f32>,
     last: Vec<u8>,
-    token: Vec<f32>,
+    identity_token: Vec<f32>,
     position: Vec<f32>,
 }
 
@@ -48,9 +48,9 @@ impl LearnedPolicy {
         if let Some(bad) = params.iter().find(|x| !x.is_finite()) {
             return Err(Invalid::new("parameters", bad, "only finite numbers"));
         }
-        let mut transposed = vec![0.0; len];
-        agent.prepare(&params, &mut transposed);
-        Ok(Self { agent, flat: params, transposed, buffers: Mutex::default() })
+        let mut prepared = vec![0.0; len];
+        agent.prepare(&params, &mut prepared);
+        Ok(Self { agent, params, prepared, buffers: Mutex::default() })
     }
 
     /// The architecture.
@@ -60,7 +60,7 @@ impl LearnedPolicy {
 
     /// The parameters, in the order of the agent's layout.
     pub fn parameters(&self) -> &[f32] {
-        &self.flat
+        &self.params
     }
 
     fn has_token(&self) -> bool {
@@ -119,20 +119,20 @@ impl Policy for LearnedPolicy {
 impl LearnedPolicy {
     fn run(&self, fleets: &mut [FleetStep<'_>], b: &mut Buffers) {
         let stride = self.stride();
-        let config = self.agent.geometry();
+        let config = self.agent.geometry_config();
         b.geometry.clear();
         b.last.clear();
-        b.token.clear();
+        b.identity_token.clear();
         b.position.clear();
         for fleet in fleets.iter() {
-            b.geometry.push_slot(&config, fleet.slot);
+            b.geometry.push_graph(&config, fleet.graph);
             for uav in fleet.memory.chunks_exact(stride) {
                 // The memory may come from a client. A number that is not a heading counts as no heading.
                 let known = (0.0..self.actions() as f32).contains(&uav[HIDDEN]);
                 b.last.push(if known { uav[HIDDEN] as u8 } else { NO_ACTION });
-                b.token.extend_from_slice(&uav[HIDDEN + 1..]);
+                b.identity_token.extend_from_slice(&uav[HIDDEN + 1..]);
             }
-            if let Some(own) = fleet.slot.uav_positions() {
+            if let Some(own) = fleet.graph.uav_positions() {
                 b.position.extend(own.iter().flatten().map(|&x| x as f32));
             }
         }
@@ -142,8 +142,8 @@ impl LearnedPolicy {
         for (h, uav) in b.cache.begin(rows, 1).chunks_exact_mut(HIDDEN).zip(memories) {
             h.copy_from_slice(&uav[..HIDDEN]);
         }
-        let inputs = Inputs { geometry: &b.geometry, last: &b.last, token: &b.token, position: &b.position };
-        let weights = Weights { flat: &self.flat, transposed: &self.transposed };
+        let inputs = Inputs { geometry: &b.geometry, last: &b.last, identity_token: &b.identity_token, position: &b.position };
+        let weights = Weights { params: &self.params, prepared: &self.prepared };
         self.agent.forward(weights, &inputs, 1, &mut b.cache);
         let mut after = b.cache.last_hidden(rows).chunks_exact(HIDDEN).zip(b.cache.q.as_slice().chunks_exact(self.actions()));
         for fleet in fleets {

@@ -1,26 +1,26 @@
 //! Policies: observations, agents, mixers, baselines, and the trait that all policies implement.
 
-mod actor;
 mod agent;
 pub mod baselines;
+mod batched_agent;
 mod config;
 mod features;
+mod fleet_graph;
 mod geometry;
 mod hop_search;
 mod learned;
 pub mod mixer;
 mod neighbor_search;
-mod slot;
 
-pub use actor::{Actor, StepInput};
 pub use agent::{Agent, AgentCache, Dims};
+pub use batched_agent::{BatchedAgent, StepInput};
 pub use config::{AgentConfig, Aggregation, Gnn, Identity, ObservationKind, TOKEN};
 pub use features::{Inputs, NO_ACTION, SetEncoder, flat_observation, flat_state};
+pub use fleet_graph::FleetGraph;
 pub use geometry::{FleetSpan, Geometry, GeometryConfig, NodeView};
 pub use hop_search::HopSearch;
 pub use learned::LearnedPolicy;
 pub use neighbor_search::Detection;
-pub use slot::Slot;
 
 use crate::invalid::Invalid;
 
@@ -37,8 +37,8 @@ pub enum RequiredInput {
 
 /// One fleet in one slot, as an item of a batch: input, memory and output.
 pub struct FleetStep<'a> {
-    /// The observations of all nodes.
-    pub slot: &'a Slot,
+    /// What all nodes detect.
+    pub graph: &'a FleetGraph,
     /// Index of the slot in the episode.
     pub step: u64,
     /// The fleet's memory, of length [`Policy::memory_len`]; updated in place.

@@ -41,8 +41,8 @@ impl Grid {
         let extent = (fold(0, f64::max) - low[0]).max(fold(1, f64::max) - low[1]);
         // At most a few cells per node. Cells are slightly wider than the range, so that rounding cannot put a pair within
         // range two cells apart.
-        let most = (points.len() as f64).sqrt().ceil() * 2.0;
-        let size = (range * (1.0 + 1e-9)).max(extent / most).max(f64::MIN_POSITIVE);
+        let max_cells = (points.len() as f64).sqrt().ceil() * 2.0;
+        let size = (range * (1.0 + 1e-9)).max(extent / max_cells).max(f64::MIN_POSITIVE);
         Self { low, size, side: (extent / size) as usize + 1 }
     }
 
@@ -54,21 +54,21 @@ impl Grid {
 
 impl NeighborSearch {
     /// Appends what nodes 0..`observers` detect among all `points`, each list in ascending order of target and without the node
-    /// itself, and the end of each list to `offsets`. Stops and returns false when `detections` is longer than `most`.
+    /// itself, and the end of each list to `offsets`. Stops and returns false when `detections` is longer than `max_detections`.
     pub(super) fn append_detections(
         &mut self,
         points: &[Point],
         observers: usize,
         range: f64,
         (offsets, detections): (&mut Vec<u32>, &mut Vec<Detection>),
-        most: usize,
+        max_detections: usize,
     ) -> bool {
         if points.len() <= ALL_PAIRS {
             for (i, &from) in points[..observers].iter().enumerate() {
                 detections.extend(points.iter().enumerate().filter_map(|(j, &to)| detect(i, from, j, to, range)));
                 offsets.push(detections.len() as u32);
             }
-            return detections.len() <= most;
+            return detections.len() <= max_detections;
         }
         let grid = Grid::new(points, range);
         self.sort_into_cells(points, &grid);
@@ -83,7 +83,7 @@ impl NeighborSearch {
             }
             detections[first..].sort_unstable_by_key(|d| d.target);
             offsets.push(detections.len() as u32);
-            if detections.len() > most {
+            if detections.len() > max_detections {
                 return false;
             }
         }

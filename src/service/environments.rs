@@ -30,7 +30,7 @@ pub struct NewEnvironment {
 pub async fn create(app: &App, new: NewEnvironment) -> Result<EnvironmentInfo, Error> {
     app.admit()?;
     let NewEnvironment { id, environment, seed, count, auto_reset } = new;
-    let spec = EnvironmentSpec::new(train_config::environment(environment)?, count, seed, auto_reset)?;
+    let spec = EnvironmentSpec::new(train_config::parse_environment(environment)?, count, seed, auto_reset)?;
     Ok(app.environments.create(id, spec).await?)
 }
 

@@ -1,12 +1,12 @@
-//! The input of one fleet in one slot, and its conversion to the [`Slot`] that a policy reads.
+//! The input of one fleet in one slot, and its conversion to the [`FleetGraph`] that a policy reads.
 //!
-//! `api::convert` builds an [`FleetInput`] and checks everything that does not depend on the policy. This file applies the
+//! `api::convert` builds a [`FleetInput`] and checks everything that does not depend on the policy. This file applies the
 //! policy's detection range and needs: it computes the detections of a scene, and completes a graph.
 
 use super::FleetIds;
 use crate::env::Point;
 use crate::invalid::Invalid;
-use crate::policy::{Detection, Policy, RequiredInput, Slot};
+use crate::policy::{Detection, FleetGraph, Policy, RequiredInput};
 
 /// Maximum number of nodes of one fleet.
 pub const MAX_NODES: usize = 20_000;
@@ -109,25 +109,24 @@ impl FleetInput {
     /// # Errors
     /// [`Invalid`] if the fleet does not fit the policy, if something that the policy needs is missing, if a
     /// detection lies beyond its range, or if there are too many detections.
-    pub fn into_slot(self, policy: &dyn Policy) -> Result<Slot, Invalid> {
+    pub fn into_fleet_graph(self, policy: &dyn Policy) -> Result<FleetGraph, Invalid> {
         let size = (self.uavs(), self.users());
-        self.content.into_slot(size, policy)
+        self.content.into_fleet_graph(size, policy)
     }
 }
 
 impl SceneOrGraph {
-    /// As [`FleetInput::into_slot`], for a fleet of `(uavs, users)`.
+    /// As [`FleetInput::into_fleet_graph`], for a fleet of `(uavs, users)`.
     ///
     /// # Errors
-    /// As [`FleetInput::into_slot`].
-    pub fn into_slot(self, (uavs, users): (usize, usize), policy: &dyn Policy) -> Result<Slot, Invalid> {
+    /// As [`FleetInput::into_fleet_graph`].
+    pub fn into_fleet_graph(self, (uavs, users): (usize, usize), policy: &dyn Policy) -> Result<FleetGraph, Invalid> {
         policy.check_fleet(uavs, users)?;
         let range = policy.detection_range();
         match self {
-            Self::Scene(Scene { uavs, users, aoi }) => {
-                Slot::from_scene_within(&uavs, &users, &aoi, range, MAX_DETECTIONS).ok_or_else(|| too_many_detections("scene"))
-            }
-            Self::Graph(graph) => graph.into_slot(policy.needs(), range),
+            Self::Scene(Scene { uavs, users, aoi }) => FleetGraph::from_scene_within(&uavs, &users, &aoi, range, MAX_DETECTIONS)
+                .ok_or_else(|| too_many_detections("scene")),
+            Self::Graph(graph) => graph.into_fleet_graph(policy.needs(), range),
         }
     }
 }
@@ -142,7 +141,7 @@ fn is_within(rel: &Point, range: f64) -> bool {
 }
 
 impl Graph {
-    fn into_slot(self, needs: RequiredInput, range: f64) -> Result<Slot, Invalid> {
+    fn into_fleet_graph(self, needs: RequiredInput, range: f64) -> Result<FleetGraph, Invalid> {
         if needs == RequiredInput::FullScene {
             return Err(Invalid::missing("scene", "a scene instead of a graph, because this policy needs all positions"));
         }
@@ -175,7 +174,7 @@ impl Graph {
         }
         // All or none: a policy that uses positions needs the position of every UAV.
         let positions = self.positions.into_iter().collect::<Option<Vec<Point>>>();
-        Ok(Slot::from_flat_detections(positions, uavs, self.aoi, offsets, detections))
+        Ok(FleetGraph::from_flat_detections(positions, uavs, self.aoi, offsets, detections))
     }
 
     /// The request's field that holds the relative coordinate x (`axis` 0) or y (1) of detection `place` of `node`.

@@ -37,8 +37,8 @@ pub struct PolicyInfo {
     pub uavs: Option<u32>,
     /// N, if the policy accepts only this number of users.
     pub users: Option<u32>,
-    /// A, the number of headings.
-    pub headings: usize,
+    /// A, the number of actions.
+    pub actions: usize,
     /// The input that the policy requires.
     pub needs: RequiredInput,
     /// d, the detection range.
@@ -68,7 +68,7 @@ impl LoadedPolicy {
             description: description.to_owned(),
             uavs: None,
             users: None,
-            headings: policy.actions(),
+            actions: policy.actions(),
             needs: policy.needs(),
             detection_range: policy.detection_range(),
             config: Value::Null,

@@ -147,14 +147,14 @@ fn uninterrupted(spec: &Value) -> (Rows, Checkpoint) {
     add(0, "eval-v1/mean_aoi", reference(&trainer.checkpoint().unwrap()));
     for event in trainer.by_ref() {
         if let Event::Iteration(done) = event {
-            add(done.step, "env_steps_per_s", 0.0);
+            add(done.env_steps, "env_steps_per_s", 0.0);
         }
         for (step, name, value) in event.rows() {
             add(step, name, value);
         }
     }
     let best = trainer.best().unwrap().unwrap();
-    add(trainer.step(), "eval-v1/mean_aoi", reference(&best));
+    add(trainer.env_steps(), "eval-v1/mean_aoi", reference(&best));
     (rows, best)
 }
 

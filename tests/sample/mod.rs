@@ -21,14 +21,14 @@ pub const AGENT: AgentConfig = AgentConfig {
 
 /// Episodes of UAVs that fly at random from the centre. Each episode has its own users.
 pub fn episodes(dims: &Dims, len: usize, seed: u64) -> Episodes {
-    let Dims { uavs, users, actions, slots, .. } = *dims;
+    let Dims { uavs, users, actions, episode_slots: slots, .. } = *dims;
     let mut stream = rng::stream(seed, "episodes", 0);
     let mut ep = Episodes { len, uavs, users, slots, ..Episodes::default() };
     for _ in 0..len {
         let mut at = vec![0.5_f32; 2 * uavs];
         let mut aoi = vec![0.0; users];
         ep.user_xy.extend((0..2 * users).map(|_| stream.random::<f32>()));
-        ep.token.extend((0..uavs * TOKEN).map(|_| 2.0 * stream.random::<f32>() - 1.0));
+        ep.identity_token.extend((0..uavs * TOKEN).map(|_| 2.0 * stream.random::<f32>() - 1.0));
         for slot in 0..=slots {
             ep.uav_xy.extend(&at);
             ep.aoi.extend(&aoi);

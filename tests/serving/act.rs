@@ -49,9 +49,9 @@ fn offline(name: &str, slots: u64, seed: u64) -> Vec<Vec<u8>> {
     let mut memory = vec![0.0; policy.memory_len(3, 5)];
     policy.start(3, 5, seed, &mut memory);
     let decide = |step| {
-        let slot = FleetInput::try_from(scene(3, 5, step)).unwrap().into_slot(&*policy).unwrap();
+        let slot = FleetInput::try_from(scene(3, 5, step)).unwrap().into_fleet_graph(&*policy).unwrap();
         let mut headings = vec![0; 3];
-        policy.act(&mut [FleetStep { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
+        policy.act(&mut [FleetStep { graph: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
         headings
     };
     (0..slots).map(decide).collect()

@@ -2,29 +2,29 @@
 
 use proptest::prelude::*;
 use qedgix::policy::baselines::{EnvParams, LIST, by_name};
-use qedgix::policy::{FleetStep, Policy, RequiredInput, Slot};
+use qedgix::policy::{FleetGraph, FleetStep, Policy, RequiredInput};
 use qedgix::service::act;
 use qedgix::serving::FleetInput;
 use qedgix::wire::v1;
 
 use super::harness::*;
 
-fn slot_of(input: FleetInput, policy: &dyn Policy) -> Slot {
-    input.into_slot(policy).unwrap()
+fn slot_of(input: FleetInput, policy: &dyn Policy) -> FleetGraph {
+    input.into_fleet_graph(policy).unwrap()
 }
 
-fn decide(policy: &dyn Policy, slot: &Slot) -> Vec<u8> {
-    let (uavs, users) = (slot.uavs(), slot.users());
+fn decide(policy: &dyn Policy, graph: &FleetGraph) -> Vec<u8> {
+    let (uavs, users) = (graph.uavs(), graph.users());
     let mut memory = vec![0.0; policy.memory_len(uavs, users)];
     policy.start(uavs, users, 3, &mut memory);
     let mut headings = vec![0; uavs];
     let mut q_values = vec![0.0; uavs * policy.actions()];
-    policy.act(&mut [FleetStep { slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: Some(&mut q_values) }]);
+    policy.act(&mut [FleetStep { graph, step: 0, memory: &mut memory, headings: &mut headings, q_values: Some(&mut q_values) }]);
     headings
 }
 
-fn detections(slot: &Slot) -> Vec<Vec<qedgix::policy::Detection>> {
-    (0..slot.uavs() + slot.users()).map(|i| slot.detections(i).to_vec()).collect()
+fn detections(graph: &FleetGraph) -> Vec<Vec<qedgix::policy::Detection>> {
+    (0..graph.uavs() + graph.users()).map(|i| graph.detections(i).to_vec()).collect()
 }
 
 #[test]
@@ -56,9 +56,9 @@ fn a_graph_and_a_scene_of_the_same_slot_are_the_same_slot() {
 }
 
 /// What users see, derived from UAVs: exactly the users that some UAV sees together with them, up to rounding.
-fn check_derived(derived: &Slot, whole: &Slot) {
+fn check_derived(derived: &FleetGraph, whole: &FleetGraph) {
     let uavs = whole.uavs();
-    let sees = |slot: &Slot, i: usize, j: usize| slot.detections(i).iter().find(|d| d.target == j as u32).map(|d| d.rel);
+    let sees = |graph: &FleetGraph, i: usize, j: usize| graph.detections(i).iter().find(|d| d.target == j as u32).map(|d| d.rel);
     for i in 0..uavs {
         assert_eq!(derived.detections(i), whole.detections(i));
     }
@@ -92,7 +92,7 @@ fn what_one_side_reports_is_mirrored() {
         // A user whose list became empty counts as left out, which can only add what a UAV tells; here it adds nothing new.
         let mirrored = slot_of(half.try_into().unwrap(), &*policy);
         for i in 0..12 {
-            let ids = |slot: &Slot| slot.detections(i).iter().map(|d| d.target).collect::<Vec<_>>();
+            let ids = |graph: &FleetGraph| graph.detections(i).iter().map(|d| d.target).collect::<Vec<_>>();
             assert_eq!(ids(&mirrored), ids(&whole), "seed {seed}, node {i}");
         }
     }
@@ -162,9 +162,9 @@ proptest! {
             Ok(request) => for baseline in &LIST {
                 let policy = by_name(baseline.name, EnvParams::default()).unwrap();
                 let (uavs, users) = (request.input.uavs(), request.input.users());
-                if let Ok(slot) = request.input.clone().into_slot(&*policy) {
-                    prop_assert_eq!((slot.uavs(), slot.users()), (uavs, users));
-                    let headings = decide(&*policy, &slot);
+                if let Ok(graph) = request.input.clone().into_fleet_graph(&*policy) {
+                    prop_assert_eq!((graph.uavs(), graph.users()), (uavs, users));
+                    let headings = decide(&*policy, &graph);
                     prop_assert!(headings.iter().all(|&h| usize::from(h) < policy.actions()));
                 }
             }
@@ -177,11 +177,11 @@ proptest! {
         let sent: FleetInput = scene(3, 5, seed).try_into().unwrap();
         for baseline in &LIST {
             let policy = by_name(baseline.name, EnvParams::default()).unwrap();
-            let slot = slot_of(sent.clone(), &*policy);
+            let graph = slot_of(sent.clone(), &*policy);
             let len = policy.memory_len(3, 5);
             let mut memory: Vec<f32> = values.iter().cycle().take(len).map(|&x| x as f32).collect();
             let mut headings = vec![0; 3];
-            policy.act(&mut [FleetStep { slot: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
+            policy.act(&mut [FleetStep { graph: &graph, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
             prop_assert!(headings.iter().all(|&h| usize::from(h) < policy.actions()));
         }
     }

@@ -89,14 +89,14 @@ async fn hosted_environment_is_bit_identical_to_batch_env() {
         ("large, on a blocking thread", 2, json!({"uavs": 40, "users": 700, "slots": 3})),
     ];
     for (id, count, environment) in cases {
-        let config: EnvConfig = train_config::environment(environment.clone()).unwrap();
+        let config: EnvConfig = train_config::parse_environment(environment.clone()).unwrap();
         let mut env = BatchEnv::new(&config, count).unwrap();
         env.reset(&(0..count as u64).map(|b| 7 + b).collect::<Vec<_>>());
         let state = create_and_reset(&mut client, create(id, count as u32, &environment)).await;
         assert_eq!((state.step, state.episode, state.slot, state.copies.len()), (0, 0, 0, count));
         assert_same(&state, &env);
         for k in 0..config.slots as u64 {
-            let actions = headings(count, config.uavs, config.headings() as u32, k);
+            let actions = headings(count, config.uavs, config.actions() as u32, k);
             env.step(&flat(&actions));
             let state = step_once(&mut client, step(id, k, actions)).await;
             assert_eq!((state.step, state.slot), (k + 1, env.slot() as u32));

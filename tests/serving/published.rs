@@ -1,7 +1,7 @@
 //! Published checkpoints: versions, restarts, what is refused, and learned policies flown like all others.
 
 use bytes::Bytes;
-use qedgix::checkpoint::{Checkpoint, layout};
+use qedgix::checkpoint::{Checkpoint, parameter_layout};
 use qedgix::policy::FleetStep;
 use qedgix::service::{Error, policies};
 use qedgix::serving::{FleetInput, PolicyRef};
@@ -16,7 +16,7 @@ pub fn checkpoint(algorithm: Algorithm, preset: Preset, seed: u64) -> Checkpoint
     let mut config = TrainConfig::preset(algorithm, preset);
     config.environment.reward_scale = Some(1.0);
     let mut rng = qedgix::rng::stream(seed, "test-weights", 0);
-    let weights = (0..layout(&config).len()).map(|_| rng.random_range(-0.3..0.3_f32)).collect();
+    let weights = (0..parameter_layout(&config).len()).map(|_| rng.random_range(-0.3..0.3_f32)).collect();
     Checkpoint::new(config, 1234, None, weights).unwrap()
 }
 
@@ -97,10 +97,10 @@ async fn a_learned_policy_flies_like_all_others() {
         let mut state = Bytes::new();
         for step in 0..20 {
             let sent = scene(3, 5, step);
-            let slot = FleetInput::try_from(sent.clone()).unwrap().into_slot(policy).unwrap();
+            let slot = FleetInput::try_from(sent.clone()).unwrap().into_fleet_graph(policy).unwrap();
             let (mut expected, mut q) = (vec![0; 3], vec![0.0; 3 * policy.actions()]);
             let (memory, headings) = (&mut memory[..], &mut expected[..]);
-            policy.act(&mut [FleetStep { slot: &slot, step, memory, headings, q_values: Some(&mut q) }]);
+            policy.act(&mut [FleetStep { graph: &slot, step, memory, headings, q_values: Some(&mut q) }]);
 
             let by_graph = v1::act_request::Observation::Graph(graph(&sent, policy.detection_range(), true));
             let requests = [

@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use qedgix::checkpoint::{Checkpoint, digest, layout};
+use qedgix::checkpoint::{Checkpoint, digest, parameter_layout};
 use qedgix::policy::{FleetStep, LearnedPolicy, Policy};
 use qedgix::serving::FleetInput;
 use qedgix::train_config::{Algorithm, Preset, TrainConfig};
@@ -95,7 +95,7 @@ impl Policies {
             let mut config = TrainConfig::preset(algorithm, Preset::Practical);
             config.environment.reward_scale = Some(1.0);
             let mut rng = qedgix::rng::stream(seed, "soak-weights", 0);
-            let weights = (0..layout(&config).len()).map(|_| rng.random_range(-0.3..0.3_f32)).collect();
+            let weights = (0..parameter_layout(&config).len()).map(|_| rng.random_range(-0.3..0.3_f32)).collect();
             let checkpoint = Checkpoint::new(config, seed, None, weights).unwrap();
             let file = checkpoint.to_bytes();
             all.by_digest.insert(digest(&file), Arc::new(checkpoint.policy()));
@@ -127,11 +127,11 @@ impl Reference {
             WireObservation::Graph(graph) => FleetInput::try_from(graph).unwrap(),
         };
         let ids = observation.fleet.uavs.clone();
-        let slot = observation.into_slot(&*self.policy).unwrap();
+        let slot = observation.into_fleet_graph(&*self.policy).unwrap();
         let actions = self.policy.actions();
         let (mut headings, mut values) = (vec![0; ids.len()], vec![0.0; ids.len() * actions]);
         let (memory, headings_out, q_values) = (&mut self.memory[..], &mut headings[..], Some(&mut values[..]));
-        self.policy.act(&mut [FleetStep { slot: &slot, step: 0, memory, headings: headings_out, q_values }]);
+        self.policy.act(&mut [FleetStep { graph: &slot, step: 0, memory, headings: headings_out, q_values }]);
         let decisions = headings.iter().zip(values.chunks_exact(actions)).map(|(&heading, q)| (u32::from(heading), q.to_vec()));
         ids.into_iter().zip(decisions).collect()
     }

@@ -61,7 +61,7 @@ impl From<EnvironmentInfo> for v1::Environment {
             seed: cursor.seed,
             count: spec.copies as u32,
             auto_reset: spec.auto_reset,
-            headings: spec.config.headings() as u32,
+            headings: spec.config.actions() as u32,
             episode: cursor.episode,
             slot: cursor.slot as u32,
             step: cursor.step,

@@ -103,7 +103,7 @@ impl From<PolicyDetails> for v1::Policy {
             description: info.description.clone(),
             uavs: info.uavs,
             users: info.users,
-            headings: info.headings as u32,
+            headings: info.actions as u32,
             needs: needs.into(),
             detection_range: info.detection_range,
             aliases,

@@ -2,7 +2,7 @@
 
 use crate::env::Point;
 use crate::invalid::Invalid;
-use crate::policy::Slot;
+use crate::policy::FleetGraph;
 use crate::serving::{FleetInput, Node, NodeDetection, Scene};
 use crate::wire::v1;
 
@@ -57,18 +57,18 @@ pub fn users(scene: &Scene) -> impl Iterator<Item = (String, Point, f64)> {
 }
 
 /// The nodes of a slot with their detections.
-pub fn nodes(slot: &Slot) -> impl Iterator<Item = Node<impl Iterator<Item = NodeDetection>>> {
-    let uavs = slot.uavs();
+pub fn nodes(graph: &FleetGraph) -> impl Iterator<Item = Node<impl Iterator<Item = NodeDetection>>> {
+    let uavs = graph.uavs();
     let id = move |node: usize| node.checked_sub(uavs).map_or_else(|| uav_id(node), user_id);
-    let aoi = move |node: usize| node.checked_sub(uavs).map(|user| f64::from(slot.aoi()[user]));
-    (0..uavs + slot.users()).map(move |node| Node {
+    let aoi = move |node: usize| node.checked_sub(uavs).map(|user| f64::from(graph.aoi()[user]));
+    (0..uavs + graph.users()).map(move |node| Node {
         id: id(node),
         is_uav: node < uavs,
-        detections: slot.detections(node).iter().map(move |detection| {
+        detections: graph.detections(node).iter().map(move |detection| {
             let target = detection.target as usize;
             NodeDetection { target_id: id(target), rel: detection.rel.map(f64::from), aoi: aoi(target) }
         }),
-        position: slot.uav_positions().and_then(|positions| positions.get(node)).copied(),
+        position: graph.uav_positions().and_then(|positions| positions.get(node)).copied(),
         aoi: aoi(node),
     })
 }
@@ -81,10 +81,10 @@ impl From<&Scene> for v1::Scene {
     }
 }
 
-impl From<&Slot> for v1::Graph {
-    fn from(slot: &Slot) -> Self {
+impl From<&FleetGraph> for v1::Graph {
+    fn from(graph: &FleetGraph) -> Self {
         let detection = |d: NodeDetection| v1::Detection { target_id: d.target_id, rel_x: d.rel[0], rel_y: d.rel[1], aoi: d.aoi };
-        let nodes = nodes(slot).map(|node| v1::Node {
+        let nodes = nodes(graph).map(|node| v1::Node {
             id: node.id,
             kind: if node.is_uav { v1::NodeKind::Uav } else { v1::NodeKind::User }.into(),
             detections: node.detections.map(detection).collect(),

@@ -6,7 +6,7 @@ use prost_types::{ListValue, Struct};
 use serde_json::{Map, Number, Value};
 
 use crate::invalid::Invalid;
-use crate::train_config::EXACT;
+use crate::train_config::MAX_EXACT_INTEGER;
 
 /// A JSON object as a `Struct`; `None` for anything else.
 pub fn to_struct(value: &Value) -> Option<Struct> {
@@ -18,7 +18,7 @@ fn to_proto(value: &Value) -> prost_types::Value {
     let kind = match value {
         Value::Null => Kind::NullValue(0),
         Value::Bool(b) => Kind::BoolValue(*b),
-        Value::Number(n) if n.as_u64().is_some_and(|n| n > EXACT) => Kind::StringValue(n.to_string()),
+        Value::Number(n) if n.as_u64().is_some_and(|n| n > MAX_EXACT_INTEGER) => Kind::StringValue(n.to_string()),
         Value::Number(n) => Kind::NumberValue(n.as_f64().unwrap_or(f64::NAN)),
         Value::String(s) => Kind::StringValue(s.clone()),
         Value::Array(values) => Kind::ListValue(ListValue { values: values.iter().map(to_proto).collect() }),
@@ -30,7 +30,7 @@ fn to_proto(value: &Value) -> prost_types::Value {
 /// A `Struct` as a JSON object.
 ///
 /// # Errors
-/// A number that is not finite, or an integer beyond [`EXACT`].
+/// A number that is not finite, or an integer beyond [`MAX_EXACT_INTEGER`].
 pub fn from_struct(field: &str, document: Struct) -> Result<Value, Invalid> {
     let fields: Result<Map<_, _>, Invalid> = document
         .fields
@@ -47,9 +47,10 @@ fn from_proto(field: &str, value: prost_types::Value) -> Result<Value, Invalid> 
     Ok(match value.kind {
         None | Some(Kind::NullValue(_)) => Value::Null,
         Some(Kind::BoolValue(b)) => Value::Bool(b),
-        Some(Kind::NumberValue(x)) if x.fract() == 0.0 && x.abs() > EXACT as f64 => {
-            let expected =
-                format!("a number up to {EXACT}, which a google.protobuf.Struct holds exactly; REST accepts larger integers");
+        Some(Kind::NumberValue(x)) if x.fract() == 0.0 && x.abs() > MAX_EXACT_INTEGER as f64 => {
+            let expected = format!(
+                "a number up to {MAX_EXACT_INTEGER}, which a google.protobuf.Struct holds exactly; REST accepts larger integers"
+            );
             return Err(Invalid::new(field, x, expected));
         }
         Some(Kind::NumberValue(x)) => {

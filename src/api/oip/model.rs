@@ -94,7 +94,7 @@ pub fn describe(app: &App, name: &str, version: &str) -> Result<Model, Error> {
         (needs != RequiredInput::FullScene || !of_graph).then_some(input)
     };
     let state = TensorShape { name: STATE, datatype: Datatype::Bytes, shape: vec![1], optional: true };
-    let outputs = outputs::shapes(uavs, policy.headings as i64, policy.kind == PolicyKind::Checkpoint);
+    let outputs = outputs::shapes(uavs, policy.actions as i64, policy.kind == PolicyKind::Checkpoint);
     Ok(Model {
         name: name.to_owned(),
         versions: versions.iter().map(u64::to_string).collect(),

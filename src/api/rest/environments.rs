@@ -140,7 +140,7 @@ impl From<EnvironmentInfo> for HostedEnvironment {
         let EnvironmentInfo { id, spec, cursor, created_at, ttl } = info;
         Self {
             environment_id: id,
-            headings: spec.config.headings(),
+            headings: spec.config.actions(),
             environment: spec.config,
             seed: cursor.seed,
             count: spec.copies,

@@ -186,7 +186,7 @@ impl From<PolicyDetails> for Policy {
             description: info.description.clone(),
             uavs: info.uavs,
             users: info.users,
-            headings: info.headings,
+            headings: info.actions,
             needs: match info.needs {
                 RequiredInput::Detections => Needs::Detections,
                 RequiredInput::OwnPositions => Needs::OwnPositions,

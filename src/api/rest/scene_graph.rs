@@ -11,7 +11,7 @@ use super::json::objects_only;
 use crate::api::convert::scene_graph::{nodes, uavs, users};
 use crate::env::Point;
 use crate::invalid::Invalid;
-use crate::policy::Slot;
+use crate::policy::FleetGraph;
 use crate::serving::{self, FleetInput};
 
 /// The detections of all nodes. If only one of two nodes reports a detection, the server adds the reverse detection. If both
@@ -143,13 +143,13 @@ impl TryFrom<Graph> for FleetInput {
     }
 }
 
-impl From<&Slot> for Graph {
-    fn from(slot: &Slot) -> Self {
+impl From<&FleetGraph> for Graph {
+    fn from(graph: &FleetGraph) -> Self {
         let detection = |d: serving::NodeDetection| {
             let [rel_x, rel_y] = d.rel;
             Detection { target_id: d.target_id, rel_x, rel_y, aoi: d.aoi }
         };
-        let nodes = nodes(slot).map(|node| Node {
+        let nodes = nodes(graph).map(|node| Node {
             id: node.id,
             kind: if node.is_uav { NodeKind::Uav } else { NodeKind::User },
             detections: node.detections.map(detection).collect(),

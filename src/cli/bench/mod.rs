@@ -1,7 +1,7 @@
 //! `qedgix bench`: measures the speed of `Act` and of the learner on this machine.
 
 mod act;
-mod roofline;
+mod matmul_time;
 
 use std::time::Instant;
 
@@ -22,9 +22,9 @@ pub struct BenchArgs {
 
 #[derive(Subcommand, Debug)]
 enum What {
-    /// Measure the learner: time per update and per rollout, environment steps per second, and the roofline of an update
+    /// Measure the learner: time per update and per rollout, environment steps per second, and the time of the matrix products
     ///
-    /// The roofline is the time of the matrix products of an update alone, with the same shapes and threads. Fields that --set
+    /// The matrix products of an update are also measured alone, with the same shapes and threads. Fields that --set
     /// does not change differ from the preset as follows: flat observation without own position, one-hot identity, mean
     /// aggregation, qmix mixer, a batch of 128 episodes, one update per rollout of 8.
     Learner(LearnerArgs),
@@ -99,7 +99,7 @@ fn learner(mut args: LearnerArgs) -> anyhow::Result<()> {
     let rollout_s = median_seconds(repeat, || {
         rollout.collect(learner.agent(), learner.agent_parameters(), 0.1, 0);
     });
-    let roofline = roofline::measure(learner.agent(), &batch, threads, repeat);
+    let matmul = matmul_time::measure(learner.agent(), &batch, threads, repeat);
     let steps = (t.envs * config.environment.slots) as f64;
     let env_steps_per_s = steps / (rollout_s + update_s * t.updates_per_iteration as f64);
     if args.json {
@@ -109,9 +109,9 @@ fn learner(mut args: LearnerArgs) -> anyhow::Result<()> {
             "update_s": update_s,
             "rollout_s": rollout_s,
             "env_steps_per_s": env_steps_per_s,
-            "update_gflop": roofline.gflop,
-            "matmul_gflop_per_s": roofline.gflop / roofline.seconds,
-            "floor_s": roofline.seconds,
+            "update_gflop": matmul.gflop,
+            "matmul_gflop_per_s": matmul.gflop / matmul.seconds,
+            "floor_s": matmul.seconds,
             "config": config,
         });
         outln!("{metrics}")?;
@@ -119,10 +119,10 @@ fn learner(mut args: LearnerArgs) -> anyhow::Result<()> {
         outln!("update of {} episodes   {:.2} ms", t.batch, update_s * 1e3)?;
         outln!(
             "  matrix products alone  {:.2} ms   ({:.1} GFLOP at {:.0} GFLOP/s; the update takes {:.2} times as long)",
-            roofline.seconds * 1e3,
-            roofline.gflop,
-            roofline.gflop / roofline.seconds,
-            update_s / roofline.seconds
+            matmul.seconds * 1e3,
+            matmul.gflop,
+            matmul.gflop / matmul.seconds,
+            update_s / matmul.seconds
         )?;
         outln!("rollout of {} episodes    {:.2} ms", t.envs, rollout_s * 1e3)?;
         outln!(

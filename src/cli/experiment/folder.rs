@@ -59,7 +59,8 @@ impl RunFolder {
         let Some(bytes) = self.read("result.json")? else { return Ok(None) };
         // A result of another version is ignored, and the weights are evaluated again.
         let result: Option<RunResult> = serde_json::from_slice(&bytes).ok();
-        Ok(result.filter(|o| o.layouts == experiment.layouts && o.best.episodes.len() == experiment.layout_seeds.len()))
+        Ok(result
+            .filter(|result| result.layouts == experiment.layouts && result.best.episodes.len() == experiment.layout_seeds.len()))
     }
 
     /// The progress of the run.
@@ -75,7 +76,7 @@ impl RunFolder {
             && *trainer.config() == run.config
         {
             let mut curve = self.curve().unwrap_or_default();
-            curve.truncate(trainer.step());
+            curve.truncate(trainer.env_steps());
             return Ok((trainer, curve, self.progress()?.seconds));
         }
         Ok((Trainer::new(run.config.clone(), threads)?, TrainingCurve::default(), 0.0))

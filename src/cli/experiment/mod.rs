@@ -166,7 +166,7 @@ fn write_results(experiment: &Experiment, out: &Path, threads: usize, command: &
     write_atomic(&out.join("results.json"), &serde_json::to_vec_pretty(&summary)?)?;
     let page = readme(experiment, &summary, command, &names);
     write_atomic(&out.join("README.md"), page.as_bytes())?;
-    for row in &summary.rows {
+    for row in &summary.series_summaries {
         let Interval { mean, low, high } = row.mean_aoi;
         let name = [row.point.as_str(), row.series.as_str()].join(" ");
         outln!("{:<32} mean AoI {mean:6.2}  ({low:.2} to {high:.2})", name.trim_start())?;

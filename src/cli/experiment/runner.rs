@@ -75,8 +75,8 @@ impl<'a> Runner<'a> {
         self.stop.load(Ordering::Relaxed)
     }
 
-    /// Threads per unfinished run.
-    fn share(&self) -> usize {
+    /// Threads of each unfinished run.
+    fn threads_per_run(&self) -> usize {
         (self.threads / self.unfinished.load(Ordering::Relaxed).max(1)).max(1)
     }
 
@@ -126,8 +126,8 @@ impl<'a> Runner<'a> {
         let progress = folder.progress()?;
         let evaluate_weights = |checkpoint: &crate::checkpoint::Checkpoint| -> anyhow::Result<EvaluatedWeights> {
             let seeds = &self.experiment.layout_seeds;
-            let episodes = evaluate(&checkpoint.policy(), &run.config.environment, seeds, self.share())?;
-            Ok(EvaluatedWeights { step: checkpoint.step(), episodes })
+            let episodes = evaluate(&checkpoint.policy(), &run.config.environment, seeds, self.threads_per_run())?;
+            Ok(EvaluatedWeights { step: checkpoint.env_steps(), episodes })
         };
         let result = RunResult {
             layouts: self.experiment.layouts.clone(),
@@ -143,17 +143,17 @@ impl<'a> Runner<'a> {
 
     /// Trains a run. Returns whether training has ended; false if it was stopped.
     fn train(&self, run: &Run, folder: &RunFolder, label: &str, bar: &ProgressBar) -> anyhow::Result<bool> {
-        let mut threads = self.share();
+        let mut threads = self.threads_per_run();
         let (mut trainer, mut curve, before) = folder.restore(run, threads)?;
         let begun = Instant::now();
         let progress = |trainer: &Trainer, trained, diverged| RunProgress {
-            step: trainer.step(),
+            step: trainer.env_steps(),
             seconds: before + begun.elapsed().as_secs_f64(),
             trained,
             diverged,
         };
         let steps = run.config.training.steps;
-        let mut reported = trainer.step().min(steps);
+        let mut reported = trainer.env_steps().min(steps);
         bar.set_position(reported);
         bar.reset_eta();
         self.overall.inc(reported);
@@ -161,10 +161,10 @@ impl<'a> Runner<'a> {
             for (step, name, value) in event.rows() {
                 curve.push(step, name, value);
             }
-            let step = trainer.step().min(steps);
+            let step = trainer.env_steps().min(steps);
             bar.set_position(step);
             self.overall.inc(step - std::mem::replace(&mut reported, step));
-            let evaluated = if let Event::Evaluation(e) = event { Some((e.step, e.metrics.mean_aoi)) } else { None };
+            let evaluated = if let Event::Evaluation(e) = event { Some((e.env_steps, e.metrics.mean_aoi)) } else { None };
             if evaluated.is_none() && !self.stopped() {
                 continue;
             }
@@ -179,8 +179,8 @@ impl<'a> Runner<'a> {
             if self.stopped() {
                 return Ok(false);
             }
-            if self.share() > threads {
-                threads = self.share();
+            if self.threads_per_run() > threads {
+                threads = self.threads_per_run();
                 trainer = Trainer::restore(&snapshot, threads)?;
             }
         }

@@ -75,11 +75,11 @@ fn conditions(comparison: &Comparison) -> ReportSection {
 
 fn policies(evaluations: &[&PolicyEvaluation]) -> ReportSection {
     let header = ["policy", "mean AoI", "95 % interval", "p95 AoI", "peak AoI", "coverage", "fairness"];
-    let rows = evaluations.iter().map(|f| {
-        let name = if f.reference { format!("{} (reference)", f.name) } else { f.name.clone() };
-        std::iter::once(name).chain(metric_cells(&f.summary.mean_aoi, &f.summary.mean)).collect()
+    let rows = evaluations.iter().map(|policy| {
+        let name = if policy.reference { format!("{} (reference)", policy.name) } else { policy.name.clone() };
+        std::iter::once(name).chain(metric_cells(&policy.summary.mean_aoi, &policy.summary.mean)).collect()
     });
-    let bars: Vec<Bar> = evaluations.iter().map(|f| bar(f, f.summary.mean_aoi)).collect();
+    let bars: Vec<Bar> = evaluations.iter().map(|policy| bar(policy, policy.summary.mean_aoi)).collect();
     ReportSection {
         title: "Policies, the best first".to_owned(),
         text: "Means over layouts; the interval of the mean AoI is a 95 % bootstrap interval. p95 and peak are over the users \
@@ -97,13 +97,13 @@ fn policies(evaluations: &[&PolicyEvaluation]) -> ReportSection {
 
 /// `None` if the reference or all other policies are missing.
 fn gaps(name: &str, gaps: &[Pair]) -> Option<ReportSection> {
-    let others = gaps.iter().filter(|(f, reference, _)| f.name != reference.name);
-    let rows: Vec<Vec<String>> = others.map(|(f, _, d)| difference_row([&f.name], d)).collect();
+    let others = gaps.iter().filter(|(policy, reference, _)| policy.name != reference.name);
+    let rows: Vec<Vec<String>> = others.map(|(policy, _, d)| difference_row([&policy.name], d)).collect();
     if rows.is_empty() {
         return None;
     }
     // The reference has a bar of length 0, so that every policy has the same colour in all plots.
-    let bars: Vec<Bar> = gaps.iter().map(|(f, _, d)| bar(f, d.mean_aoi)).collect();
+    let bars: Vec<Bar> = gaps.iter().map(|(policy, _, d)| bar(policy, d.mean_aoi)).collect();
     let header = ["policy", "gap", "95 % interval", "better on"];
     Some(ReportSection {
         title: format!("Gap to {name}"),
@@ -135,9 +135,9 @@ fn pairs(pairs: &[Pair]) -> Option<ReportSection> {
 }
 
 fn over_slots(evaluations: &[&PolicyEvaluation]) -> ReportSection {
-    let series = evaluations.iter().map(|f| {
-        let points = f.evaluation.aoi.iter().enumerate().map(|(slot, &aoi)| [slot as f64, aoi]).collect();
-        Series { name: f.name.clone(), points, band: None }
+    let series = evaluations.iter().map(|policy| {
+        let points = policy.evaluation.aoi.iter().enumerate().map(|(slot, &aoi)| [slot as f64, aoi]).collect();
+        Series { name: policy.name.clone(), points, band: None }
     });
     let chart = Chart {
         title: "AoI during an episode".to_owned(),
@@ -162,7 +162,8 @@ fn over_slots(evaluations: &[&PolicyEvaluation]) -> ReportSection {
 }
 
 fn over_layouts(evaluations: &[&PolicyEvaluation]) -> ReportSection {
-    let values = |f: &&PolicyEvaluation| (f.name.clone(), f.evaluation.episodes.iter().map(|e| e.mean_aoi).collect());
+    let values =
+        |policy: &&PolicyEvaluation| (policy.name.clone(), policy.evaluation.episodes.iter().map(|e| e.mean_aoi).collect());
     let series: Vec<(String, Vec<f64>)> = evaluations.iter().map(values).collect();
     ReportSection {
         title: "Over layouts".to_owned(),
@@ -177,20 +178,20 @@ fn over_layouts(evaluations: &[&PolicyEvaluation]) -> ReportSection {
 }
 
 fn trajectories(comparison: &Comparison, evaluations: &[&PolicyEvaluation]) -> ReportSection {
-    let seed = evaluations.first().map_or(0, |f| f.evaluation.trajectory.seed);
+    let seed = evaluations.first().map_or(0, |policy| policy.evaluation.trajectory.seed);
     let index = seed.saturating_sub(comparison.layouts.first) as usize;
-    let plots = evaluations.iter().enumerate().map(|(i, f)| {
-        let trajectory = &f.evaluation.trajectory;
+    let plots = evaluations.iter().enumerate().map(|(i, policy)| {
+        let trajectory = &policy.evaluation.trajectory;
         let paths = Trajectories {
             uavs: trajectory.uavs.clone(),
             users: trajectory.users.iter().filter_map(|path| path.first().copied()).collect(),
             transmission_range: comparison.env.transmission_range,
         };
-        let aoi = f.evaluation.episodes.get(index).map_or(f64::NAN, |e| e.mean_aoi);
+        let aoi = policy.evaluation.episodes.get(index).map_or(f64::NAN, |e| e.mean_aoi);
         ReportPlot {
-            file: format!("flight-{}-{}.svg", i + 1, file_name(&f.name)),
-            caption: format!("{}: mean AoI {aoi:.2} on this layout.", f.name),
-            svg: plot::trajectories(&f.name, &paths),
+            file: format!("flight-{}-{}.svg", i + 1, file_name(&policy.name)),
+            caption: format!("{}: mean AoI {aoi:.2} on this layout.", policy.name),
+            svg: plot::trajectories(&policy.name, &paths),
         }
     });
     let note = if comparison.env.user_speed > 0.0 { " Users are shown at their start positions." } else { "" };

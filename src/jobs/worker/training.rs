@@ -66,15 +66,15 @@ impl ReportQueue {
 
     fn snapshot(&self, trainer: &Trainer) {
         self.snapshot_pending.store(true, Ordering::Release);
-        self.push(Report::Snapshot { step: trainer.step(), bytes: trainer.snapshot() });
+        self.push(Report::Snapshot { step: trainer.env_steps(), bytes: trainer.snapshot() });
     }
 
     fn checkpoint(&self, kind: CheckpointKind, checkpoint: &Checkpoint) {
         let metrics = checkpoint.metrics().map_or_else(Vec::new, |metrics| {
-            let rows = Event::Evaluation(Evaluation { step: checkpoint.step(), metrics: *metrics }).rows();
+            let rows = Event::Evaluation(Evaluation { env_steps: checkpoint.env_steps(), metrics: *metrics }).rows();
             rows.into_iter().map(|(_, name, value)| (name, value)).collect()
         });
-        self.push(Report::Checkpoint { kind, step: checkpoint.step(), bytes: checkpoint.to_bytes(), metrics });
+        self.push(Report::Checkpoint { kind, step: checkpoint.env_steps(), bytes: checkpoint.to_bytes(), metrics });
     }
 }
 
@@ -94,27 +94,29 @@ fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Re
         None => Trainer::new(config, threads)?,
     };
     drop(snapshot);
-    if trainer.step() == 0 {
+    if trainer.env_steps() == 0 {
         let untrained = eval_mean_aoi(&trainer.checkpoint()?, threads)?;
         reports.push(Report::Metrics { step: 0, rows: vec![(0, EVAL_METRIC, untrained)] });
     }
-    let mut curve = CurveSampler::new(trainer.config(), trainer.step());
+    let mut curve = CurveSampler::new(trainer.config(), trainer.env_steps());
     let mut last_snapshot = Instant::now();
     while stop.directive() == Directive::Continue
         && let Some(event) = trainer.next()
     {
         let rows = curve.rows(&event);
         if !rows.is_empty() {
-            reports.push(Report::Metrics { step: trainer.step(), rows });
+            reports.push(Report::Metrics { step: trainer.env_steps(), rows });
         }
         match event {
-            Event::Evaluation(evaluation) if trainer.best_evaluation().is_some_and(|best| best.step == evaluation.step) => {
+            Event::Evaluation(evaluation)
+                if trainer.best_evaluation().is_some_and(|best| best.env_steps == evaluation.env_steps) =>
+            {
                 if let Some(best) = trainer.best()? {
                     reports.checkpoint(CheckpointKind::Best, &best);
                 }
             }
-            Event::Diverged { step } => {
-                let reason = format!("training diverged at step {step}: a weight is not finite or too large");
+            Event::Diverged { env_steps } => {
+                let reason = format!("training diverged at step {env_steps}: a parameter is not finite or too large");
                 return Ok(WorkerResult::Failed { reason, permanent: true });
             }
             Event::Iteration(_) | Event::Evaluation(_) | Event::Finished { .. } => {}
@@ -133,7 +135,7 @@ fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Re
         Directive::Pause | Directive::Continue => {
             reports.checkpoint(CheckpointKind::Last, &trainer.checkpoint()?);
             let best = trainer.best()?.ok_or("no policy has been evaluated")?;
-            let step = trainer.step();
+            let step = trainer.env_steps();
             reports.push(Report::Metrics { step, rows: vec![(step, EVAL_METRIC, eval_mean_aoi(&best, threads)?)] });
             Ok(WorkerResult::Succeeded)
         }
@@ -168,14 +170,14 @@ impl CurveSampler {
     fn rows(&mut self, event: &Event) -> Vec<Row> {
         let mut rows = event.rows();
         if let Event::Iteration(done) = event {
-            let regular = (done.step / self.steps_per_iteration).is_multiple_of(self.iterations_per_point);
-            if !regular && done.step < self.total_steps {
+            let regular = (done.env_steps / self.steps_per_iteration).is_multiple_of(self.iterations_per_point);
+            if !regular && done.env_steps < self.total_steps {
                 return Vec::new();
             }
             let now = Instant::now();
             let seconds = (now - self.last_point.1).as_secs_f64();
-            rows.push((done.step, "env_steps_per_s", (done.step - self.last_point.0) as f64 / seconds));
-            self.last_point = (done.step, now);
+            rows.push((done.env_steps, "env_steps_per_s", (done.env_steps - self.last_point.0) as f64 / seconds));
+            self.last_point = (done.env_steps, now);
         }
         rows
     }
@@ -194,7 +196,7 @@ mod tests {
         let iteration = curve.steps_per_iteration;
         for step in (iteration..steps + iteration).step_by(iteration as usize) {
             let done = Iteration {
-                step,
+                env_steps: step,
                 episodes: 0,
                 updates: 0,
                 epsilon: 1.0,

@@ -2,7 +2,7 @@
 
 use super::geometry::{heading_toward, travel_slots};
 use super::rule::{EnvParams, Rule, uav_positions, user_positions};
-use crate::policy::{RequiredInput, Slot};
+use crate::policy::{FleetGraph, RequiredInput};
 
 /// Has no memory.
 #[derive(Default)]
@@ -10,7 +10,7 @@ pub(super) struct GreedyGlobal;
 
 impl Rule for GreedyGlobal {
     const NAME: &'static str = "greedy-global";
-    const DESCRIPTION: &'static str = "Full information: pairs UAVs with the users that promise most AoI per slot of flight.";
+    const DESCRIPTION: &'static str = "Full information: pairs UAVs with the users that promise most AoI per graph of flight.";
     const NEEDS: RequiredInput = RequiredInput::FullScene;
 
     fn memory_len(&self, _uavs: usize, _users: usize) -> usize {
@@ -19,13 +19,13 @@ impl Rule for GreedyGlobal {
 
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}
 
-    fn decide(&self, env: &EnvParams, slot: &Slot, _step: u64, _memory: &mut [f32], headings: &mut [u8]) {
-        let (uavs, users) = (uav_positions(slot), user_positions(slot));
+    fn decide(&self, env: &EnvParams, graph: &FleetGraph, _step: u64, _memory: &mut [f32], headings: &mut [u8]) {
+        let (uavs, users) = (uav_positions(graph), user_positions(graph));
         let mut pairs = Vec::with_capacity(uavs.len() * users.len());
         for (i, &at) in uavs.iter().enumerate() {
             for (j, &to) in users.iter().enumerate() {
                 let slots = travel_slots(env, at, to, env.transmission_range);
-                let age = f64::from(slot.aoi()[j]) + slots;
+                let age = f64::from(graph.aoi()[j]) + slots;
                 pairs.push((age / slots, i, j));
             }
         }

@@ -71,7 +71,7 @@ const MAX_PAIRS: usize = 1 << 20;
 
 impl<R: Rule> Policy for Baseline<R> {
     fn actions(&self) -> usize {
-        self.env.headings
+        self.env.actions
     }
 
     fn needs(&self) -> RequiredInput {
@@ -98,7 +98,7 @@ impl<R: Rule> Policy for Baseline<R> {
 
     fn act(&self, fleets: &mut [FleetStep<'_>]) {
         for fleet in fleets {
-            self.rule.decide(&self.env, fleet.slot, fleet.step, fleet.memory, fleet.headings);
+            self.rule.decide(&self.env, fleet.graph, fleet.step, fleet.memory, fleet.headings);
             if let Some(q) = &mut fleet.q_values {
                 q.fill(f32::NAN);
             }

@@ -3,14 +3,14 @@
 use rand::RngExt;
 
 use super::rule::{EnvParams, Rule, SEED_LEN, slot_rng, store_seed};
-use crate::policy::{RequiredInput, Slot};
+use crate::policy::{FleetGraph, RequiredInput};
 
 #[derive(Default)]
 pub(super) struct Random;
 
 impl Rule for Random {
     const NAME: &'static str = "random";
-    const DESCRIPTION: &'static str = "Every UAV draws a heading in every slot.";
+    const DESCRIPTION: &'static str = "Every UAV draws a heading in every graph.";
     const NEEDS: RequiredInput = RequiredInput::Detections;
 
     fn memory_len(&self, _uavs: usize, _users: usize) -> usize {
@@ -21,10 +21,10 @@ impl Rule for Random {
         store_seed(seed, memory);
     }
 
-    fn decide(&self, env: &EnvParams, _slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]) {
+    fn decide(&self, env: &EnvParams, _graph: &FleetGraph, step: u64, memory: &mut [f32], headings: &mut [u8]) {
         let mut rng = slot_rng(memory, "random", step);
         for h in headings {
-            *h = rng.random_range(0..env.headings as u8);
+            *h = rng.random_range(0..env.actions as u8);
         }
     }
 }

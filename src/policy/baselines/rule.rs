@@ -3,7 +3,7 @@
 use rand_chacha::ChaCha8Rng;
 
 use crate::env::{EnvConfig, Point};
-use crate::policy::{RequiredInput, Slot};
+use crate::policy::{FleetGraph, RequiredInput};
 use crate::rng;
 
 /// The parameters of the environment that a baseline flies in. Lengths are in units of the square's side.
@@ -16,7 +16,7 @@ pub struct EnvParams {
     /// d, range within which nodes detect each other.
     pub detection_range: f64,
     /// A, the number of actions.
-    pub headings: usize,
+    pub actions: usize,
     /// K, slots per episode: how far baselines that plan look ahead.
     pub slots: usize,
 }
@@ -27,7 +27,7 @@ impl From<&EnvConfig> for EnvParams {
             speed: env.speed,
             transmission_range: env.transmission_range,
             detection_range: env.detection_range,
-            headings: env.headings(),
+            actions: env.actions(),
             slots: env.slots,
         }
     }
@@ -53,7 +53,7 @@ pub(super) trait Rule: Default + Send + Sync {
     fn start(&self, seed: u64, memory: &mut [f32]);
 
     /// Writes one heading per UAV and advances the memory.
-    fn decide(&self, env: &EnvParams, slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]);
+    fn decide(&self, env: &EnvParams, graph: &FleetGraph, step: u64, memory: &mut [f32], headings: &mut [u8]);
 }
 
 /// Length of a seed in a memory: 16 bits per f32, which f32 holds exactly.
@@ -72,11 +72,11 @@ pub(super) fn slot_rng(memory: &[f32], name: &str, step: u64) -> ChaCha8Rng {
 }
 
 /// The positions of the UAVs.
-pub(super) fn uav_positions(slot: &Slot) -> &[Point] {
-    slot.uav_positions().expect("the caller provides what `needs` requires")
+pub(super) fn uav_positions(graph: &FleetGraph) -> &[Point] {
+    graph.uav_positions().expect("the caller provides what `needs` requires")
 }
 
 /// The positions of the users.
-pub(super) fn user_positions(slot: &Slot) -> &[Point] {
-    slot.user_positions().expect("the caller provides what `needs` requires")
+pub(super) fn user_positions(graph: &FleetGraph) -> &[Point] {
+    graph.user_positions().expect("the caller provides what `needs` requires")
 }

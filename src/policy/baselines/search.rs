@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use super::geometry::{heading_toward, in_square, next_position};
 use super::rule::{EnvParams, Rule, SEED_LEN, slot_rng, store_seed, uav_positions};
 use crate::env::{EnvConfig, Point};
-use crate::policy::{RequiredInput, Slot};
+use crate::policy::{FleetGraph, RequiredInput};
 
 /// A user that a UAV detects.
 #[derive(Clone, Copy, Debug)]
@@ -47,13 +47,13 @@ impl<T: TargetChoice> Rule for Search<T> {
         store_seed(seed, memory);
     }
 
-    fn decide(&self, env: &EnvParams, slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]) {
+    fn decide(&self, env: &EnvParams, graph: &FleetGraph, step: u64, memory: &mut [f32], headings: &mut [u8]) {
         let mut rng = slot_rng(memory, T::NAME, step);
         for (i, (course, heading)) in memory[SEED_LEN..].iter_mut().zip(headings).enumerate() {
-            let at = uav_positions(slot)[i];
+            let at = uav_positions(graph)[i];
             // Always called, so that the random numbers of other UAVs do not depend on what this UAV detects.
             *heading = cruise(env, &mut rng, at, course);
-            if let Some(user) = T::choose(detected_users(slot, i, at)) {
+            if let Some(user) = T::choose(detected_users(graph, i, at)) {
                 *heading = heading_toward(env, at, user.position);
                 // The search continues in the direction of the last target.
                 *course = f32::from(*heading) + 1.0;
@@ -63,13 +63,13 @@ impl<T: TargetChoice> Rule for Search<T> {
 }
 
 /// The users that UAV `i` at `at` detects.
-fn detected_users(slot: &Slot, i: usize, at: Point) -> impl Iterator<Item = DetectedUser> {
-    slot.detections(i).iter().filter_map(move |detection| {
-        let user = (detection.target as usize).checked_sub(slot.uavs())?;
+fn detected_users(graph: &FleetGraph, i: usize, at: Point) -> impl Iterator<Item = DetectedUser> {
+    graph.detections(i).iter().filter_map(move |detection| {
+        let user = (detection.target as usize).checked_sub(graph.uavs())?;
         let rel = detection.rel.map(f64::from);
         let position = [at[0] + rel[0], at[1] + rel[1]];
         let distance = (position[0] - at[0]).hypot(position[1] - at[1]);
-        Some(DetectedUser { position, distance, aoi: slot.aoi()[user] })
+        Some(DetectedUser { position, distance, aoi: graph.aoi()[user] })
     })
 }
 

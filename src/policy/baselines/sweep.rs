@@ -9,7 +9,7 @@ use std::f64::consts::{PI, TAU};
 use super::geometry::{distance, heading_toward, travel_slots};
 use super::rule::{EnvParams, Rule, uav_positions};
 use crate::env::Point;
-use crate::policy::{RequiredInput, Slot};
+use crate::policy::{FleetGraph, RequiredInput};
 
 /// Memory of each UAV: a grid of cells, 1 if the cell was seen; then for each user: 1 if it is known, its position (x, y), and
 /// the slot in which its data was last collected.
@@ -42,12 +42,12 @@ impl Rule for Sweep {
 
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}
 
-    fn decide(&self, env: &EnvParams, slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]) {
-        let memories = memory.chunks_exact_mut(CELLS + USER * slot.users());
+    fn decide(&self, env: &EnvParams, graph: &FleetGraph, step: u64, memory: &mut [f32], headings: &mut [u8]) {
+        let memories = memory.chunks_exact_mut(CELLS + USER * graph.users());
         for ((i, memory), heading) in memories.enumerate().zip(headings) {
             let (seen, users) = memory.split_at_mut(CELLS);
-            let uav = Uav { env, index: i, fleet: slot.uavs(), at: uav_positions(slot)[i], now: step as f64 };
-            let nearby = uav.observe(slot, seen, users);
+            let uav = Uav { env, index: i, uavs: graph.uavs(), at: uav_positions(graph)[i], now: step as f64 };
+            let nearby = uav.observe(graph, seen, users);
             let serving = uav.best_user(users, &nearby);
             let searching = uav.best_cell(seen, users);
             let best = if serving.score >= searching.score { serving } else { searching };
@@ -71,14 +71,14 @@ const NOTHING: Candidate = Candidate { score: 0.0, position: [0.5, 0.5] };
 struct Uav<'a> {
     env: &'a EnvParams,
     index: usize,
-    fleet: usize,
+    uavs: usize,
     at: Point,
     now: f64,
 }
 
 impl Uav<'_> {
     /// Writes what the UAV detects into its memory. Returns the positions of the other UAVs that it detects.
-    fn observe(&self, slot: &Slot, seen: &mut [f32], users: &mut [f32]) -> Vec<Point> {
+    fn observe(&self, graph: &FleetGraph, seen: &mut [f32], users: &mut [f32]) -> Vec<Point> {
         let range = self.env.detection_range;
         for (_, seen) in seen.iter_mut().enumerate().filter(|(c, _)| distance(self.at, center(*c)) <= range) {
             *seen = 1.0;
@@ -88,11 +88,11 @@ impl Uav<'_> {
             user[0] = 0.0;
         }
         let mut uavs = Vec::new();
-        for detection in slot.detections(self.index) {
+        for detection in graph.detections(self.index) {
             let [x, y] = [0, 1].map(|k| self.at[k] + f64::from(detection.rel[k]));
-            match (detection.target as usize).checked_sub(slot.uavs()) {
+            match (detection.target as usize).checked_sub(graph.uavs()) {
                 Some(j) => {
-                    let collected = self.now as f32 - slot.aoi()[j];
+                    let collected = self.now as f32 - graph.aoi()[j];
                     users[j * USER..][..USER].copy_from_slice(&[1.0, x as f32, y as f32, collected]);
                 }
                 None => uavs.push([x, y]),
@@ -139,9 +139,9 @@ impl Uav<'_> {
 
     /// Weight of an unseen cell at `p`: 1 in the UAV's own sector around the centre of the square.
     fn cell_weight(&self, p: Point) -> f64 {
-        let own = TAU * self.index as f64 / self.fleet as f64;
+        let own = TAU * self.index as f64 / self.uavs as f64;
         let off = ((p[1] - 0.5).atan2(p[0] - 0.5) - own).rem_euclid(TAU);
-        if off.min(TAU - off) <= PI / self.fleet as f64 { 1.0 } else { FOREIGN_SECTOR }
+        if off.min(TAU - off) <= PI / self.uavs as f64 { 1.0 } else { FOREIGN_SECTOR }
     }
 }
 

@@ -10,8 +10,8 @@
 
 use super::hyper_net::{HyperNet, HyperNetCache};
 use super::mixing::{E, mix, mix_back};
-use crate::nn::matmul::Accumulate;
-use crate::nn::{Batch, Embedding, EmbeddingGrad, HIDDEN, Linear, ParameterLayout, Real, Rows, Weights, simd};
+use crate::nn::matmul::InitialValue;
+use crate::nn::{Batch, Embedding, EmbeddingParams, HIDDEN, Linear, ParameterLayout, Real, Rows, Weights, simd};
 use crate::policy::agent::Dims;
 
 #[derive(Clone, Copy, Debug)]
@@ -30,8 +30,8 @@ pub(super) struct InvariantCache<T: Real> {
     g: Batch<T>,
     /// P_i, one sample per slot and UAV.
     positions: Batch<T>,
-    /// The part of w1's first layer that depends on g; in backward its gradient.
-    share: Batch<T>,
+    /// The part of w1's first layer that depends on g; backward replaces it by its gradient.
+    g_part_or_grad: Batch<T>,
     w1: HyperNetCache<T>,
     w2: HyperNetCache<T>,
     b2: HyperNetCache<T>,
@@ -52,11 +52,11 @@ impl Invariant {
         }
     }
 
-    pub(super) fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
-        self.uav.prepare(flat, transposed);
-        self.user.prepare(flat, transposed);
-        [&self.w1, &self.w2, &self.b2].iter().for_each(|net| net.prepare(flat, transposed));
-        self.b1.prepare(flat, transposed);
+    pub(super) fn prepare<T: Real>(&self, params: &[T], prepared: &mut [T]) {
+        self.uav.prepare(params, prepared);
+        self.user.prepare(params, prepared);
+        [&self.w1, &self.w2, &self.b2].iter().for_each(|net| net.prepare(params, prepared));
+        self.b1.prepare(params, prepared);
     }
 
     pub(super) fn forward<T: Real>(
@@ -68,12 +68,12 @@ impl Invariant {
         total: &mut [T],
     ) {
         let (m, slots) = (self.uavs, states.len);
-        c.g.reset(HIDDEN, slots);
-        c.positions.reset(2, slots * m);
-        c.share.reset(HIDDEN, slots);
-        c.w1.hidden.reset(HIDDEN, slots * m);
-        c.mixed.reset(E, slots);
-        let (uav, user) = (self.uav.load(w), self.user.load(w));
+        c.g.resize(HIDDEN, slots);
+        c.positions.resize(2, slots * m);
+        c.g_part_or_grad.resize(HIDDEN, slots);
+        c.w1.hidden.resize(HIDDEN, slots * m);
+        c.mixed.resize(E, slots);
+        let (uav, user) = (self.uav.params(w), self.user.params(w));
         simd(
             #[inline(always)]
             || summarise(states, m, (&uav, &user), c.g.as_mut_slice()),
@@ -82,17 +82,18 @@ impl Invariant {
             p.copy_from_slice(&state[..2 * m]);
         }
         let first = &self.w1.first;
-        first.forward_part(w, (2, HIDDEN), c.g.rows(), c.share.rows_mut(), Accumulate::Bias(first.bias(w)));
-        for (rows, share) in c.w1.hidden.as_mut_slice().chunks_exact_mut(m * HIDDEN).zip(c.share.as_slice().chunks_exact(HIDDEN))
+        first.forward_part(w, (2, HIDDEN), c.g.rows(), c.g_part_or_grad.rows_mut(), InitialValue::Bias(first.bias(w)));
+        for (rows, g_part) in
+            c.w1.hidden.as_mut_slice().chunks_exact_mut(m * HIDDEN).zip(c.g_part_or_grad.as_slice().chunks_exact(HIDDEN))
         {
-            rows.chunks_exact_mut(HIDDEN).for_each(|row| row.copy_from_slice(share));
+            rows.chunks_exact_mut(HIDDEN).for_each(|row| row.copy_from_slice(g_part));
         }
-        first.forward_part(w, (0, 2), c.positions.rows(), c.w1.hidden.rows_mut(), Accumulate::Add);
+        first.forward_part(w, (0, 2), c.positions.rows(), c.w1.hidden.rows_mut(), InitialValue::Previous);
         self.w1.finish(w, &mut c.w1);
         self.w2.forward(w, c.g.rows(), &mut c.w2);
         self.b2.forward(w, c.g.rows(), &mut c.b2);
         self.b1.forward(w, c.g.rows(), c.mixed.rows_mut());
-        let parts = (c.w1.out.as_slice(), c.w2.out.as_slice(), c.b2.out.as_slice());
+        let parts = (c.w1.output_or_grad.as_slice(), c.w2.output_or_grad.as_slice(), c.b2.output_or_grad.as_slice());
         simd(
             #[inline(always)]
             || mix(parts, (q.data, m), c.mixed.as_mut_slice(), total),
@@ -107,32 +108,33 @@ impl Invariant {
         d_total: &[T],
         (grads, dq): (&mut [T], &mut Batch<T>),
     ) {
-        let (m, flat) = (self.uavs, w.flat);
-        let parts = (c.w1.out.as_mut_slice(), c.w2.out.as_mut_slice(), c.mixed.as_mut_slice());
+        let (m, params) = (self.uavs, w.params);
+        let parts = (c.w1.output_or_grad.as_mut_slice(), c.w2.output_or_grad.as_mut_slice(), c.mixed.as_mut_slice());
         simd(
             #[inline(always)]
             || mix_back(parts, (q.data, m), d_total, dq.as_mut_slice()),
         );
-        c.b2.out.as_mut_slice().copy_from_slice(d_total);
-        c.dg.reset(HIDDEN, states.len);
-        self.b1.backward(flat, c.g.rows(), c.mixed.rows(), grads, Some(c.dg.rows_mut()));
+        c.b2.output_or_grad.as_mut_slice().copy_from_slice(d_total);
+        c.dg.resize(HIDDEN, states.len);
+        self.b1.backward(params, c.g.rows(), c.mixed.rows(), grads, Some(c.dg.rows_mut()));
         for (net, cache) in [(&self.w2, &mut c.w2), (&self.b2, &mut c.b2)] {
-            net.backward(flat, c.g.rows(), cache, grads);
-            net.backward_input(flat, cache, &mut c.dg);
+            net.backward(params, c.g.rows(), cache, grads);
+            net.backward_input(params, cache, &mut c.dg);
         }
-        self.w1.backward_last(flat, &mut c.w1, grads);
+        self.w1.backward_last(params, &mut c.w1, grads);
         let first = &self.w1.first;
         first.backward_part((0, 2), c.positions.rows(), c.w1.d_first.rows(), grads);
-        for (rows, share) in c.w1.d_first.as_slice().chunks_exact(m * HIDDEN).zip(c.share.as_mut_slice().chunks_exact_mut(HIDDEN))
+        for (rows, g_part) in
+            c.w1.d_first.as_slice().chunks_exact(m * HIDDEN).zip(c.g_part_or_grad.as_mut_slice().chunks_exact_mut(HIDDEN))
         {
-            share.fill(T::ZERO);
-            rows.chunks_exact(HIDDEN).for_each(|row| share.iter_mut().zip(row).for_each(|(s, &d)| *s += d));
+            g_part.fill(T::ZERO);
+            rows.chunks_exact(HIDDEN).for_each(|row| g_part.iter_mut().zip(row).for_each(|(s, &d)| *s += d));
         }
-        first.backward_bias(c.share.rows(), grads);
-        first.backward_part((2, HIDDEN), c.g.rows(), c.share.rows(), grads);
-        first.backward_input(flat, (2, HIDDEN), c.share.rows(), c.dg.rows_mut(), Accumulate::Add);
-        let (uav, user) = (self.uav.load(w), self.user.load(w));
-        let (mut uav_sums, mut user_sums) = (EmbeddingGrad::zero(), EmbeddingGrad::zero());
+        first.backward_bias(c.g_part_or_grad.rows(), grads);
+        first.backward_part((2, HIDDEN), c.g.rows(), c.g_part_or_grad.rows(), grads);
+        first.backward_input(params, (2, HIDDEN), c.g_part_or_grad.rows(), c.dg.rows_mut(), InitialValue::Previous);
+        let (uav, user) = (self.uav.params(w), self.user.params(w));
+        let (mut uav_sums, mut user_sums) = (EmbeddingParams::zero(), EmbeddingParams::zero());
         simd(
             #[inline(always)]
             || summarise_back(states, m, (&uav, &user), c.dg.as_slice(), (&mut uav_sums, &mut user_sums)),
@@ -143,8 +145,13 @@ impl Invariant {
 }
 
 #[inline(always)]
-fn summarise<T: Real>(states: Rows<'_, T>, uavs: usize, (uav, user): (&EmbeddingGrad<T, 2>, &EmbeddingGrad<T, 3>), g: &mut [T]) {
-    let (per_uav, per_user) = shares(states.stride, uavs);
+fn summarise<T: Real>(
+    states: Rows<'_, T>,
+    uavs: usize,
+    (uav, user): (&EmbeddingParams<T, 2>, &EmbeddingParams<T, 3>),
+    g: &mut [T],
+) {
+    let (per_uav, per_user) = mean_factors(states.stride, uavs);
     for (state, g) in states.data.chunks(states.stride).zip(g.as_chunks_mut::<HIDDEN>().0) {
         let (own, users) = state.split_at(2 * uavs);
         let (mut a, mut b) = ([T::ZERO; HIDDEN], [T::ZERO; HIDDEN]);
@@ -160,11 +167,11 @@ fn summarise<T: Real>(states: Rows<'_, T>, uavs: usize, (uav, user): (&Embedding
 fn summarise_back<T: Real>(
     states: Rows<'_, T>,
     uavs: usize,
-    (uav, user): (&EmbeddingGrad<T, 2>, &EmbeddingGrad<T, 3>),
+    (uav, user): (&EmbeddingParams<T, 2>, &EmbeddingParams<T, 3>),
     dg: &[T],
-    (uav_sums, user_sums): (&mut EmbeddingGrad<T, 2>, &mut EmbeddingGrad<T, 3>),
+    (uav_sums, user_sums): (&mut EmbeddingParams<T, 2>, &mut EmbeddingParams<T, 3>),
 ) {
-    let (per_uav, per_user) = shares::<T>(states.stride, uavs);
+    let (per_uav, per_user) = mean_factors::<T>(states.stride, uavs);
     for (state, dg) in states.data.chunks(states.stride).zip(dg.as_chunks::<HIDDEN>().0) {
         let (own, users) = state.split_at(2 * uavs);
         let (mut a, mut b) = (*dg, *dg);
@@ -179,7 +186,7 @@ fn summarise_back<T: Real>(
 
 /// 1 / M and 1 / N.
 #[inline(always)]
-fn shares<T: Real>(states: usize, uavs: usize) -> (T, T) {
+fn mean_factors<T: Real>(states: usize, uavs: usize) -> (T, T) {
     let users = (states - 2 * uavs) / 3;
     (T::from_f64(1.0 / uavs as f64), T::from_f64(1.0 / users.max(1) as f64))
 }

@@ -13,8 +13,8 @@ pub(super) const E: usize = 32;
 #[inline(always)]
 pub(super) fn mix<T: Real>((w1, w2, b2): (&[T], &[T], &[T]), (q, uavs): (&[T], usize), mixed: &mut [T], total: &mut [T]) {
     let (w1, w2) = (w1.as_chunks::<E>().0, w2.as_chunks::<E>().0);
-    for (g, (mixed, total)) in mixed.as_chunks_mut::<E>().0.iter_mut().zip(total).enumerate() {
-        for (w1, &q) in w1[g * uavs..][..uavs].iter().zip(&q[g * uavs..]) {
+    for (slot, (mixed, total)) in mixed.as_chunks_mut::<E>().0.iter_mut().zip(total).enumerate() {
+        for (w1, &q) in w1[slot * uavs..][..uavs].iter().zip(&q[slot * uavs..]) {
             for e in 0..E {
                 mixed[e] = q.mul_add(w1[e].abs(), mixed[e]);
             }
@@ -23,12 +23,12 @@ pub(super) fn mix<T: Real>((w1, w2, b2): (&[T], &[T], &[T]), (q, uavs): (&[T], u
         let mut terms = [T::ZERO; E];
         for e in 0..E {
             mixed[e] = elu(mixed[e]);
-            terms[e] = mixed[e] * w2[g][e].abs();
+            terms[e] = mixed[e] * w2[slot][e].abs();
         }
         for x in terms {
             sum += x;
         }
-        *total = sum + b2[g];
+        *total = sum + b2[slot];
     }
 }
 
@@ -41,14 +41,14 @@ pub(super) fn mix_back<T: Real>(
     dq: &mut [T],
 ) {
     let (w1, w2) = (w1.as_chunks_mut::<E>().0, w2.as_chunks_mut::<E>().0);
-    for (g, (mixed, &d)) in mixed.as_chunks_mut::<E>().0.iter_mut().zip(d_total).enumerate() {
-        let w2 = &mut w2[g];
+    for (slot, (mixed, &d)) in mixed.as_chunks_mut::<E>().0.iter_mut().zip(d_total).enumerate() {
+        let w2 = &mut w2[slot];
         for e in 0..E {
             let y = mixed[e];
             mixed[e] = d * w2[e].abs() * elu_slope(y);
             w2[e] = d * y * sign(w2[e]);
         }
-        for i in g * uavs..(g + 1) * uavs {
+        for i in slot * uavs..(slot + 1) * uavs {
             let w1 = &mut w1[i];
             let mut terms = [T::ZERO; E];
             for e in 0..E {

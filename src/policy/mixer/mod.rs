@@ -64,15 +64,15 @@ impl Mixer {
     }
 
     /// Number of joint values per slot: 1, or M with [`MixerKind::None`].
-    pub fn values(&self) -> usize {
+    pub fn joint_values_per_slot(&self) -> usize {
         if matches!(self.net, Net::None) { self.uavs } else { 1 }
     }
 
     /// See [`crate::nn::Weights`].
-    pub fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
+    pub fn prepare<T: Real>(&self, params: &[T], prepared: &mut [T]) {
         match &self.net {
-            Net::Qmix(net) => net.prepare(flat, transposed),
-            Net::Invariant(net) => net.prepare(flat, transposed),
+            Net::Qmix(net) => net.prepare(params, prepared),
+            Net::Invariant(net) => net.prepare(params, prepared),
             Net::Vdn | Net::None => {}
         }
     }
@@ -106,7 +106,7 @@ impl Mixer {
         d_total: &[T],
         (grads, dq): (&mut [T], &mut Batch<T>),
     ) {
-        dq.reset(self.uavs, q.len);
+        dq.resize(self.uavs, q.len);
         match &self.net {
             Net::Qmix(net) => net.backward(w, (states, q), &mut c.qmix, d_total, (grads, dq)),
             Net::Invariant(net) => net.backward(w, (states, q), &mut c.invariant, d_total, (grads, dq)),

@@ -39,9 +39,9 @@ impl Qmix {
         }
     }
 
-    pub(super) fn prepare<T: Real>(&self, flat: &[T], transposed: &mut [T]) {
-        [&self.w1, &self.w2, &self.b2].iter().for_each(|net| net.prepare(flat, transposed));
-        self.b1.prepare(flat, transposed);
+    pub(super) fn prepare<T: Real>(&self, params: &[T], prepared: &mut [T]) {
+        [&self.w1, &self.w2, &self.b2].iter().for_each(|net| net.prepare(params, prepared));
+        self.b1.prepare(params, prepared);
     }
 
     pub(super) fn forward<T: Real>(
@@ -55,9 +55,9 @@ impl Qmix {
         self.w1.forward(w, states, &mut c.w1);
         self.w2.forward(w, states, &mut c.w2);
         self.b2.forward(w, states, &mut c.b2);
-        c.mixed.reset(E, states.len);
+        c.mixed.resize(E, states.len);
         self.b1.forward(w, states, c.mixed.rows_mut());
-        let parts = (c.w1.out.as_slice(), c.w2.out.as_slice(), c.b2.out.as_slice());
+        let parts = (c.w1.output_or_grad.as_slice(), c.w2.output_or_grad.as_slice(), c.b2.output_or_grad.as_slice());
         simd(
             #[inline(always)]
             || mix(parts, (q.data, q.stride), c.mixed.as_mut_slice(), total),
@@ -72,15 +72,15 @@ impl Qmix {
         d_total: &[T],
         (grads, dq): (&mut [T], &mut Batch<T>),
     ) {
-        let (w1, w2) = (c.w1.out.as_mut_slice(), c.w2.out.as_mut_slice());
+        let (w1, w2) = (c.w1.output_or_grad.as_mut_slice(), c.w2.output_or_grad.as_mut_slice());
         simd(
             #[inline(always)]
             || mix_back((w1, w2, c.mixed.as_mut_slice()), (q.data, q.stride), d_total, dq.as_mut_slice()),
         );
-        c.b2.out.as_mut_slice().copy_from_slice(d_total);
-        self.b1.backward(w.flat, states, c.mixed.rows(), grads, None);
-        self.w1.backward(w.flat, states, &mut c.w1, grads);
-        self.w2.backward(w.flat, states, &mut c.w2, grads);
-        self.b2.backward(w.flat, states, &mut c.b2, grads);
+        c.b2.output_or_grad.as_mut_slice().copy_from_slice(d_total);
+        self.b1.backward(w.params, states, c.mixed.rows(), grads, None);
+        self.w1.backward(w.params, states, &mut c.w1, grads);
+        self.w2.backward(w.params, states, &mut c.w2, grads);
+        self.b2.backward(w.params, states, &mut c.b2, grads);
     }
 }

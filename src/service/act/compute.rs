@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use tracing::level_filters::LevelFilter;
 
-use crate::policy::Slot;
+use crate::policy::FleetGraph;
 use crate::service::{App, Error};
 use crate::serving::{LoadedPolicy, SceneOrGraph, Task, TaskOutput};
 
@@ -17,12 +17,12 @@ pub(super) async fn convert(
     content: SceneOrGraph,
     (uavs, users): (usize, usize),
     policy: &Arc<LoadedPolicy>,
-) -> Result<Slot, Error> {
+) -> Result<FleetGraph, Error> {
     if uavs + users < OFFLOAD_NODES {
-        return Ok(content.into_slot((uavs, users), &*policy.implementation)?);
+        return Ok(content.into_fleet_graph((uavs, users), &*policy.implementation)?);
     }
     let policy = policy.clone();
-    let converted = tokio::task::spawn_blocking(move || content.into_slot((uavs, users), &*policy.implementation));
+    let converted = tokio::task::spawn_blocking(move || content.into_fleet_graph((uavs, users), &*policy.implementation));
     Ok(converted.await.map_err(Error::internal)??)
 }
 

@@ -67,8 +67,8 @@ async fn start(
     }
     let policy = app.registry.resolve(spec)?;
     let FleetInput { fleet, canonical_of_request, content } = request.input;
-    let slot = compute::convert(content, fleet.size(), &policy).await?;
-    let step = SessionStep { fleet, canonical_of_request, slot, step: Some(0), run_id: None };
+    let graph = compute::convert(content, fleet.size(), &policy).await?;
+    let step = SessionStep { fleet, canonical_of_request, graph, step: Some(0), run_id: None };
     let mut guard = StartGuard { app, session: app.sessions.start_replacing(name, policy, request.seed)?, completed: false };
     let response = session::advance(app, &guard.session, step, deadline).await?;
     guard.completed = true;

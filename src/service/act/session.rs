@@ -5,7 +5,7 @@ use std::time::Instant;
 use super::compute;
 use super::request::{Request, Response};
 use crate::invalid::Invalid;
-use crate::policy::Slot;
+use crate::policy::FleetGraph;
 use crate::service::{App, Error};
 use crate::serving::{FleetIds, FleetInput, LoadedPolicy, PolicySpec, Session, StepStart, Task, VersionSelector};
 
@@ -17,8 +17,8 @@ pub(super) async fn act(app: &App, session: &Session, request: Request, deadline
         return Err(Invalid::new("seed", seed, "no value, because a session takes its seed when it is opened").into());
     }
     let FleetInput { fleet, canonical_of_request, content } = request.input;
-    let slot = compute::convert(content, fleet.size(), session.policy()).await?;
-    let step = SessionStep { fleet, canonical_of_request, slot, step: request.step, run_id: request.run_id };
+    let graph = compute::convert(content, fleet.size(), session.policy()).await?;
+    let step = SessionStep { fleet, canonical_of_request, graph, step: request.step, run_id: request.run_id };
     advance(app, session, step, deadline).await
 }
 
@@ -26,7 +26,7 @@ pub(super) async fn act(app: &App, session: &Session, request: Request, deadline
 pub(super) struct SessionStep {
     pub(super) fleet: FleetIds,
     pub(super) canonical_of_request: Vec<u32>,
-    pub(super) slot: Slot,
+    pub(super) graph: FleetGraph,
     pub(super) step: Option<u64>,
     pub(super) run_id: Option<String>,
 }
@@ -39,12 +39,12 @@ pub(super) async fn advance(
     deadline: Option<Instant>,
 ) -> Result<Response, Error> {
     let policy = session.policy().clone();
-    let SessionStep { fleet, canonical_of_request, slot, step, run_id } = step;
+    let SessionStep { fleet, canonical_of_request, graph, step, run_id } = step;
     let decision = match session.begin_step(&fleet, step, run_id.as_deref()).await? {
         StepStart::Repeated(decision) => decision,
         StepStart::Next(mut pending) => {
             let (memory, buffers) = (std::mem::take(&mut pending.memory), std::mem::take(&mut pending.buffers));
-            let task = Task::new(policy.clone(), slot, pending.step, memory, buffers);
+            let task = Task::new(policy.clone(), graph, pending.step, memory, buffers);
             pending.commit(compute::run(app, task, deadline).await?)
         }
     };

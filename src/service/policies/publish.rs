@@ -157,7 +157,7 @@ impl ParsedCheckpoint {
 
     /// The policy, published as `reference`.
     fn into_policy(self, reference: PolicyRef, created_at: i64) -> LoadedPolicy {
-        let (config, step) = (self.checkpoint.config(), self.checkpoint.step());
+        let (config, step) = (self.checkpoint.config(), self.checkpoint.env_steps());
         let (environment, training) = (&config.environment, &config.training);
         let flat = training.observation == ObservationKind::Flat;
         let object = |value: serde_json::Result<Value>| value.unwrap_or_default();
@@ -173,7 +173,7 @@ impl ParsedCheckpoint {
             description: format!("{:?}, trained for {step} slots with {uavs} UAVs and {users} users.", config.algorithm),
             uavs: (flat || training.identity == Identity::Onehot).then_some(uavs as u32),
             users: flat.then_some(users as u32),
-            headings: self.policy.actions(),
+            actions: self.policy.actions(),
             needs: self.policy.needs(),
             detection_range: self.policy.detection_range(),
             config: object(serde_json::to_value(config)),

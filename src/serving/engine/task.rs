@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use crate::policy::{FleetStep, Slot};
+use crate::policy::{FleetGraph, FleetStep};
 use crate::serving::LoadedPolicy;
 
 /// Cost of a UAV in units of work. A detection or a user costs one unit.
@@ -13,7 +13,7 @@ const UAV_WORK: usize = 32;
 #[derive(Debug)]
 pub struct Task {
     policy: Arc<LoadedPolicy>,
-    slot: Slot,
+    graph: FleetGraph,
     output: TaskOutput,
 }
 
@@ -61,14 +61,14 @@ pub struct OutputBuffers {
 
 impl Task {
     /// A task for slot `step` of a fleet with this memory.
-    pub fn new(policy: Arc<LoadedPolicy>, slot: Slot, step: u64, memory: Vec<f32>, buffers: OutputBuffers) -> Self {
+    pub fn new(policy: Arc<LoadedPolicy>, graph: FleetGraph, step: u64, memory: Vec<f32>, buffers: OutputBuffers) -> Self {
         let OutputBuffers { mut headings, mut q_values } = buffers;
         headings.clear();
-        headings.resize(slot.uavs(), 0);
+        headings.resize(graph.uavs(), 0);
         q_values.clear();
-        q_values.resize(slot.uavs() * policy.implementation.actions(), f32::NAN);
+        q_values.resize(graph.uavs() * policy.implementation.actions(), f32::NAN);
         let decision = Decision { step, headings, q_values, timings: Timings::default() };
-        Self { policy, slot, output: TaskOutput { memory, decision } }
+        Self { policy, graph, output: TaskOutput { memory, decision } }
     }
 
     /// The policy version to run.
@@ -80,7 +80,7 @@ impl Task {
     pub(super) fn as_fleet_step(&mut self) -> FleetStep<'_> {
         let TaskOutput { memory, decision } = &mut self.output;
         let Decision { step, headings, q_values, .. } = decision;
-        FleetStep { slot: &self.slot, step: *step, memory, headings, q_values: Some(q_values) }
+        FleetStep { graph: &self.graph, step: *step, memory, headings, q_values: Some(q_values) }
     }
 
     pub(super) fn finish(self, timings: Timings) -> TaskOutput {
@@ -90,6 +90,6 @@ impl Task {
 
     /// Estimated cost. A detection costs one unit.
     pub(super) fn work(&self) -> usize {
-        UAV_WORK * self.slot.uavs() + self.slot.users() + self.slot.detection_count()
+        UAV_WORK * self.graph.uavs() + self.graph.users() + self.graph.detection_count()
     }
 }

@@ -5,7 +5,7 @@ use rand::RngExt;
 use crate::env::EnvConfig;
 use crate::invalid::{Invalid, in_range};
 use crate::rng;
-use crate::train_config::EXACT;
+use crate::train_config::MAX_EXACT_INTEGER;
 
 /// Maximum number of copies of one environment.
 const MAX_COPIES: usize = 1024;
@@ -73,8 +73,8 @@ impl EnvironmentSpec {
                 return Err(Invalid::new(format!("actions[{b}].headings"), value, expected));
             }
             for (i, &heading) in headings.iter().enumerate() {
-                if heading as usize >= self.config.headings() {
-                    let expected = format!("a heading index from 0 to {}", self.config.headings() - 1);
+                if heading as usize >= self.config.actions() {
+                    let expected = format!("a heading index from 0 to {}", self.config.actions() - 1);
                     return Err(Invalid::new(format!("actions[{b}].headings[{i}]"), heading, expected));
                 }
                 flat.push(heading as u8);
@@ -100,15 +100,15 @@ impl EnvironmentSpec {
 
 /// Checks that a seed is in range.
 pub(super) fn check_seed(seed: u64) -> Result<(), Invalid> {
-    in_range("seed", seed, 0..=EXACT)
+    in_range("seed", seed, 0..=MAX_EXACT_INTEGER)
 }
 
 /// The seed of episode `episode` of the copy whose episode 0 has seed `first`. Seeds of later episodes have bit 52 set and are
-/// at most [`EXACT`], so they are disjoint from the seeds of evaluation episodes.
+/// at most [`MAX_EXACT_INTEGER`], so they are disjoint from the seeds of evaluation episodes.
 pub(super) fn episode_seed(first: u64, episode: u64) -> u64 {
     if episode == 0 {
         return first;
     }
     let drawn = rng::stream(first, "hosted-episode", episode).random::<u64>();
-    (drawn & EXACT) | (1 << 52)
+    (drawn & MAX_EXACT_INTEGER) | (1 << 52)
 }

@@ -1,7 +1,7 @@
 //! What a reset or a step of an environment returns, per copy.
 
 use crate::env::{EnvConfig, EpisodeMetrics, points};
-use crate::policy::Slot;
+use crate::policy::FleetGraph;
 use crate::serving::Scene;
 
 /// All copies after a reset or a step.
@@ -47,7 +47,7 @@ pub struct CopyObservation {
     /// Positions and AoI.
     pub scene: Scene,
     /// Detections within the environment's detection range.
-    pub graph: Option<Slot>,
+    pub graph: Option<FleetGraph>,
 }
 
 impl CopyObservation {
@@ -63,7 +63,7 @@ impl CopyObservation {
         let copies = uav_xy.chunks_exact(2 * m).zip(user_xy.chunks_exact(2 * n)).zip(aoi.chunks_exact(n));
         copies.map(move |((uavs, users), aoi)| {
             let scene = Scene { uavs: points(uavs).collect(), users: points(users).collect(), aoi: aoi.to_vec() };
-            let graph = graph.then(|| Slot::from_scene(&scene.uavs, &scene.users, &scene.aoi, range));
+            let graph = graph.then(|| FleetGraph::from_scene(&scene.uavs, &scene.users, &scene.aoi, range));
             Self { scene, graph }
         })
     }

@@ -362,11 +362,11 @@ proptest! {
         prop_assert_eq!(observation.canonical_of_request.len(), uavs);
         for baseline in LIST.iter().filter(|baseline| baseline.needs != RequiredInput::FullScene) {
             let policy = by_name(baseline.name, EnvParams::default()).unwrap();
-            let Ok(slot) = observation.clone().into_slot(&*policy) else { continue };
+            let Ok(slot) = observation.clone().into_fleet_graph(&*policy) else { continue };
             let mut memory = vec![0.0; policy.memory_len(uavs, users)];
             policy.start(uavs, users, 3, &mut memory);
             let mut headings = vec![0; uavs];
-            policy.act(&mut [FleetStep { slot: &slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: None }]);
+            policy.act(&mut [FleetStep { graph: &slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: None }]);
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use super::{ActArgs, ObservationForm};
 use crate::env::{EnvConfig, Episode, Point, Start};
-use crate::policy::Slot;
+use crate::policy::FleetGraph;
 use crate::wire::v1;
 use crate::wire::v1::act_request::{Memory, Observation as Sent};
 
@@ -40,7 +40,7 @@ pub(super) struct SimulatedFleet {
     observation: ObservationForm,
     range: f64,
     scale: f64,
-    slot: Slot,
+    graph: FleetGraph,
     uavs: Vec<String>,
     users: Vec<String>,
 }
@@ -58,7 +58,7 @@ impl SimulatedFleet {
             observation: config.observation,
             range: config.range,
             scale: config.scale,
-            slot: Slot::default(),
+            graph: FleetGraph::default(),
             uavs: (0..config.env.uavs).map(|i| format!("uav-{i}")).collect(),
             users: (0..config.env.users).map(|i| format!("user-{i}")).collect(),
         })
@@ -106,7 +106,7 @@ impl SimulatedFleet {
     /// The detections of the UAVs. The server derives those of the users.
     fn graph(&mut self, uavs: &[Point], users: &[Point]) -> v1::Graph {
         let aoi = self.episode.aoi();
-        self.slot.set_scene(uavs, users, aoi, self.range);
+        self.graph.set_scene(uavs, users, aoi, self.range);
         let detection = |d: &crate::policy::Detection| {
             let target = d.target as usize;
             let (id, aoi) = match target.checked_sub(uavs.len()) {
@@ -118,7 +118,7 @@ impl SimulatedFleet {
         let uav = |(i, p): (usize, &Point)| v1::Node {
             id: self.uavs[i].clone(),
             kind: v1::NodeKind::Uav.into(),
-            detections: self.slot.detections(i).iter().map(detection).collect(),
+            detections: self.graph.detections(i).iter().map(detection).collect(),
             position: Some(v1::Position { x: p[0], y: p[1] }),
             aoi: None,
         };

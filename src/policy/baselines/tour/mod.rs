@@ -13,7 +13,7 @@ use self::pilot::{Pilot, Problem, TourState};
 use super::geometry::distance;
 use super::rule::{EnvParams, Rule, uav_positions, user_positions};
 use crate::env::Point;
-use crate::policy::{RequiredInput, Slot};
+use crate::policy::{FleetGraph, RequiredInput};
 
 /// Memory: for each UAV, 1 + the index in its tour, and the length of the tour; the positions of users at the time of planning;
 /// then all tours, one after another. All zeros before the first plan.
@@ -39,12 +39,12 @@ impl Rule for Tour {
 
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}
 
-    fn decide(&self, env: &EnvParams, slot: &Slot, step: u64, memory: &mut [f32], headings: &mut [u8]) {
-        let (uavs, users) = (uav_positions(slot), user_positions(slot));
+    fn decide(&self, env: &EnvParams, graph: &FleetGraph, step: u64, memory: &mut [f32], headings: &mut [u8]) {
+        let (uavs, users) = (uav_positions(graph), user_positions(graph));
         let mut states = read_plan(env, uavs.len(), users, memory).unwrap_or_else(|| {
             let left = env.slots.saturating_sub(usize::try_from(step).unwrap_or(usize::MAX));
             let slots = left.clamp(MIN_SLOTS, MAX_SLOTS);
-            let problem = Problem { env, uavs, users, aoi: slot.aoi(), slots };
+            let problem = Problem { env, uavs, users, aoi: graph.aoi(), slots };
             let tours = plan::tours(&problem, capacity(uavs.len(), users.len()));
             write_plan(&tours, users, memory);
             tours.into_iter().map(|tour| TourState { tour, next: 0 }).collect()

@@ -1,14 +1,14 @@
 //! Assigns users to UAVs so that the sum of AoI is low when each UAV flies its tour alone.
 //!
-//! Up to [`EXACT`] users and UAVs, all assignments are compared. Larger problems start from clusters of users, and users are
-//! moved between UAVs that are near, within a bounded number of simulated flights.
+//! Up to [`MAX_EXHAUSTIVE`] users and UAVs, all assignments are compared. Larger problems start from clusters of users, and users
+//! are moved between UAVs that are near, within a bounded number of simulated flights.
 
 use super::super::geometry::distance;
 use super::order::shorten;
 use super::pilot::{Pilot, Problem};
 
-/// Largest number of users, and of UAVs, for which all assignments are compared.
-const EXACT: usize = 8;
+/// Maximum number of users, and of UAVs, for which all assignments are compared.
+const MAX_EXHAUSTIVE: usize = 8;
 /// Rounds of k-means.
 const ROUNDS: usize = 10;
 /// Bound on the work of improving clusters, in the unit of [`work`].
@@ -18,7 +18,7 @@ const NEIGHBOURS: usize = 3;
 
 /// A tour per UAV; together they visit every user once.
 pub fn tours(problem: &Problem) -> Vec<Vec<u32>> {
-    if problem.users.len() <= EXACT && problem.uavs.len() <= EXACT { exact(problem) } else { clusters(problem) }
+    if problem.users.len() <= MAX_EXHAUSTIVE && problem.uavs.len() <= MAX_EXHAUSTIVE { exact(problem) } else { clusters(problem) }
 }
 
 /// A tour and the sum of the AoI of its users over the slots.
@@ -81,7 +81,7 @@ fn exact(problem: &Problem) -> Vec<Vec<u32>> {
     let (m, n) = (problem.uavs.len(), problem.users.len());
     let sets = 1 << n;
     // No UAV is without users while another has two.
-    let most = (n + 1).saturating_sub(m).max(1);
+    let max_users = (n + 1).saturating_sub(m).max(1);
     let members = |set: usize| (0..n as u32).filter(|user| set >> user & 1 == 1).collect::<Vec<_>>();
     let mut flown: Vec<Vec<Option<ScoredTour>>> = Vec::with_capacity(m);
     for uav in 0..m {
@@ -89,7 +89,7 @@ fn exact(problem: &Problem) -> Vec<Vec<u32>> {
         flown.push(match twin {
             Some(other) => flown[other].clone(),
             None => (0..sets)
-                .map(|set: usize| (set.count_ones() as usize <= most).then(|| best_tour(problem, uav, members(set))))
+                .map(|set: usize| (set.count_ones() as usize <= max_users).then(|| best_tour(problem, uav, members(set))))
                 .collect(),
         });
     }

@@ -19,41 +19,41 @@ pub struct StepInput<'a> {
 
 /// Hidden states, last actions and buffers of B fleets of the size that the agent was made for.
 #[derive(Debug)]
-pub struct Actor {
+pub struct BatchedAgent {
     fleets: usize,
-    flat: Vec<f32>,
-    transposed: Vec<f32>,
+    params: Vec<f32>,
+    prepared: Vec<f32>,
     hidden: Vec<f32>,
     last: Vec<u8>,
-    token: Vec<f32>,
+    identity_token: Vec<f32>,
     geometry: Geometry,
     cache: AgentCache<f32>,
 }
 
-impl Actor {
-    /// Allocates for `fleets` fleets. Call [`Actor::begin`] before the first step.
+impl BatchedAgent {
+    /// Allocates for `fleets` fleets. Call [`BatchedAgent::begin`] before the first step.
     pub fn new(agent: &Agent, fleets: usize) -> Self {
         let (len, rows) = (agent.layout().len(), fleets * agent.dims().uavs);
         Self {
             fleets,
-            flat: vec![0.0; len],
-            transposed: vec![0.0; len],
+            params: vec![0.0; len],
+            prepared: vec![0.0; len],
             hidden: vec![0.0; rows * HIDDEN],
             last: vec![NO_ACTION; rows],
-            token: vec![0.0; rows * TOKEN],
+            identity_token: vec![0.0; rows * TOKEN],
             geometry: Geometry::default(),
             cache: AgentCache::default(),
         }
     }
 
-    /// Starts an episode with the parameters `params`. `token` is (B, M, 4) and is used only with identity `token`.
+    /// Starts an episode with the parameters `params`. `identity_token` is (B, M, 4) and is used only with identity `token`.
     ///
     /// # Panics
     /// If a length does not fit.
-    pub fn begin(&mut self, agent: &Agent, params: &[f32], token: &[f32]) {
-        self.flat.copy_from_slice(params);
-        agent.prepare(&self.flat, &mut self.transposed);
-        self.token.copy_from_slice(token);
+    pub fn begin(&mut self, agent: &Agent, params: &[f32], identity_token: &[f32]) {
+        self.params.copy_from_slice(params);
+        agent.prepare(&self.params, &mut self.prepared);
+        self.identity_token.copy_from_slice(identity_token);
         self.hidden.fill(0.0);
         self.last.fill(NO_ACTION);
     }
@@ -66,7 +66,7 @@ impl Actor {
         let (m, n) = (agent.dims().uavs, agent.dims().users);
         let lengths = (input.uav_xy.len(), input.user_xy.len(), input.aoi.len());
         assert_eq!(lengths, (self.fleets * m * 2, self.fleets * n * 2, self.fleets * n), "B fleets of M and N");
-        let config = agent.geometry();
+        let config = agent.geometry_config();
         self.geometry.clear();
         for f in 0..self.fleets {
             let (uav_xy, user_xy) = (&input.uav_xy[f * 2 * m..][..2 * m], &input.user_xy[f * 2 * n..][..2 * n]);
@@ -75,8 +75,9 @@ impl Actor {
         self.geometry.finish(&config);
         let rows = self.fleets * m;
         self.cache.begin(rows, 1).copy_from_slice(&self.hidden);
-        let weights = Weights { flat: &self.flat, transposed: &self.transposed };
-        let inputs = Inputs { geometry: &self.geometry, last: &self.last, token: &self.token, position: input.uav_xy };
+        let weights = Weights { params: &self.params, prepared: &self.prepared };
+        let inputs =
+            Inputs { geometry: &self.geometry, last: &self.last, identity_token: &self.identity_token, position: input.uav_xy };
         agent.forward(weights, &inputs, 1, &mut self.cache);
         self.hidden.copy_from_slice(self.cache.last_hidden(rows));
         self.cache.q.as_slice()

@@ -1,11 +1,13 @@
-//! One slot of one fleet: what each node detects, the users' AoI, and positions where they are known (docs/model.md, "Observations").
+//! The input of a policy for one fleet in one slot: what each node detects, the users' AoI, and positions where they are known
+//! (docs/model.md, "Observations").
 
 use super::neighbor_search::{Detection, NeighborSearch};
 use crate::env::Point;
 
-/// The graph of one slot as lists of detections. Nodes 0..M are UAVs, nodes M..M+N are users. No node is in its own list.
+/// What all nodes of a fleet detect in one slot, as lists of detections. Nodes 0..M are UAVs, nodes M..M+N are users. No node is
+/// in its own list.
 #[derive(Clone, Debug, Default)]
-pub struct Slot {
+pub struct FleetGraph {
     uavs: usize,
     users: usize,
     /// `offsets[i]..offsets[i + 1]` are node i's detections.
@@ -19,7 +21,7 @@ pub struct Slot {
     search: NeighborSearch,
 }
 
-impl PartialEq for Slot {
+impl PartialEq for FleetGraph {
     fn eq(&self, other: &Self) -> bool {
         let parts = |s: &Self| (s.uavs, s.users);
         parts(self) == parts(other)
@@ -31,20 +33,20 @@ impl PartialEq for Slot {
     }
 }
 
-impl Slot {
-    /// The slot of a scene: nodes within `range` (distance^2 <= range^2, in f64) detect each other.
+impl FleetGraph {
+    /// The graph of a scene: nodes within `range` (distance^2 <= range^2, in f64) detect each other.
     ///
     /// Work and memory grow with the nodes and the detections, not with the square of the nodes.
     ///
     /// # Panics
     /// When `aoi` does not have one entry per user.
     pub fn from_scene(uavs: &[Point], users: &[Point], aoi: &[f32], range: f64) -> Self {
-        let mut slot = Self::default();
-        slot.set_scene(uavs, users, aoi, range);
-        slot
+        let mut graph = Self::default();
+        graph.set_scene(uavs, users, aoi, range);
+        graph
     }
 
-    /// The slot of a detection graph. `detections[i]` is the list of node i, in ascending order of target. The caller has checked
+    /// The graph with these detections. `detections[i]` is the list of node i, in ascending order of target. The caller has checked
     /// that targets exist, differ from i and do not repeat. The AoI of a user that no node detects has no effect; set it to 0.
     ///
     /// # Panics
@@ -60,17 +62,17 @@ impl Slot {
         Self::from_flat_detections(uav_positions, uavs, aoi, offsets, flat)
     }
 
-    /// As [`Slot::from_scene`], but `None` if there are more than `most` detections. Work and memory are bounded by the number of
-    /// nodes and by `most`.
+    /// As [`FleetGraph::from_scene`], but `None` if there are more than `max_detections` detections. Work and memory are bounded by
+    /// the number of nodes and by `max_detections`.
     ///
     /// # Panics
     /// When `aoi` does not have one entry per user.
-    pub fn from_scene_within(uavs: &[Point], users: &[Point], aoi: &[f32], range: f64, most: usize) -> Option<Self> {
-        let mut slot = Self::default();
-        slot.rebuild(uavs, users, aoi, range, most).then_some(slot)
+    pub fn from_scene_within(uavs: &[Point], users: &[Point], aoi: &[f32], range: f64, max_detections: usize) -> Option<Self> {
+        let mut graph = Self::default();
+        graph.rebuild(uavs, users, aoi, range, max_detections).then_some(graph)
     }
 
-    /// As [`Slot::from_detections`], from all lists in one vector: the list of node i is
+    /// As [`FleetGraph::from_detections`], from all lists in one vector: the list of node i is
     /// `detections[offsets[i]..offsets[i + 1]]`.
     ///
     /// # Panics
@@ -92,7 +94,7 @@ impl Slot {
         Self { uavs, users, offsets, detections, aoi, uav_positions, ..Self::default() }
     }
 
-    /// Rebuilds this slot from a scene, keeping its allocations (see [`Slot::from_scene`]).
+    /// Rebuilds this graph from a scene, keeping its allocations (see [`FleetGraph::from_scene`]).
     ///
     /// # Panics
     /// When `aoi` does not have one entry per user.
@@ -100,8 +102,8 @@ impl Slot {
         self.rebuild(uavs, users, aoi, range, usize::MAX);
     }
 
-    /// Returns false and leaves the slot incomplete if there are more than `most` detections.
-    fn rebuild(&mut self, uavs: &[Point], users: &[Point], aoi: &[f32], range: f64, most: usize) -> bool {
+    /// Returns false and leaves the graph incomplete if there are more than `max_detections` detections.
+    fn rebuild(&mut self, uavs: &[Point], users: &[Point], aoi: &[f32], range: f64, max_detections: usize) -> bool {
         assert_eq!(aoi.len(), users.len(), "one AoI per user");
         self.uavs = uavs.len();
         self.users = users.len();
@@ -119,7 +121,13 @@ impl Slot {
         self.points.clear();
         self.points.extend_from_slice(uavs);
         self.points.extend_from_slice(users);
-        self.search.append_detections(&self.points, self.points.len(), range, (&mut self.offsets, &mut self.detections), most)
+        self.search.append_detections(
+            &self.points,
+            self.points.len(),
+            range,
+            (&mut self.offsets, &mut self.detections),
+            max_detections,
+        )
     }
 
     /// M.

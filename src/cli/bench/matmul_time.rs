@@ -1,4 +1,4 @@
-//! The roofline of an update: the time of its matrix products alone, with the same shapes on the same number of threads.
+//! The time of the matrix products of an update alone, with the same shapes on the same number of threads.
 //!
 //! An update multiplies by every weight four times: forward through the online and the target network, and backward to the weights
 //! and to the inputs of the online network. The mixers, about 3 % of the arithmetic, are left out.
@@ -8,19 +8,19 @@ use std::time::Instant;
 
 use crate::learner::Episodes;
 use crate::learner::loss::episodes_per_chunk;
-use crate::nn::matmul::{Accumulate, Lhs, Out, Rhs, matmul};
+use crate::nn::matmul::{InitialValue, Lhs, Out, Rhs, matmul};
 use crate::policy::{Agent, Geometry};
 
-/// A lower bound of the time of an update.
-pub(super) struct Roofline {
+/// The matrix products of an update: a lower bound of its time.
+pub(super) struct MatmulTime {
     /// Floating-point operations of all products, in 10^9.
     pub gflop: f64,
     /// Median time of all products, in seconds.
     pub seconds: f64,
 }
 
-/// Measures the roofline of an update with `batch`.
-pub(super) fn measure(agent: &Agent, batch: &Episodes, threads: usize, repeat: usize) -> Roofline {
+/// Measures the matrix products of an update with `batch`.
+pub(super) fn measure(agent: &Agent, batch: &Episodes, threads: usize, repeat: usize) -> MatmulTime {
     let chunks = batch.len.div_ceil(episodes_per_chunk(batch.uavs));
     let slots = batch.slots + 1;
     let products: Vec<[usize; 3]> = agent
@@ -31,12 +31,12 @@ pub(super) fn measure(agent: &Agent, batch: &Episodes, threads: usize, repeat: u
     let operations: usize = products.iter().map(|[m, k, n]| 2 * m * k * n).sum();
     let mut seconds: Vec<f64> = (0..repeat).map(|_| multiply(&products, chunks, threads)).collect();
     seconds.sort_by(f64::total_cmp);
-    Roofline { gflop: (4 * chunks * operations) as f64 * 1e-9, seconds: seconds[repeat / 2] }
+    MatmulTime { gflop: (4 * chunks * operations) as f64 * 1e-9, seconds: seconds[repeat / 2] }
 }
 
 /// The graphs of all slots of all episodes.
 fn geometry(agent: &Agent, ep: &Episodes) -> Geometry {
-    let config = agent.geometry();
+    let config = agent.geometry_config();
     let mut geometry = Geometry::default();
     geometry.clear();
     for at in 0..ep.len * (ep.slots + 1) {
@@ -63,12 +63,12 @@ fn multiply(products: &[[usize; 3]], chunks: usize, threads: usize) -> f64 {
                     for &[m, k, n] in products {
                         for _ in 0..2 {
                             let out = Out { data: &mut y, stride: n };
-                            matmul((m, k, n), Lhs::rows(&x, k), Rhs { data: &w, stride: n }, out, Accumulate::Zero);
+                            matmul((m, k, n), Lhs::rows(&x, k), Rhs { data: &w, stride: n }, out, InitialValue::Zero);
                         }
                         let out = Out { data: &mut dw, stride: k };
-                        matmul((n, m, k), Lhs::transposed(&x, n), Rhs { data: &x, stride: k }, out, Accumulate::Add);
+                        matmul((n, m, k), Lhs::transposed(&x, n), Rhs { data: &x, stride: k }, out, InitialValue::Previous);
                         let out = Out { data: &mut y, stride: k };
-                        matmul((m, n, k), Lhs::rows(&x, n), Rhs { data: &w, stride: k }, out, Accumulate::Zero);
+                        matmul((m, n, k), Lhs::rows(&x, n), Rhs { data: &w, stride: k }, out, InitialValue::Zero);
                     }
                 }
                 black_box((y, dw));
