@@ -117,7 +117,7 @@ impl Config {
             normalise: false,
         };
         if count("token")? != TOKEN {
-            return Err(format!("metadata identity_token = {}; expected {TOKEN}", text("token")?));
+            return Err(format!("metadata token = {}; expected {TOKEN}", text("token")?));
         }
         Ok(Self {
             agent,

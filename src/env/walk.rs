@@ -18,7 +18,7 @@ pub(super) struct RandomWalk {
 }
 
 impl RandomWalk {
-    /// Largest change of direction per slot, in radians.
+    /// Maximum change of direction per slot, in radians.
     const MAX_TURN: f64 = FRAC_PI_8;
 
     pub(super) fn new(seed: u64, users: usize, speed: f64) -> Self {

@@ -2,8 +2,8 @@
 //!
 //! An iteration collects `envs` episodes, makes its updates, and copies the target networks when due. The greedy policy is evaluated
 //! at step 0, every `eval_every` steps and at the end, on `valid-v1`; training never uses `eval-v1`. (configuration, seed) fixes
-//! every event and parameter, whatever the number of threads. A run restored from a snapshot yields the same events and parameters as a
-//! run without interruption.
+//! every event and parameter, whatever the number of threads. A run restored from a snapshot yields the same events and parameters
+//! as a run without interruption.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};

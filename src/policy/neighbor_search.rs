@@ -5,7 +5,7 @@
 
 use crate::env::Point;
 
-/// Largest number of nodes for which all pairs are compared.
+/// Maximum number of nodes for which all pairs are compared.
 const ALL_PAIRS: usize = 48;
 
 /// Node `target` detected at relative position `rel` = position of the target - position of the detecting node.

@@ -10,7 +10,7 @@ pub(super) struct GreedyGlobal;
 
 impl Rule for GreedyGlobal {
     const NAME: &'static str = "greedy-global";
-    const DESCRIPTION: &'static str = "Full information: pairs UAVs with the users that promise most AoI per graph of flight.";
+    const DESCRIPTION: &'static str = "Full information: pairs UAVs with the users that promise most AoI per slot of flight.";
     const NEEDS: RequiredInput = RequiredInput::FullScene;
 
     fn memory_len(&self, _uavs: usize, _users: usize) -> usize {

@@ -66,7 +66,7 @@ struct Baseline<R> {
     env: EnvParams,
 }
 
-/// Largest M * N that baselines accept: their work and memory grow with it.
+/// Maximum M * N that baselines accept: their work and memory grow with it.
 const MAX_PAIRS: usize = 1 << 20;
 
 impl<R: Rule> Policy for Baseline<R> {

@@ -10,7 +10,7 @@ pub(super) struct Random;
 
 impl Rule for Random {
     const NAME: &'static str = "random";
-    const DESCRIPTION: &'static str = "Every UAV draws a heading in every graph.";
+    const DESCRIPTION: &'static str = "Every UAV draws a heading in every slot.";
     const NEEDS: RequiredInput = RequiredInput::Detections;
 
     fn memory_len(&self, _uavs: usize, _users: usize) -> usize {

@@ -22,7 +22,7 @@ pub(super) struct Tour;
 
 /// Share of the transmission range that a user may move before the fleet plans again.
 const MAX_MOVE: f64 = 0.5;
-/// Largest number of slots that a plan looks ahead.
+/// Maximum number of slots that a plan looks ahead.
 const MAX_SLOTS: usize = 200;
 /// Smallest number, used near the end of an episode and after it.
 const MIN_SLOTS: usize = 20;
@@ -56,7 +56,7 @@ impl Rule for Tour {
     }
 }
 
-/// Largest number of entries of all tours: every user once, and two more per UAV for users that are shared.
+/// Maximum number of entries of all tours: every user once, and two more per UAV for users that are shared.
 fn capacity(uavs: usize, users: usize) -> usize {
     users + 2 * uavs
 }

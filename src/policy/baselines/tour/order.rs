@@ -3,14 +3,14 @@
 use super::super::geometry::distance;
 use crate::env::Point;
 
-/// Largest number of points for which the first tour is by nearest neighbour, which compares all pairs. Larger tours start row
+/// Maximum number of points for which the first tour is by nearest neighbour, which compares all pairs. Larger tours start row
 /// by row.
 const PAIRWISE: usize = 2048;
-/// Largest distance along the tour between two points that an improvement exchanges.
+/// Maximum distance along the tour between two points that an improvement exchanges.
 const WINDOW: usize = 48;
-/// Largest number of rounds of improvements.
+/// Maximum number of rounds of improvements.
 const ROUNDS: usize = 12;
-/// Largest number of points times rounds.
+/// Maximum number of points times rounds.
 const WORK: usize = 20_000;
 
 /// Reorders `tour` into a short cyclic tour.

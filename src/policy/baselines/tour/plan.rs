@@ -11,7 +11,7 @@ use super::partition;
 use super::pilot::{Pilot, Problem};
 use crate::rng;
 
-/// Largest number of users for which the fleet is simulated: one bit per user.
+/// Maximum number of users for which the fleet is simulated: one bit per user.
 const MAX_SIMULATED: usize = 64;
 /// Number of changes that are tried. Ten times as many lower the AoI by 1 %.
 const TRIES: usize = 400;
