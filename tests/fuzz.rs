@@ -14,7 +14,7 @@ use axum::body::Body;
 use axum::http::{Request, Response, header};
 use prost::Message;
 use qedgix::api::{grpc, rest};
-use qedgix::checkpoint::{Checkpoint, layout};
+use qedgix::checkpoint::{Checkpoint, parameter_layout};
 use qedgix::clock::Clock;
 use qedgix::config::Config;
 use qedgix::policy::{FleetGraph, FleetStep, Policy};
