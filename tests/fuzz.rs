@@ -275,7 +275,7 @@ impl Subject {
         let grpc = ServiceBuilder::new().map_response(|r: Response<_>| r.map(Body::new)).service(services);
         let mut config = TrainConfig::preset(Algorithm::Vdn, Preset::Practical);
         config.environment.reward_scale = Some(1.0);
-        let weights = (0..layout(&config).len()).map(|i| (i % 7) as f32 * 0.01).collect();
+        let weights = (0..parameter_layout(&config).len()).map(|i| (i % 7) as f32 * 0.01).collect();
         let points = |n: usize| (0..n).map(|i| [0.1 * i as f64, 0.2]).collect::<Vec<_>>();
         Self {
             rest: rest::router(app.clone(), telemetry::render_metrics, LARGEST),
