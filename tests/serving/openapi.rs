@@ -103,6 +103,23 @@ async fn operations_say_who_they_are_and_problems_are_problems() {
     }
 }
 
+/// What responses call `policy` is a version reference, so every path parameter of that name accepts one.
+#[tokio::test]
+async fn version_references_are_accepted_wherever_a_path_has_a_policy() {
+    let server = Server::start().await;
+    let document = document(&server).await;
+    let mut tried = 0;
+    for (path, item) in paths(&document).filter(|(path, _)| path.contains("{policy}")) {
+        for verb in item.keys() {
+            let verb = Method::from_bytes(verb.to_uppercase().as_bytes()).unwrap();
+            let response = Client::new().request(verb, server.url(&path.replace("{policy}", "qedgix:1"))).send().await.unwrap();
+            assert_eq!(response.status(), StatusCode::OK, "{path}");
+            tried += 1;
+        }
+    }
+    assert!(tried >= 4, "{tried}");
+}
+
 /// Sends what the document shows as an example of this operation.
 async fn pasted(server: &Server, document: &Value, id: &str) -> (StatusCode, Value) {
     let operations = paths(document).flat_map(|(path, item)| item.iter().map(move |(verb, operation)| (path, verb, operation)));
