@@ -4,7 +4,6 @@ use std::path::{Path, PathBuf};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     println!("cargo:rerun-if-changed=proto");
-    println!("cargo:rerun-if-changed=migrations");
     let mut files: Vec<PathBuf> = Vec::new();
     for dir in ["proto/inference", "proto/qedgix/v1"] {
         for entry in std::fs::read_dir(dir)? {

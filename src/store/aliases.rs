@@ -1,7 +1,7 @@
 //! Aliases of policies with their history. An alias and its history change in one transaction.
 
 use jiff::Timestamp;
-use sqlx::{FromRow, SqliteConnection};
+use sqlx::SqliteConnection;
 
 use super::{Result, Store, timestamp};
 
@@ -48,14 +48,15 @@ pub struct AliasHistoryEntry {
     pub by: Option<String>,
 }
 
-#[derive(FromRow)]
-struct AliasHistoryRow {
-    id: i64,
-    alias: String,
-    version: Option<i64>,
-    previous: Option<i64>,
-    at: i64,
-    by: Option<String>,
+from_row! {
+    struct AliasHistoryRow {
+        id: i64,
+        alias: String,
+        version: Option<i64>,
+        previous: Option<i64>,
+        at: i64,
+        by: Option<String>,
+    }
 }
 
 /// Selects entries of the history.

@@ -2,7 +2,7 @@
 //! write, and only until it has ended. The store refuses writes of all other attempts.
 
 use jiff::Timestamp;
-use sqlx::{FromRow, SqliteConnection};
+use sqlx::SqliteConnection;
 
 use super::jobs::{Transition, find, transition};
 use super::named_enum::named_enum;
@@ -95,14 +95,15 @@ pub struct Attempt {
     pub log: String,
 }
 
-#[derive(FromRow)]
-struct AttemptRow {
-    number: i64,
-    started_at: i64,
-    ended_at: Option<i64>,
-    outcome: Option<String>,
-    reason: Option<String>,
-    log: String,
+from_row! {
+    struct AttemptRow {
+        number: i64,
+        started_at: i64,
+        ended_at: Option<i64>,
+        outcome: Option<String>,
+        reason: Option<String>,
+        log: String,
+    }
 }
 
 /// Whether the attempt may write: it is the newest of its job and has not ended.

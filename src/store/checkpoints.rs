@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 
 use jiff::Timestamp;
-use sqlx::FromRow;
 use uuid::Uuid;
 
 use super::attempts::is_active;
@@ -60,18 +59,19 @@ pub struct Checkpoint {
     pub created_at: Timestamp,
 }
 
-#[derive(FromRow)]
-struct CheckpointRow {
-    id: String,
-    job: String,
-    kind: String,
-    attempt: i64,
-    step: i64,
-    sha256: String,
-    size: i64,
-    metrics: String,
-    config: String,
-    created_at: i64,
+from_row! {
+    struct CheckpointRow {
+        id: String,
+        job: String,
+        kind: String,
+        attempt: i64,
+        step: i64,
+        sha256: String,
+        size: i64,
+        metrics: String,
+        config: String,
+        created_at: i64,
+    }
 }
 
 impl TryFrom<CheckpointRow> for Checkpoint {

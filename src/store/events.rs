@@ -1,7 +1,6 @@
 //! The event log of each job: changes of state and reported metrics in the order of their commits. Event ids increase per
 //! job and are never reused, so a reader can continue after any event, also after a restart.
 
-use sqlx::FromRow;
 use tokio::sync::watch;
 
 use super::{JobState, MetricRow, Result, Store, timestamp};
@@ -34,16 +33,17 @@ pub enum JobEventKind {
     Metrics(Vec<MetricRow>),
 }
 
-#[derive(FromRow)]
-struct Row {
-    seq: i64,
-    at: i64,
-    state: Option<String>,
-    attempt: i64,
-    reason: Option<String>,
-    name: String,
-    step: i64,
-    value: Option<f64>,
+from_row! {
+    struct Row {
+        seq: i64,
+        at: i64,
+        state: Option<String>,
+        attempt: i64,
+        reason: Option<String>,
+        name: String,
+        step: i64,
+        value: Option<f64>,
+    }
 }
 
 /// Rows per page, unless a single event has more.

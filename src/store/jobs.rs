@@ -7,7 +7,7 @@ use futures::TryStreamExt;
 use jiff::Timestamp;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use sqlx::{FromRow, Sqlite, SqliteConnection, Transaction};
+use sqlx::{Sqlite, SqliteConnection, Transaction};
 use uuid::Uuid;
 
 use super::named_enum::named_enum;
@@ -201,23 +201,24 @@ impl Job {
     }
 }
 
-#[derive(FromRow)]
-struct JobRow {
-    number: i64,
-    id: String,
-    state: String,
-    /// The pending action.
-    wanted: Option<String>,
-    reason: Option<String>,
-    spec: String,
-    attempts: i64,
-    failures: i64,
-    step: i64,
-    policy: Option<String>,
-    seq: i64,
-    created_at: i64,
-    started_at: Option<i64>,
-    ended_at: Option<i64>,
+from_row! {
+    struct JobRow {
+        number: i64,
+        id: String,
+        state: String,
+        /// The pending action.
+        wanted: Option<String>,
+        reason: Option<String>,
+        spec: String,
+        attempts: i64,
+        failures: i64,
+        step: i64,
+        policy: Option<String>,
+        seq: i64,
+        created_at: i64,
+        started_at: Option<i64>,
+        ended_at: Option<i64>,
+    }
 }
 
 impl<S: DeserializeOwned> TryFrom<JobRow> for Job<S> {

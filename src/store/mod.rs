@@ -1,6 +1,22 @@
 //! The database: all SQL of the program. One SQLite file in WAL mode, one writer, embedded migrations. Every method returns
 //! after its change is on the disk, so acknowledged changes survive `kill -9`.
 
+/// Declares a struct whose fields are read from the columns of their names. It stands in for sqlx's derive macro, for which
+/// Cargo compiles SQLite and sqlx a second time.
+macro_rules! from_row {
+    (struct $name:ident { $($(#[$doc:meta])* $field:ident: $type:ty,)+ }) => {
+        struct $name {
+            $($(#[$doc])* $field: $type,)+
+        }
+
+        impl<'r> sqlx::FromRow<'r, sqlx::sqlite::SqliteRow> for $name {
+            fn from_row(row: &'r sqlx::sqlite::SqliteRow) -> sqlx::Result<Self> {
+                Ok(Self { $($field: sqlx::Row::try_get(row, stringify!($field))?,)+ })
+            }
+        }
+    };
+}
+
 mod aliases;
 mod attempts;
 mod checkpoints;
@@ -29,10 +45,19 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
+use sqlx::migrate::{Migration, MigrationType, Migrator};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
-use sqlx::{Sqlite, SqlitePool, Transaction};
+use sqlx::{SqlSafeStr, Sqlite, SqlitePool, Transaction};
 
-static MIGRATIONS: sqlx::migrate::Migrator = sqlx::migrate!("./migrations");
+macro_rules! migrations {
+    ($($file:literal),+ $(,)?) => {
+        [$(($file, include_str!(concat!("../../migrations/", $file)))),+]
+    };
+}
+
+/// Name and content of every file in `migrations/`.
+const MIGRATIONS: [(&str, &str); 5] =
+    migrations!["0001_jobs.sql", "0002_policies.sql", "0003_promotions.sql", "0004_events.sql", "0005_api_keys.sql"];
 
 /// Name of the database file inside the data directory.
 pub const FILE: &str = "qedgix.sqlite";
@@ -81,7 +106,7 @@ impl Store {
             .foreign_keys(true)
             .busy_timeout(Duration::from_secs(10));
         let write = SqlitePoolOptions::new().max_connections(1).connect_with(options.clone()).await?;
-        MIGRATIONS.run(&write).await?;
+        migrator().run(&write).await?;
         let read = SqlitePoolOptions::new().max_connections(4).connect_with(options.read_only(true)).await?;
         Ok(Self { read, write, notifier: Arc::new(events::Notifier::new()) })
     }
@@ -93,6 +118,16 @@ impl Store {
     }
 }
 
+fn migrator() -> Migrator {
+    let migration = |(file, sql): (&'static str, &'static str)| {
+        let parts = file.strip_suffix(".sql").and_then(|name| name.split_once('_'));
+        let (number, name) = parts.expect("files are named NUMBER_NAME.sql");
+        let number = number.parse().expect("files are named NUMBER_NAME.sql");
+        Migration::new(number, name.replace('_', " ").into(), MigrationType::Simple, sql.into_sql_str(), false)
+    };
+    Migrator::with_migrations(MIGRATIONS.into_iter().map(migration).collect())
+}
+
 /// A result of the store.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
@@ -102,4 +137,22 @@ fn corrupt(what: &str, id: impl std::fmt::Display, reason: impl std::fmt::Displa
 
 fn timestamp(milliseconds: i64) -> Result<Timestamp> {
     Timestamp::from_millisecond(milliseconds).map_err(|e| corrupt("time", milliseconds, e))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use sqlx::migrate::Migrator;
+
+    #[tokio::test]
+    async fn every_migration_of_the_folder_is_embedded() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("migrations");
+        let read = |migrator: &Migrator| {
+            let all =
+                migrator.iter().map(|m| (m.version, m.description.to_string(), m.migration_type, m.checksum.to_vec(), m.no_tx));
+            all.collect::<Vec<_>>()
+        };
+        assert_eq!(read(&super::migrator()), read(&Migrator::new(folder).await.unwrap()));
+    }
 }
