@@ -33,7 +33,7 @@ pub enum SceneOrGraph {
     /// Absolute positions.
     Scene(Scene),
     /// Detections.
-    Graph(Graph),
+    Graph(ReportedGraph),
 }
 
 /// Absolute positions of all nodes.
@@ -49,7 +49,7 @@ pub struct Scene {
 
 /// Detections of each node, symmetric: where i detects j, j detects i at the negated coordinates.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Graph {
+pub struct ReportedGraph {
     /// Own position of each UAV, where given.
     pub positions: Vec<Option<Point>>,
     /// AoI of each user in slots; 0 if it was not given.
@@ -140,7 +140,7 @@ fn is_within(rel: &Point, range: f64) -> bool {
     rel[0] * rel[0] + rel[1] * rel[1] <= range * range
 }
 
-impl Graph {
+impl ReportedGraph {
     fn into_fleet_graph(self, needs: RequiredInput, range: f64) -> Result<FleetGraph, Invalid> {
         if needs == RequiredInput::FullScene {
             return Err(Invalid::missing("scene", "a scene instead of a graph, because this policy needs all positions"));

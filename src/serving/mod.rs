@@ -23,7 +23,7 @@ pub use environments::{
 };
 pub use error::Error;
 pub use fleet_ids::FleetIds;
-pub use fleet_input::{FleetInput, Graph, GraphForm, MAX_DETECTIONS, MAX_NODES, ReportedDetection, Scene, SceneOrGraph};
+pub use fleet_input::{FleetInput, GraphForm, MAX_DETECTIONS, MAX_NODES, ReportedDetection, ReportedGraph, Scene, SceneOrGraph};
 pub use nodes::{Node, NodeDetection};
 pub use recurrent_state::RecurrentState;
 pub use reference::{PolicyRef, PolicySpec, VersionSelector, check_name};

@@ -7,7 +7,7 @@
 use std::collections::HashMap;
 
 use super::ids::{Ids, canonical_of_request, check_counts, check_distinct, check_nodes, node_indices};
-use super::{FleetIds, FleetInput, Graph, GraphForm, ReportedDetection, Scene, SceneOrGraph};
+use super::{FleetIds, FleetInput, GraphForm, ReportedDetection, ReportedGraph, Scene, SceneOrGraph};
 use crate::env::Point;
 use crate::invalid::{Invalid, in_range};
 
@@ -140,14 +140,14 @@ impl FleetInput {
 }
 
 struct Builder {
-    graph: Graph,
+    graph: ReportedGraph,
     /// Whether the AoI of a user was reported.
     has_aoi: Vec<bool>,
 }
 
 impl Builder {
     fn new(uavs: usize, users: usize) -> Self {
-        let graph = Graph {
+        let graph = ReportedGraph {
             positions: vec![None; uavs],
             aoi: vec![0.0; users],
             detections: Vec::with_capacity(uavs + users),
@@ -228,7 +228,7 @@ impl Builder {
 }
 
 /// Mirrors detections that one side reports, and compares those that both report. Lists are in ascending order of target.
-pub(crate) fn mirror(mut graph: Graph) -> Result<Graph, Invalid> {
+pub(crate) fn mirror(mut graph: ReportedGraph) -> Result<ReportedGraph, Invalid> {
     let mut mirrored = Vec::new();
     for (node, list) in graph.detections.iter().enumerate() {
         for detection in list {

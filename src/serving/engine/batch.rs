@@ -21,12 +21,12 @@ pub(super) struct Queued {
 
 /// Tasks to compute together, and buffers that are kept from one batch to the next.
 #[derive(Default)]
-pub(super) struct Batch {
+pub(super) struct TaskBatch {
     pub(super) tasks: Vec<Queued>,
     fleet_steps: Vec<FleetStep<'static>>,
 }
 
-impl Batch {
+impl TaskBatch {
     /// Computes all tasks whose callers still wait, and replies to them. Returns the number of tasks computed.
     pub(super) fn run(&mut self, metrics: &EngineMetrics) -> usize {
         let started = Instant::now();

@@ -22,7 +22,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use batch::{Batch, Queued};
+use batch::{Queued, TaskBatch};
 use metrics::EngineMetrics;
 use tokio::sync::oneshot;
 use tokio::sync::oneshot::error::TryRecvError;
@@ -59,12 +59,12 @@ struct Queue {
     /// Batches that are being computed.
     running: usize,
     /// Batches that were computed inline, kept for their buffers.
-    spare_batches: Vec<Batch>,
+    spare_batches: Vec<TaskBatch>,
     closed: bool,
 }
 
 /// State that callers and threads share.
-struct Shared {
+struct EngineState {
     queue: Mutex<Queue>,
     /// Notified when a thread may have work.
     queued: Condvar,
@@ -74,7 +74,7 @@ struct Shared {
     metrics: EngineMetrics,
 }
 
-impl Shared {
+impl EngineState {
     fn lock(&self) -> MutexGuard<'_, Queue> {
         // Policies run outside the lock, and nothing else panics while holding it.
         self.queue.lock().unwrap_or_else(PoisonError::into_inner)
@@ -82,7 +82,7 @@ impl Shared {
 
     /// Waits for work and moves tasks of one policy version into `batch`, the oldest first. Returns false if the engine was
     /// dropped.
-    fn next_batch(&self, batch: &mut Batch) -> bool {
+    fn next_batch(&self, batch: &mut TaskBatch) -> bool {
         let EngineConfig { max_batch, max_batch_delay, .. } = self.config;
         let mut queue = self.lock();
         loop {
@@ -109,7 +109,7 @@ impl Shared {
     }
 
     /// Moves the oldest task and the tasks of its policy version into `batch`, up to `max_work`. Other tasks keep their order.
-    fn fill(&self, queue: &mut Queue, batch: &mut Batch, max_work: usize) {
+    fn fill(&self, queue: &mut Queue, batch: &mut TaskBatch, max_work: usize) {
         let Some(oldest) = queue.waiting.pop_front() else { return };
         queue.running += 1;
         let mut work = oldest.task.work();
@@ -132,7 +132,7 @@ impl Shared {
         self.metrics.policy(&task.policy().reference.name).failure.increment(1);
     }
 
-    /// Reserves one of the concurrent computations for [`Shared::run_inline`], if nothing waits.
+    /// Reserves one of the concurrent computations for [`EngineState::run_inline`], if nothing waits.
     fn reserve_inline(&self) -> bool {
         let mut queue = self.lock();
         let free = queue.waiting.is_empty() && queue.running < self.config.threads;
@@ -140,7 +140,7 @@ impl Shared {
         free
     }
 
-    /// Computes one task on this thread. [`Shared::reserve_inline`] has returned true.
+    /// Computes one task on this thread. [`EngineState::reserve_inline`] has returned true.
     fn run_inline(&self, task: Task) -> Result<TaskOutput, Error> {
         let output = batch::run_single(task, &self.metrics);
         self.single_batches.fetch_add(1, Ordering::Relaxed);
@@ -215,7 +215,7 @@ fn lost_request() -> Error {
 
 /// Wakes a thread when a caller stops waiting, so that its task leaves the queue soon.
 struct AbandonGuard<'a> {
-    shared: &'a Shared,
+    shared: &'a EngineState,
     replied: bool,
 }
 
@@ -229,7 +229,7 @@ impl Drop for AbandonGuard<'_> {
 
 /// The engine. Dropping it stops its threads after their current batches.
 pub struct Engine {
-    shared: Arc<Shared>,
+    shared: Arc<EngineState>,
 }
 
 impl Engine {
@@ -238,7 +238,7 @@ impl Engine {
     /// # Errors
     /// If the system cannot create a thread.
     pub fn start(config: EngineConfig) -> std::io::Result<Self> {
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(EngineState {
             queue: Mutex::default(),
             queued: Condvar::new(),
             single_batches: AtomicU32::new(0),
@@ -249,7 +249,7 @@ impl Engine {
         for i in 0..config.threads {
             let shared = shared.clone();
             let work = move || {
-                let mut batch = Batch::default();
+                let mut batch = TaskBatch::default();
                 while shared.next_batch(&mut batch) {
                     batch.run(&shared.metrics);
                     shared.lock().running -= 1;

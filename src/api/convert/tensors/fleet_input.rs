@@ -7,7 +7,9 @@ use crate::env::Point;
 use crate::invalid::Invalid;
 use crate::serving::ids::{Ids, canonical_of_request, check_counts, check_distinct};
 use crate::serving::nodes::{check_aoi, check_finite, check_point, mirror};
-use crate::serving::{FleetIds, FleetInput, Graph, GraphForm, MAX_DETECTIONS, MAX_NODES, ReportedDetection, Scene, SceneOrGraph};
+use crate::serving::{
+    FleetIds, FleetInput, GraphForm, MAX_DETECTIONS, MAX_NODES, ReportedDetection, ReportedGraph, Scene, SceneOrGraph,
+};
 
 /// The inputs of a fleet: name, datatype in the metadata, and the meaning of each dimension.
 pub const INPUTS: [(&str, Datatype, &[Dimension]); 8] = [
@@ -168,7 +170,13 @@ fn ids(tensor: Option<&Tensor>, count: usize, expected: &str, kind: &str) -> Res
     Ok(ids.sorted())
 }
 
-fn graph(nodes: &Nodes, own: Option<&[Point]>, ages: &[f32], index: &Tensor, relative: &Tensor) -> Result<Graph, Invalid> {
+fn graph(
+    nodes: &Nodes,
+    own: Option<&[Point]>,
+    ages: &[f32],
+    index: &Tensor,
+    relative: &Tensor,
+) -> Result<ReportedGraph, Invalid> {
     let (uavs, users) = (nodes.uavs.len(), nodes.users.len());
     let edges = index.rows("[E, 2]", &[2], MAX_DETECTIONS)?;
     if relative.rows("[E, 2]", &[2], MAX_DETECTIONS)? != edges {
@@ -200,7 +208,7 @@ fn graph(nodes: &Nodes, own: Option<&[Point]>, ages: &[f32], index: &Tensor, rel
             return Err(Invalid::new(format!("edge_index[{again}]"), ends, format!("an edge that differs from edge {first}")));
         }
     }
-    mirror(Graph {
+    mirror(ReportedGraph {
         positions: match own {
             Some(own) => nodes.uavs.iter().map(|&place| Some(own[place as usize])).collect(),
             None => vec![None; uavs],
