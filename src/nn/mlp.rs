@@ -73,7 +73,7 @@ impl<const W: usize> Mlp<W> {
                     &affine,
                     cache.stats.as_mut_slice(),
                     cache.hidden_or_grad.as_mut_slice(),
-                )
+                );
             },
         );
         self.last.forward(w, cache.hidden_or_grad.rows(), y);
@@ -102,7 +102,7 @@ impl<const W: usize> Mlp<W> {
                     cache.stats.as_slice(),
                     cache.hidden_or_grad.as_slice(),
                     &mut sums,
-                )
+                );
             },
         );
         self.norm.add_grads(&sums, grads);
