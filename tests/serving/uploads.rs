@@ -1,4 +1,4 @@
-//! The limit of uploads holds until their checkpoints are published.
+//! The limit of uploads of checkpoints, which are held in memory until they are published.
 
 use std::time::Duration;
 
@@ -9,37 +9,55 @@ use super::harness::*;
 use super::policies::numbered;
 
 #[tokio::test]
-async fn permits_are_held_until_checkpoints_are_published() {
+async fn upload_permits_are_held_until_checkpoints_are_published() {
+    const TIMEOUT: Duration = Duration::from_secs(30);
     let server = Server::start().await;
     let body = numbered(1).to_bytes();
     let upload = |name: &str| -> RequestBuilder {
         let url = server.url(&format!("/v1/policies/{name}/versions"));
         Client::new().post(url).header("content-type", "application/octet-stream").body(body.clone())
     };
-    // Publishing waits for its turn, so the uploads are read and not published.
+    // Publishing waits for this lock, so uploads are received and not published.
     let guard = server.app.registry.lock_changes().await;
     let mut uploads = Vec::new();
     for i in 0..4 {
-        uploads.push(tokio::spawn(upload(&format!("policy-{i}")).send()));
-    }
-    let refused = async {
-        let mut in_a_row = 0;
-        while in_a_row < 50 {
-            match timeout(Duration::from_millis(100), upload("one-more").send()).await {
-                Ok(answer) if answer.as_ref().unwrap().status() == StatusCode::TOO_MANY_REQUESTS => in_a_row += 1,
-                // The other uploads have not begun yet; or they hold no permits.
-                _ => in_a_row = 0,
+        let request = upload(&format!("policy-{i}"));
+        uploads.push(tokio::spawn(async move {
+            loop {
+                let answer = request.try_clone().expect("the body is in memory").send().await.unwrap();
+                // The test itself holds a permit for a moment below.
+                if answer.status() != StatusCode::TOO_MANY_REQUESTS {
+                    return answer.status();
+                }
             }
+        }));
+    }
+    let all_held = async {
+        while server.app.uploads.acquire().is_ok() {
+            tokio::task::yield_now().await;
         }
     };
-    timeout(Duration::from_secs(20), refused).await.expect("waiting uploads hold their permits");
-    // A caller that disconnects leaves its checkpoint in memory, and so its permit.
-    uploads.pop().unwrap().abort();
-    assert_eq!(upload("one-more").send().await.unwrap().status(), StatusCode::TOO_MANY_REQUESTS);
-    drop(guard);
-    for answer in uploads {
-        assert_eq!(answer.await.unwrap().unwrap().status(), StatusCode::CREATED);
+    timeout(TIMEOUT, all_held).await.expect("every upload takes a permit");
+    let refused = async || {
+        let answer = timeout(TIMEOUT, upload("one-more").send()).await.expect("refused without waiting for other uploads");
+        assert_eq!(answer.unwrap().status(), StatusCode::TOO_MANY_REQUESTS);
+    };
+    for _ in 0..50 {
+        refused().await;
     }
-    let published = async { while upload("one-more").send().await.unwrap().status() == StatusCode::TOO_MANY_REQUESTS {} };
-    timeout(Duration::from_secs(20), published).await.expect("permits are given back");
+    // The checkpoint of a caller that disconnects stays in memory, and keeps its permit.
+    uploads.pop().expect("four uploads").abort();
+    for _ in 0..50 {
+        refused().await;
+    }
+    drop(guard);
+    for status in uploads {
+        assert_eq!(status.await.unwrap(), StatusCode::CREATED);
+    }
+    let returned = async {
+        while server.app.uploads.acquire().is_err() {
+            tokio::task::yield_now().await;
+        }
+    };
+    timeout(TIMEOUT, returned).await.expect("permits are returned");
 }
