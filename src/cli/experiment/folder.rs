@@ -129,9 +129,10 @@ impl RunFolder {
         Checkpoint::from_bytes(&bytes).with_context(|| path.display().to_string())
     }
 
-    /// Writes the result and removes the snapshot.
+    /// Removes the snapshot and writes the result.
     pub fn finish(&self, result: &RunResult) -> anyhow::Result<()> {
-        self.write("result.json", &serde_json::to_vec(result)?)?;
+        // The snapshot first: a run with a result is finished, and its folder is not touched again. Without a snapshot, a run
+        // whose training has ended still has its weights.
         let snapshot = self.path.join("snapshot");
         // The partial file is left by a process that was killed during a write.
         for path in [partial_path(&snapshot), snapshot] {
@@ -142,6 +143,6 @@ impl RunFolder {
                 _ => {}
             }
         }
-        Ok(())
+        self.write("result.json", &serde_json::to_vec(result)?)
     }
 }
