@@ -84,7 +84,7 @@ async fn commands_survive_an_output_that_cannot_be_written() {
     .unwrap();
 }
 
-/// The server logs to standard error. When nobody reads it any more, the server must continue.
+/// The server logs to standard error. If the reader of standard error has gone, the server must continue.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_server_survives_when_its_log_cannot_be_written() {
     let dir = tempfile::tempdir().unwrap();

@@ -68,7 +68,7 @@ pub struct Environment {
     /// Copy of the simulation's cursor, readable during a step.
     cursor: SyncMutex<EpisodeCursor>,
     simulation: Arc<Mutex<Simulation>>,
-    /// Set while `simulation` is locked, so that whoever locks it afterwards sees the flag.
+    /// Set while `simulation` is locked, so that the next holder of the lock sees the flag.
     deleted: AtomicBool,
     /// The environment's share of the memory for environments.
     _memory_permit: OwnedSemaphorePermit,
