@@ -24,6 +24,8 @@ pub struct Config {
     pub max_attempts: u32,
     /// Time between snapshots of a running job.
     pub snapshot_every: Duration,
+    /// Time without a heartbeat after which a worker is killed and its attempt has failed.
+    pub heartbeat_timeout: Duration,
     /// Program of workers; `None`: this program.
     pub worker: Option<PathBuf>,
     /// Idle time after which a session expires.
@@ -84,6 +86,7 @@ impl Config {
             cpu_budget: cores,
             max_attempts: 3,
             snapshot_every: Duration::from_secs(10),
+            heartbeat_timeout: Duration::from_secs(30),
             worker: None,
             session_ttl: Duration::from_secs(600),
             max_sessions: 100_000,
@@ -113,6 +116,8 @@ impl Config {
         in_range("--cpu-budget", self.cpu_budget, 1..=4096)?;
         in_range("--max-attempts", self.max_attempts, 1..=1000)?;
         in_seconds("--snapshot-every", self.snapshot_every, 0.0..=1e9)?;
+        // Workers send a heartbeat every 0.4 s.
+        in_seconds("--heartbeat-timeout", self.heartbeat_timeout, 2.0..=3600.0)?;
         in_seconds("--session-ttl", self.session_ttl, 0.001..=1e9)?;
         in_range("--max-sessions", self.max_sessions, 1..=100_000_000)?;
         in_seconds("--environment-ttl", self.environment_ttl, 0.001..=1e9)?;

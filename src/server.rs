@@ -196,6 +196,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
     let scheduler = SchedulerConfig {
         max_attempts: config.max_attempts,
         snapshot_every: config.snapshot_every,
+        heartbeat_timeout: config.heartbeat_timeout,
         pause_grace: config.drain_timeout,
         ..SchedulerConfig::new(config.cpu_budget)
     };

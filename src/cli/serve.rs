@@ -47,6 +47,9 @@ pub struct ServeArgs {
     /// Time between two snapshots of a running job; after a crash the job continues from its last snapshot
     #[arg(long, env = "QEDGIX_SNAPSHOT_EVERY", default_value = "10s", value_parser = duration, value_name = "TIME")]
     snapshot_every: Duration,
+    /// Time without a heartbeat after which a worker is killed and its job starts again from the last snapshot, 2 s to 1 h
+    #[arg(long, env = "QEDGIX_HEARTBEAT_TIMEOUT", default_value = "30s", value_parser = duration, value_name = "TIME")]
+    heartbeat_timeout: Duration,
     /// Idle time after which a session expires
     #[arg(long, env = "QEDGIX_SESSION_TTL", default_value = "10m", value_parser = duration, value_name = "TIME")]
     session_ttl: Duration,
@@ -212,6 +215,7 @@ impl ServeArgs {
             cpu_budget: self.cpu_budget.unwrap_or(default.cpu_budget),
             max_attempts: self.max_attempts,
             snapshot_every: self.snapshot_every,
+            heartbeat_timeout: self.heartbeat_timeout,
             session_ttl: self.session_ttl,
             max_sessions: self.max_sessions,
             environment_ttl: self.environment_ttl,
