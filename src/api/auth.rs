@@ -6,7 +6,8 @@ use std::future::{Ready, ready};
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
-use axum::extract::MatchedPath;
+use axum::extract::{FromRequestParts, MatchedPath};
+use axum::http::request::Parts;
 use axum::http::{Extensions, HeaderMap, HeaderName, Request, Response, header};
 use axum::middleware::Next;
 use axum::response::IntoResponse;
@@ -75,8 +76,8 @@ fn authorize<B>(app: &App, request: &mut Request<B>, requirement: impl FnOnce(&R
     if requirement == Requirement::NoKey {
         return Ok(());
     }
-    let Some(caller) = app.keys.authenticate(presented_key(request.headers()), app.clock.now())? else { return Ok(()) };
-    tracing::Span::current().record("key", caller.id());
+    let caller = app.keys.authenticate(presented_key(request.headers()), app.clock.now())?;
+    tracing::Span::current().record("key", caller.key_id());
     caller.acquire(&app.clock)?;
     if let Requirement::Scope(scope) = requirement {
         caller.authorize(scope)?;
@@ -87,40 +88,28 @@ fn authorize<B>(app: &App, request: &mut Request<B>, requirement: impl FnOnce(&R
     Ok(())
 }
 
-/// The caller of a stream, if keys are required. The key may expire or be revoked before the stream ends.
-#[derive(Clone)]
-pub(super) struct StreamCaller(Option<Caller>);
+/// The caller of a request, as [`authorize`] put it into the extensions.
+pub(super) fn caller(extensions: &Extensions) -> Caller {
+    extensions.get().cloned().unwrap_or_default()
+}
 
-impl StreamCaller {
-    /// The caller that [`authorize`] put into the extensions.
-    pub(super) fn new(extensions: &Extensions) -> Self {
-        Self(extensions.get().cloned())
+impl<S: Sync> FromRequestParts<S> for Caller {
+    type Rejection = Infallible;
+
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Infallible> {
+        Ok(caller(&parts.extensions))
     }
+}
 
-    /// Checks that the key is still valid.
-    ///
-    /// # Errors
-    /// [`Error::Unauthenticated`] if the key expired or was revoked.
-    pub(super) fn check(&self, app: &App) -> Result<(), Error> {
-        self.0.as_ref().map_or(Ok(()), |caller| caller.check(app.clock.now()))
-    }
-
-    /// Counts the next message against the rate of the key. The inner error refuses this message only.
-    ///
-    /// # Errors
-    /// The status that ends the stream, if the key expired or was revoked.
-    pub(super) fn count_message(&self, app: &App) -> Result<Result<(), Error>, Status> {
-        match self.0.as_ref().map_or(Ok(()), |caller| caller.check_and_acquire(&app.clock)) {
-            Err(error) if !matches!(error, Error::Busy { .. }) => Err(error.into()),
-            counted => Ok(counted),
-        }
-    }
-
-    /// Counts `slots` further slots of one message, without refusing them.
-    pub(super) fn charge(&self, app: &App, slots: u32) {
-        if let Some(caller) = &self.0 {
-            caller.charge(slots, &app.clock);
-        }
+/// Counts the next message of a stream against the rate of its caller, whose key may expire or be revoked before the stream ends.
+/// The inner error refuses this message only.
+///
+/// # Errors
+/// The status that ends the stream, if the key expired or was revoked.
+pub(super) fn count_message(caller: &Caller, app: &App) -> Result<Result<(), Error>, Status> {
+    match caller.check_and_acquire(&app.clock) {
+        Err(error) if !matches!(error, Error::Busy { .. }) => Err(error.into()),
+        counted => Ok(counted),
     }
 }
 

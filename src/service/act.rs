@@ -15,25 +15,27 @@ pub use sequence::SEQUENCE_PREFIX;
 use std::time::Instant;
 
 use super::{App, Error};
+use crate::service::keys::Caller;
 
-/// Runs the policy for one slot.
+/// Runs the policy for one slot. Sessions and sequences are those of the caller's owner, also for `admin`: nobody steps the fleet of
+/// another owner by using the same name.
 ///
 /// # Errors
 /// [`Error::Draining`]; [`Error::NotFound`] for an unknown policy or session; [`Error::Invalid`]; [`Error::Precondition`] for
 /// wrong steps, earlier runs, expired sessions, unloaded policies and sequences that have not started; [`Error::Busy`] if the
 /// engine's queue is full; [`Error::Deadline`].
-pub async fn act(app: &App, request: Request, deadline: Option<Instant>) -> Result<Response, Error> {
+pub async fn act(app: &App, caller: &Caller, request: Request, deadline: Option<Instant>) -> Result<Response, Error> {
     app.admit()?;
     match &request.memory {
         MemoryLocation::Session(id) => {
             compute::record_in_span("session", id);
-            let session = app.sessions.get(id)?;
+            let session = app.sessions.get(caller.owner(), id)?;
             with_deadline(deadline, session::act(app, &session, request, deadline)).await
         }
         MemoryLocation::Sequence(sequence) => {
             let sequence = sequence.clone();
             // Boxed, so that its size does not add to the future of other requests.
-            with_deadline(deadline, Box::pin(sequence::act(app, &sequence, request, deadline))).await
+            with_deadline(deadline, Box::pin(sequence::act(app, caller.owner(), &sequence, request, deadline))).await
         }
         MemoryLocation::RecurrentState(state) => {
             let state = state.clone();

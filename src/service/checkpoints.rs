@@ -2,6 +2,7 @@
 
 use uuid::Uuid;
 
+use super::keys::Caller;
 use super::{App, Error};
 use crate::store::Checkpoint;
 
@@ -9,7 +10,7 @@ use crate::store::Checkpoint;
 ///
 /// # Errors
 /// [`Error::NotFound`].
-pub async fn get(app: &App, id: &str) -> Result<(Checkpoint, Vec<u8>), Error> {
+pub async fn get(app: &App, caller: &Caller, id: &str) -> Result<(Checkpoint, Vec<u8>), Error> {
     let missing = || Error::not_found("checkpoint", id);
     app.store.checkpoint(Uuid::try_parse(id).map_err(|_| missing())?).await?.ok_or_else(missing)
 }

@@ -2,6 +2,7 @@
 
 use serde_json::Value;
 
+use super::keys::Caller;
 use super::paging::json_bytes;
 use super::{App, Error, Page, PageRequest};
 use crate::serving::{EnvironmentInfo, EnvironmentReset, EnvironmentSpec, EnvironmentState, EnvironmentStep};
@@ -27,56 +28,57 @@ pub struct NewEnvironment {
 /// # Errors
 /// [`Error::Draining`]; [`Error::Invalid`] for unknown fields and values out of range; [`Error::Conflict`] if the name is
 /// taken; [`Error::Busy`] if the number or the memory of environments is exhausted.
-pub async fn create(app: &App, new: NewEnvironment) -> Result<EnvironmentInfo, Error> {
+pub async fn create(app: &App, caller: &Caller, new: NewEnvironment) -> Result<EnvironmentInfo, Error> {
     app.admit()?;
     let NewEnvironment { id, environment, seed, count, auto_reset } = new;
     let spec = EnvironmentSpec::new(train_config::parse_environment(environment)?, count, seed, auto_reset)?;
-    Ok(app.environments.create(id, spec).await?)
+    Ok(app.environments.create(caller.owner(), id, spec).await?)
 }
 
-/// Begins an episode in every copy.
+/// Begins an episode in every copy of an environment of the caller's owner.
 ///
 /// # Errors
 /// [`Error::Draining`]; [`Error::Invalid`] if the seed is out of range or graphs would be too large; [`Error::NotFound`];
 /// `environment_expired`.
-pub async fn reset(app: &App, id: &str, reset: EnvironmentReset) -> Result<EnvironmentState, Error> {
+pub async fn reset(app: &App, caller: &Caller, id: &str, reset: EnvironmentReset) -> Result<EnvironmentState, Error> {
     app.admit()?;
-    Ok(app.environments.table().get(id)?.reset(reset).await?)
+    Ok(app.environments.table().get(caller.owner(), id)?.reset(reset).await?)
 }
 
-/// Advances every copy by one slot.
+/// Advances every copy of an environment of the caller's owner by one slot.
 ///
 /// # Errors
 /// [`Error::Draining`]; [`Error::Invalid`] if the actions do not fit or graphs would be too large; [`Error::NotFound`];
 /// `wrong_step`, `episode_over`, `environment_expired`.
-pub async fn step(app: &App, id: &str, step: EnvironmentStep) -> Result<EnvironmentState, Error> {
+pub async fn step(app: &App, caller: &Caller, id: &str, step: EnvironmentStep) -> Result<EnvironmentState, Error> {
     app.admit()?;
-    Ok(app.environments.table().get(id)?.step(step).await?)
+    Ok(app.environments.table().get(caller.owner(), id)?.step(step).await?)
 }
 
 /// Describes an environment.
 ///
 /// # Errors
 /// [`Error::NotFound`], or `environment_expired`.
-pub fn get(app: &App, id: &str) -> Result<EnvironmentInfo, Error> {
-    Ok(app.environments.describe(id)?)
+pub fn get(app: &App, caller: &Caller, id: &str) -> Result<EnvironmentInfo, Error> {
+    Ok(app.environments.describe(&caller.owner_among(app.environments.table(), id), id)?)
 }
 
 /// Deletes an environment after its step in flight.
 ///
 /// # Errors
 /// [`Error::NotFound`], or `environment_expired`.
-pub async fn delete(app: &App, id: &str) -> Result<EnvironmentInfo, Error> {
-    Ok(app.environments.delete(id).await?)
+pub async fn delete(app: &App, caller: &Caller, id: &str) -> Result<EnvironmentInfo, Error> {
+    Ok(app.environments.delete(&caller.owner_among(app.environments.table(), id), id).await?)
 }
 
-/// A page of environments in order of names.
+/// A page of the environments that the caller sees, in order of names.
 ///
 /// # Errors
 /// [`Error::Invalid`]: the page size is out of range.
-pub fn list(app: &App, page: &PageRequest) -> Result<Page<EnvironmentInfo>, Error> {
+pub fn list(app: &App, caller: &Caller, page: &PageRequest) -> Result<Page<EnvironmentInfo>, Error> {
     let table = app.environments.table();
-    let (environments, more) = table.list(&page.token, page.usual_limit()?);
+    let (owner, id) = caller.list_position(&page.token);
+    let (environments, more) = table.list(caller.sees(), (id, &owner), page.usual_limit()?);
     let environments = environments.iter().map(|environment| environment.info(table.ttl())).collect();
-    Ok(Page::bounded(environments, more, |info| json_bytes(&info.spec.config), |info| info.id.clone()))
+    Ok(Page::bounded(environments, more, |info| json_bytes(&info.spec.config), |info| caller.list_token(&info.owner, &info.id)))
 }

@@ -9,6 +9,7 @@ use std::time::Duration;
 use futures::{Stream, TryStreamExt};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 
+use super::keys::Caller;
 use super::{App, Error, jobs};
 use crate::invalid::in_range;
 use crate::store::{Job, JobEvent, JobEventKind};
@@ -42,6 +43,7 @@ impl WatchLimit {
 /// A watch of a job.
 pub struct Watch {
     app: Arc<App>,
+    caller: Caller,
     id: String,
     job: i64,
     after: u64,
@@ -55,17 +57,18 @@ pub struct Watch {
 /// # Errors
 /// [`Error::NotFound`], [`Error::Invalid`] when the job has no event `after` yet, [`Error::Busy`] when too many watches are
 /// open, [`Error::Draining`].
-pub async fn watch(app: &Arc<App>, id: &str, after: u64) -> Result<Watch, Error> {
+pub async fn watch(app: &Arc<App>, caller: &Caller, id: &str, after: u64) -> Result<Watch, Error> {
     app.admit()?;
     let WatchLimit { permits, max, .. } = &app.watchers;
     let permit = permits.clone().try_acquire_owned().map_err(|_| Error::Busy {
         message: format!("{max} watches are open, which is the limit"),
         retry_after: Duration::from_secs(5),
     })?;
-    let Job { row_id: job, state, last_event, .. } = jobs::get(app, id).await?;
+    let Job { row_id: job, state, last_event, .. } = jobs::get(app, caller, id).await?;
     in_range("after", after, 0..=last_event)?;
     let ended = state.ended() && after == last_event;
-    Ok(Watch { app: app.clone(), id: id.to_owned(), job, after, ended, changes: app.store.changes(job), _permit: permit })
+    let (changes, caller) = (app.store.changes(job), caller.clone());
+    Ok(Watch { app: app.clone(), caller, id: id.to_owned(), job, after, ended, changes, _permit: permit })
 }
 
 impl Watch {
@@ -97,7 +100,7 @@ impl Watch {
                 return Ok(Some(events));
             }
             // A deleted job has no events either.
-            jobs::get(&self.app, &self.id).await?;
+            jobs::get(&self.app, &self.caller, &self.id).await?;
             tokio::select! {
                 changed = self.changes.changed() => changed.map_err(Error::internal)?,
                 () = self.app.draining.wait() => {}

@@ -2,6 +2,7 @@
 
 use uuid::Uuid;
 
+use super::keys::Caller;
 use super::paging::{self, parse_number};
 use super::{App, Error, Page, PageRequest, policies};
 use crate::error_code::ErrorCode;
@@ -19,7 +20,12 @@ use crate::store::{
 /// [`Error::Invalid`]: a field of the request, or the idempotency key. [`Error::Conflict`]: the key was used with another
 /// request.
 /// [`Error::Draining`].
-pub async fn submit(app: &App, request: JobRequest, idempotency_key: Option<String>) -> Result<(Job, bool), Error> {
+pub async fn submit(
+    app: &App,
+    caller: &Caller,
+    request: JobRequest,
+    idempotency_key: Option<String>,
+) -> Result<(Job, bool), Error> {
     if let Some(key) = &idempotency_key {
         let printable = key.bytes().all(|b| (b' '..=b'~').contains(&b));
         if key.is_empty() || key.len() > 255 || !printable {
@@ -59,7 +65,7 @@ fn parse_id(id: &str) -> Result<JobId, Error> {
 ///
 /// # Errors
 /// [`Error::NotFound`].
-pub async fn get(app: &App, id: &str) -> Result<Job, Error> {
+pub async fn get(app: &App, caller: &Caller, id: &str) -> Result<Job, Error> {
     app.store.job(parse_id(id)?).await?.ok_or_else(|| Error::not_found("job", id))
 }
 
@@ -67,7 +73,7 @@ pub async fn get(app: &App, id: &str) -> Result<Job, Error> {
 ///
 /// # Errors
 /// [`Error::Invalid`]: the page size is over 1000, or the token is invalid.
-pub async fn list(app: &App, state: Option<JobState>, page: &PageRequest) -> Result<Page<JobSummary>, Error> {
+pub async fn list(app: &App, caller: &Caller, state: Option<JobState>, page: &PageRequest) -> Result<Page<JobSummary>, Error> {
     let (limit, before) = (page.usual_limit()?, page.parse_token(parse_number)?);
     let (jobs, more) = app.store.job_summaries(state, before, limit, paging::MAX_BYTES).await?;
     Ok(Page::new(jobs, more, |job| job.row_id.to_string()))
@@ -77,7 +83,7 @@ pub async fn list(app: &App, state: Option<JobState>, page: &PageRequest) -> Res
 ///
 /// # Errors
 /// [`Error::NotFound`], or [`Error::Precondition`] when the state of the job does not allow the action.
-pub async fn change(app: &App, id: &str, action: JobAction) -> Result<Job, Error> {
+pub async fn change(app: &App, caller: &Caller, id: &str, action: JobAction) -> Result<Job, Error> {
     if action == JobAction::Resume {
         app.admit()?;
     }
@@ -110,9 +116,15 @@ pub async fn change(app: &App, id: &str, action: JobAction) -> Result<Job, Error
 ///
 /// # Errors
 /// [`Error::NotFound`]: there is no such job. [`Error::Invalid`]: the page size is over 100 000, or the token is invalid.
-pub async fn metrics(app: &App, id: &str, name: Option<&str>, page: &PageRequest) -> Result<Page<MetricRow>, Error> {
+pub async fn metrics(
+    app: &App,
+    caller: &Caller,
+    id: &str,
+    name: Option<&str>,
+    page: &PageRequest,
+) -> Result<Page<MetricRow>, Error> {
     let (limit, after) = (page.limit(10_000, 100_000)?, page.parse_token(parse_metric_cursor)?);
-    let job = get(app, id).await?;
+    let job = get(app, caller, id).await?;
     let mut rows = app.store.metrics(job.id, name, after.as_ref(), limit as u32 + 1).await?;
     let more = rows.len() > limit;
     rows.truncate(limit);
@@ -129,8 +141,8 @@ fn parse_metric_cursor(cursor: &str) -> Option<MetricCursor> {
 ///
 /// # Errors
 /// [`Error::NotFound`].
-pub async fn checkpoints(app: &App, id: &str) -> Result<Vec<Checkpoint>, Error> {
-    let job = get(app, id).await?;
+pub async fn checkpoints(app: &App, caller: &Caller, id: &str) -> Result<Vec<Checkpoint>, Error> {
+    let job = get(app, caller, id).await?;
     Ok(app.store.checkpoints(job.id).await?)
 }
 
@@ -138,8 +150,8 @@ pub async fn checkpoints(app: &App, id: &str) -> Result<Vec<Checkpoint>, Error> 
 ///
 /// # Errors
 /// [`Error::NotFound`].
-pub async fn logs(app: &App, id: &str) -> Result<Vec<Attempt>, Error> {
-    let job = get(app, id).await?;
+pub async fn logs(app: &App, caller: &Caller, id: &str) -> Result<Vec<Attempt>, Error> {
+    let job = get(app, caller, id).await?;
     let mut attempts = app.store.attempts(job.id).await?;
     for attempt in &mut attempts {
         if let Some(log) = app.scheduler.live_log(job.row_id, attempt.number) {

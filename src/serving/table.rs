@@ -1,5 +1,5 @@
 //! A table of named things that expire when idle: sessions, environments. This file owns names and expiry; the entries own
-//! the requests to them.
+//! the requests to them. Every owner has names of its own.
 //!
 //! The table's lock is held for look-ups, never during computations. An entry that has been idle for longer than the time to
 //! live expires at the next look-up or at the next [`Table::remove_expired`]. The table remembers a bounded number of expired
@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use uuid::Uuid;
 
-use super::Error;
+use super::{Error, Owner};
 use crate::clock::Clock;
 use crate::error_code::ErrorCode;
 
@@ -32,7 +32,10 @@ pub trait TableEntry {
     /// Error code for entries that have expired.
     const EXPIRED: ErrorCode;
 
-    /// Its name.
+    /// Who made it.
+    fn owner(&self) -> &Owner;
+
+    /// Its name, unique among the entries of its owner.
     fn id(&self) -> &str;
 
     /// When it was last used.
@@ -75,30 +78,58 @@ pub(super) enum Lookup<T> {
     Added(Arc<T>),
 }
 
+/// Owner and id of an entry.
+type Name = (Owner, String);
+
 #[derive(Debug)]
 struct Names<T> {
-    open: HashMap<String, Arc<T>>,
+    /// The entries of each owner that has any, by id.
+    open: HashMap<Owner, HashMap<String, Arc<T>>>,
+    /// Number of entries of all owners.
+    count: usize,
     /// Names of expired entries. A name can expire several times, so its latest expiry is identified by a serial number.
-    expired: HashMap<String, u64>,
+    expired: HashMap<Name, u64>,
     /// The last expiries, oldest first: serial number and name. When an expiry leaves this queue, its name is forgotten unless
     /// `expired` has a later one.
-    expiries: VecDeque<(u64, String)>,
+    expiries: VecDeque<(u64, Name)>,
     /// Serial number of the last expiry.
     expiry_count: u64,
 }
 
-impl<T> Names<T> {
-    /// Removes entry `id` and remembers its name among the newest `capacity` expired ones.
-    fn expire(&mut self, id: String, capacity: usize) {
-        self.open.remove(&id);
+impl<T: TableEntry> Names<T> {
+    fn get(&self, owner: &Owner, id: &str) -> Option<&Arc<T>> {
+        self.open.get(owner)?.get(id)
+    }
+
+    fn insert(&mut self, entry: &Arc<T>) {
+        let (owner, id) = (entry.owner().clone(), entry.id().to_owned());
+        let former = self.open.entry(owner).or_default().insert(id, entry.clone());
+        self.count += usize::from(former.is_none());
+    }
+
+    fn remove(&mut self, owner: &Owner, id: &str) {
+        let Some(names) = self.open.get_mut(owner) else { return };
+        self.count -= usize::from(names.remove(id).is_some());
+        if names.is_empty() {
+            self.open.remove(owner);
+        }
+    }
+
+    fn entries(&self) -> impl Iterator<Item = &Arc<T>> {
+        self.open.values().flat_map(HashMap::values)
+    }
+
+    /// Removes an entry and remembers its name among the newest `capacity` expired ones.
+    fn expire(&mut self, name: Name, capacity: usize) {
+        self.remove(&name.0, &name.1);
         self.expiry_count += 1;
-        self.expired.insert(id.clone(), self.expiry_count);
-        self.expiries.push_back((self.expiry_count, id));
+        self.expired.insert(name.clone(), self.expiry_count);
+        self.expiries.push_back((self.expiry_count, name));
         while self.expiries.len() > capacity {
-            if let Some((serial, id)) = self.expiries.pop_front()
-                && self.expired.get(&id) == Some(&serial)
+            if let Some((serial, name)) = self.expiries.pop_front()
+                && self.expired.get(&name) == Some(&serial)
             {
-                self.expired.remove(&id);
+                self.expired.remove(&name);
             }
         }
     }
@@ -112,6 +143,11 @@ pub struct Table<T> {
     names: RwLock<Names<T>>,
 }
 
+/// The name of an entry in the order of lists.
+fn name_of<T: TableEntry>(entry: &Arc<T>) -> (&str, &Owner) {
+    (entry.id(), entry.owner())
+}
+
 /// A new unique name.
 pub(super) fn generate_id() -> String {
     Uuid::now_v7().to_string()
@@ -120,7 +156,8 @@ pub(super) fn generate_id() -> String {
 impl<T: TableEntry> Table<T> {
     /// An empty table.
     pub fn new(limits: Limits, clock: Clock) -> Self {
-        let names = Names { open: HashMap::new(), expired: HashMap::new(), expiries: VecDeque::new(), expiry_count: 0 };
+        let (open, expired, expiries) = (HashMap::new(), HashMap::new(), VecDeque::new());
+        let names = Names { open, count: 0, expired, expiries, expiry_count: 0 };
         Self { limits, clock, names: RwLock::new(names) }
     }
 
@@ -147,62 +184,70 @@ impl<T: TableEntry> Table<T> {
         &self.clock
     }
 
-    /// Returns entry `id`. If there is none, adds the one that `make` creates.
+    /// Returns entry `id` of `owner`. If there is none, adds the one of this name that `make` creates.
     ///
     /// # Errors
     /// [`Error::Busy`] if the table is full.
-    pub(super) fn find_or_add(&self, id: &str, make: impl FnOnce() -> T) -> Result<Lookup<T>, Error> {
+    pub(super) fn find_or_add(&self, owner: &Owner, id: &str, make: impl FnOnce() -> T) -> Result<Lookup<T>, Error> {
         let now = self.clock.monotonic();
         let mut names = self.write();
-        if let Some(existing) = names.open.get(id).filter(|entry| !self.is_idle(entry, now)) {
+        if let Some(existing) = names.get(owner, id).filter(|entry| !self.is_idle(entry, now)) {
             return Ok(Lookup::Found(existing.clone()));
         }
-        self.insert(&mut names, id, now, make).map(Lookup::Added)
+        self.insert(&mut names, (owner, id), now, make).map(Lookup::Added)
     }
 
-    /// Adds the entry that `make` creates under the name `id`, in place of the former entry of that name, if any.
+    /// Adds the entry of `owner` named `id` that `make` creates, in place of the former entry of that name, if any.
     ///
     /// # Errors
     /// [`Error::Busy`] if the table is full.
-    pub(super) fn replace(&self, id: &str, make: impl FnOnce() -> T) -> Result<Arc<T>, Error> {
+    pub(super) fn replace(&self, owner: &Owner, id: &str, make: impl FnOnce() -> T) -> Result<Arc<T>, Error> {
         let now = self.clock.monotonic();
-        self.insert(&mut self.write(), id, now, make)
+        self.insert(&mut self.write(), (owner, id), now, make)
     }
 
-    fn insert(&self, names: &mut Names<T>, id: &str, now: Duration, make: impl FnOnce() -> T) -> Result<Arc<T>, Error> {
-        let full = |names: &Names<T>| names.open.len() >= self.limits.max && !names.open.contains_key(id);
+    fn insert(
+        &self,
+        names: &mut Names<T>,
+        (owner, id): (&Owner, &str),
+        now: Duration,
+        make: impl FnOnce() -> T,
+    ) -> Result<Arc<T>, Error> {
+        let full = |names: &Names<T>| names.count >= self.limits.max && names.get(owner, id).is_none();
         if full(names) {
             self.remove_expired_names(names, now, Duration::ZERO);
         }
         if full(names) {
             return Err(Error::Busy(format!("{} {}s are open, the limit of this server", self.limits.max, T::KIND)));
         }
-        names.expired.remove(id);
+        names.expired.remove(&(owner.clone(), id.to_owned()));
         let entry = Arc::new(make());
-        names.open.insert(id.to_owned(), entry.clone());
+        names.insert(&entry);
         Ok(entry)
     }
 
-    /// Returns entry `id`, and counts as a use of it.
+    /// Returns entry `id` of `owner`, and counts as a use of it.
     ///
     /// # Errors
     /// [`TableEntry::EXPIRED`] if it has expired, [`Error::NotFound`] if there is none.
-    pub fn get(&self, id: &str) -> Result<Arc<T>, Error> {
+    pub fn get(&self, owner: &Owner, id: &str) -> Result<Arc<T>, Error> {
         let now = self.clock.monotonic();
         {
             let names = self.read();
-            match names.open.get(id) {
+            match names.get(owner, id) {
                 Some(entry) if !self.is_idle(entry, now) => {
                     entry.last_use().touch(now);
                     return Ok(entry.clone());
                 }
-                None if !names.expired.contains_key(id) => return Err(Error::not_found(T::KIND, id)),
+                None if !names.expired.contains_key(&(owner.clone(), id.to_owned())) => {
+                    return Err(Error::not_found(T::KIND, id));
+                }
                 _ => {}
             }
         }
         let mut names = self.write();
-        if names.open.get(id).is_some_and(|entry| self.is_idle(entry, now)) {
-            names.expire(id.to_owned(), self.limits.max);
+        if names.get(owner, id).is_some_and(|entry| self.is_idle(entry, now)) {
+            names.expire((owner.clone(), id.to_owned()), self.limits.max);
         }
         let idle = self.limits.ttl.as_secs_f64();
         let message = format!("{} {id:?} expired after {idle} s without a request; open a new one", T::KIND);
@@ -212,25 +257,39 @@ impl<T: TableEntry> Table<T> {
     /// Removes `entry`, unless another entry has taken its name.
     pub(super) fn remove(&self, entry: &Arc<T>) {
         let mut names = self.write();
-        if names.open.get(entry.id()).is_some_and(|current| Arc::ptr_eq(current, entry)) {
-            names.open.remove(entry.id());
+        if names.get(entry.owner(), entry.id()).is_some_and(|current| Arc::ptr_eq(current, entry)) {
+            names.remove(entry.owner(), entry.id());
         }
     }
 
-    /// At most `limit` entries with names after `after`, in order, and whether there are more.
-    pub fn list(&self, after: &str, limit: usize) -> (Vec<Arc<T>>, bool) {
+    /// Whether `owner` has an entry `id` that is open.
+    pub fn contains(&self, owner: &Owner, id: &str) -> bool {
+        self.read().get(owner, id).is_some()
+    }
+
+    /// An owner of an open entry `id`: the first in order, if several have one.
+    pub fn owner_of(&self, id: &str) -> Option<Owner> {
+        let names = self.read();
+        names.open.iter().filter(|(_, entries)| entries.contains_key(id)).map(|(owner, _)| owner).min().cloned()
+    }
+
+    /// At most `limit` entries in order of ids and owners, and whether there are more: those after the name `after`, of one
+    /// owner or of all.
+    pub fn list(&self, of: Option<&Owner>, after: (&str, &Owner), limit: usize) -> (Vec<Arc<T>>, bool) {
         let now = self.clock.monotonic();
         let names = self.read();
-        let listed = |entry: &&Arc<T>| entry.id() > after && !entry.is_ended() && !self.is_idle(entry, now);
-        let mut entries: Vec<&Arc<T>> = names.open.values().filter(listed).collect();
-        entries.sort_unstable_by(|a, b| a.id().cmp(b.id()));
+        let listed = |entry: &&Arc<T>| name_of(entry) > after && !entry.is_ended() && !self.is_idle(entry, now);
+        let of_owner = of.and_then(|owner| names.open.get(owner)).into_iter().flat_map(HashMap::values);
+        let of_all = of.is_none().then(|| names.entries()).into_iter().flatten();
+        let mut entries: Vec<&Arc<T>> = of_owner.chain(of_all).filter(listed).collect();
+        entries.sort_unstable_by(|a, b| name_of(a).cmp(&name_of(b)));
         let more = entries.len() > limit;
         (entries.into_iter().take(limit).cloned().collect(), more)
     }
 
     /// Number of entries, including idle ones that have not been removed yet.
     pub fn len(&self) -> usize {
-        self.read().open.len()
+        self.read().count
     }
 
     /// Whether there is no entry.
@@ -245,12 +304,15 @@ impl<T: TableEntry> Table<T> {
     }
 
     fn remove_expired_names(&self, names: &mut Names<T>, now: Duration, repeat_window: Duration) {
-        names.open.retain(|_, entry| !entry.is_ended() || entry.last_use().idle(now) < repeat_window);
+        let name = |entry: &Arc<T>| (entry.owner().clone(), entry.id().to_owned());
+        let over = |entry: &&Arc<T>| entry.is_ended() && entry.last_use().idle(now) >= repeat_window;
+        let over: Vec<Name> = names.entries().filter(over).map(name).collect();
+        over.iter().for_each(|(owner, id)| names.remove(owner, id));
         // An entry that a request holds is in use, however long the request takes.
-        let expired = |entry: &Arc<T>| Arc::strong_count(entry) == 1 && self.is_idle(entry, now);
-        let expired: Vec<String> = names.open.iter().filter(|(_, entry)| expired(entry)).map(|(id, _)| id.clone()).collect();
-        for id in expired {
-            names.expire(id, self.limits.max);
+        let expired = |entry: &&Arc<T>| Arc::strong_count(entry) == 1 && self.is_idle(entry, now);
+        let expired: Vec<Name> = names.entries().filter(expired).map(name).collect();
+        for name in expired {
+            names.expire(name, self.limits.max);
         }
     }
 }

@@ -13,6 +13,7 @@ use proptest::prelude::*;
 use proptest::test_runner::TestRunner;
 use qedgix::invalid::Invalid;
 use qedgix::policy::{FleetStep, Policy, RequiredInput};
+use qedgix::service::keys::Caller;
 use qedgix::service::{App, Error, act, sessions};
 use qedgix::serving::{FleetInput, SessionOptions};
 
@@ -207,7 +208,7 @@ impl Model {
         });
         let (app, policy) = (self.app.clone(), self.policy.parse().unwrap());
         let how = SessionOptions { id: Some(self.session(name)), run_id: run.map(|run| run.to_string()), seed: Some(seed) };
-        let answer = async move { sessions::open(&app, &policy, how).await.map(|_| None) }.boxed();
+        let answer = async move { sessions::open(&app, &Caller::default(), &policy, how).await.map(|_| None) }.boxed();
         self.begin(Call { session, kind: CallKind::Open { seed, run, fresh: known.is_none() }, answer });
     }
 
@@ -230,7 +231,7 @@ impl Model {
         };
         let app = self.app.clone();
         let answer = async move {
-            let answer = act::act(&app, request, None).await?;
+            let answer = act::act(&app, &Caller::default(), request, None).await?;
             let values: [f32; 3] = answer.decision.q_values[..3].try_into().unwrap();
             assert_eq!(answer.decision.q_values[3..], values, "one fleet has one memory");
             assert_eq!(answer.decision.headings, [values[0] as u8 % 3; 2]);
@@ -246,7 +247,7 @@ impl Model {
             self.names.remove(&name);
         }
         let (app, id) = (self.app.clone(), self.session(name));
-        let answer = async move { sessions::close(&app, &id).await.map(|_| None) }.boxed();
+        let answer = async move { sessions::close(&app, &Caller::default(), &id).await.map(|_| None) }.boxed();
         self.start(found, CallKind::Close, answer);
     }
 

@@ -53,7 +53,7 @@ impl From<v1::StepRequest> for EnvironmentStep {
 
 impl From<EnvironmentInfo> for v1::Environment {
     fn from(info: EnvironmentInfo) -> Self {
-        let EnvironmentInfo { id, spec, cursor, created_at, ttl } = info;
+        let EnvironmentInfo { owner: _, id, spec, cursor, created_at, ttl } = info;
         let config = serde_json::to_value(&spec.config).expect("a configuration is plain data");
         Self {
             environment_id: id,

@@ -7,11 +7,12 @@ use futures::stream::{BoxStream, StreamExt, TryStreamExt};
 use tonic::{Request, Response, Status};
 
 use super::GrpcResult;
-use crate::api::auth::StreamCaller;
+use crate::api::auth::caller;
 use crate::api::convert::jobs::state_filter;
 use crate::api::convert::structs::from_struct;
 use crate::api::errors::stream_status;
 use crate::jobs::spec::JobRequest;
+use crate::service::keys::Caller;
 use crate::service::{App, Error, PageRequest, events, jobs};
 use crate::store::JobAction;
 use crate::wire::v1;
@@ -25,8 +26,8 @@ pub fn service(app: Arc<App>) -> JobServiceServer<impl JobService> {
 struct Service(Arc<App>);
 
 impl Service {
-    async fn change(&self, id: &str, verb: JobAction) -> GrpcResult<v1::Job> {
-        Ok(Response::new(jobs::change(&self.0, id, verb).await?.into()))
+    async fn change(&self, caller: Caller, id: &str, verb: JobAction) -> GrpcResult<v1::Job> {
+        Ok(Response::new(jobs::change(&self.0, &caller, id, verb).await?.into()))
     }
 }
 
@@ -38,51 +39,56 @@ fn non_empty(text: &str) -> Option<&str> {
 #[tonic::async_trait]
 impl JobService for Service {
     async fn submit_job(&self, request: Request<v1::SubmitJobRequest>) -> GrpcResult<v1::Job> {
+        let caller = caller(request.extensions());
         let v1::SubmitJobRequest { spec, idempotency_key } = request.into_inner();
         let document = from_struct("spec", spec.unwrap_or_default()).map_err(Error::from)?;
         let job = JobRequest::from_json(document).map_err(Error::from)?;
         let key = non_empty(&idempotency_key).map(str::to_owned);
-        let (job, _) = jobs::submit(&self.0, job, key).await?;
+        let (job, _) = jobs::submit(&self.0, &caller, job, key).await?;
         Ok(Response::new(job.into()))
     }
 
     async fn get_job(&self, request: Request<v1::GetJobRequest>) -> GrpcResult<v1::Job> {
-        Ok(Response::new(jobs::get(&self.0, &request.into_inner().id).await?.into()))
+        let caller = caller(request.extensions());
+        Ok(Response::new(jobs::get(&self.0, &caller, &request.into_inner().id).await?.into()))
     }
 
     async fn list_jobs(&self, request: Request<v1::ListJobsRequest>) -> GrpcResult<v1::ListJobsResponse> {
+        let caller = caller(request.extensions());
         let v1::ListJobsRequest { state, page_size, page_token } = request.into_inner();
         let state = state_filter(state).map_err(Error::from)?;
-        let page = jobs::list(&self.0, state, &PageRequest { size: page_size, token: page_token }).await?.map(Into::into);
+        let page =
+            jobs::list(&self.0, &caller, state, &PageRequest { size: page_size, token: page_token }).await?.map(Into::into);
         Ok(Response::new(v1::ListJobsResponse { jobs: page.items, next_page_token: page.next_token }))
     }
 
     async fn cancel_job(&self, request: Request<v1::CancelJobRequest>) -> GrpcResult<v1::Job> {
-        self.change(&request.into_inner().id, JobAction::Cancel).await
+        self.change(caller(request.extensions()), &request.into_inner().id, JobAction::Cancel).await
     }
 
     async fn pause_job(&self, request: Request<v1::PauseJobRequest>) -> GrpcResult<v1::Job> {
-        self.change(&request.into_inner().id, JobAction::Pause).await
+        self.change(caller(request.extensions()), &request.into_inner().id, JobAction::Pause).await
     }
 
     async fn resume_job(&self, request: Request<v1::ResumeJobRequest>) -> GrpcResult<v1::Job> {
-        self.change(&request.into_inner().id, JobAction::Resume).await
+        self.change(caller(request.extensions()), &request.into_inner().id, JobAction::Resume).await
     }
 
     async fn get_job_metrics(&self, request: Request<v1::GetJobMetricsRequest>) -> GrpcResult<v1::GetJobMetricsResponse> {
+        let caller = caller(request.extensions());
         let v1::GetJobMetricsRequest { id, name, page_size, page_token } = request.into_inner();
         let page = PageRequest { size: page_size, token: page_token };
-        let page = jobs::metrics(&self.0, &id, non_empty(&name), &page).await?.map(Into::into);
+        let page = jobs::metrics(&self.0, &caller, &id, non_empty(&name), &page).await?.map(Into::into);
         Ok(Response::new(v1::GetJobMetricsResponse { rows: page.items, next_page_token: page.next_token }))
     }
 
     type WatchJobStream = BoxStream<'static, Result<v1::JobEvent, Status>>;
 
     async fn watch_job(&self, request: Request<v1::WatchJobRequest>) -> GrpcResult<Self::WatchJobStream> {
-        let (app, caller) = (self.0.clone(), StreamCaller::new(request.extensions()));
+        let (clock, caller) = (self.0.clock.clone(), caller(request.extensions()));
         let v1::WatchJobRequest { id, after } = request.into_inner();
-        let events = events::watch(&self.0, &id, after).await?.events();
-        let events = events.and_then(move |event| ready(caller.check(&app).map(|()| event)));
+        let events = events::watch(&self.0, &caller, &id, after).await?.events();
+        let events = events.and_then(move |event| ready(caller.check(clock.now()).map(|()| event)));
         Ok(Response::new(events.map_ok(Into::into).map_err(stream_status).boxed()))
     }
 }

@@ -8,11 +8,12 @@ use futures::stream::{BoxStream, StreamExt};
 use tonic::{Request, Response, Status, Streaming};
 
 use super::{deadline, stream};
-use crate::api::auth::StreamCaller;
+use crate::api::auth::{caller, count_message};
 use crate::api::convert::{request::open_session, response::act_response};
 use crate::api::errors::act_error;
 use crate::api::offload;
 use crate::invalid::in_range;
+use crate::service::keys::Caller;
 use crate::service::{App, Error, PageRequest, act, policies, sessions};
 use crate::serving::PolicySpec;
 use crate::wire::v1;
@@ -31,10 +32,15 @@ const MAX_IN_FLIGHT: usize = 64;
 struct Handlers(Arc<App>);
 
 /// Handles one `ActRequest` of any method.
-async fn act_one(app: &App, request: v1::ActRequest, deadline: Option<Instant>) -> Result<v1::ActResponse, Error> {
+async fn act_one(
+    app: &App,
+    caller: &Caller,
+    request: v1::ActRequest,
+    deadline: Option<Instant>,
+) -> Result<v1::ActResponse, Error> {
     let return_q_values = request.return_q_values;
     let request = offload(node_count(&request) >= act::OFFLOAD_NODES, || act::Request::try_from(request)).await??;
-    Ok(act_response(act::act(app, request, deadline).await?, return_q_values))
+    Ok(act_response(act::act(app, caller, request, deadline).await?, return_q_values))
 }
 
 /// Number of UAVs and users in the request.
@@ -56,17 +62,17 @@ fn act_result(response: Result<v1::ActResponse, Error>) -> v1::ActResult {
 #[tonic::async_trait]
 impl PolicyService for Handlers {
     async fn act(&self, request: Request<v1::ActRequest>) -> Result<Response<v1::ActResponse>, Status> {
-        let deadline = deadline(request.extensions());
-        Ok(Response::new(act_one(&self.0, request.into_inner(), deadline).await?))
+        let (deadline, caller) = (deadline(request.extensions()), caller(request.extensions()));
+        Ok(Response::new(act_one(&self.0, &caller, request.into_inner(), deadline).await?))
     }
 
     async fn act_batch(&self, request: Request<v1::ActBatchRequest>) -> Result<Response<v1::ActBatchResponse>, Status> {
-        let (deadline, caller) = (deadline(request.extensions()), StreamCaller::new(request.extensions()));
+        let (deadline, caller) = (deadline(request.extensions()), caller(request.extensions()));
         let requests = request.into_inner().requests;
         in_range("requests", requests.len(), 1..=MAX_BATCH).map_err(Error::from)?;
         // The call itself counts as one request.
-        caller.charge(&self.0, requests.len() as u32 - 1);
-        let responses = requests.into_iter().map(|request| act_one(&self.0, request, deadline));
+        caller.charge(requests.len() as u32 - 1, &self.0.clock);
+        let responses = requests.into_iter().map(|request| act_one(&self.0, &caller, request, deadline));
         let results = join_all(responses).await.into_iter().map(act_result).collect();
         Ok(Response::new(v1::ActBatchResponse { results }))
     }
@@ -74,14 +80,14 @@ impl PolicyService for Handlers {
     type ActStreamStream = BoxStream<'static, Result<v1::ActResult, Status>>;
 
     async fn act_stream(&self, request: Request<Streaming<v1::ActRequest>>) -> Result<Response<Self::ActStreamStream>, Status> {
-        let (deadline, caller) = (deadline(request.extensions()), StreamCaller::new(request.extensions()));
+        let (deadline, caller) = (deadline(request.extensions()), caller(request.extensions()));
         let app = self.0.clone();
         let requests = stream::requests(app.clone(), request.into_inner());
         let results = requests.map(move |request| {
-            let (app, counted) = (app.clone(), caller.count_message(&app));
+            let (app, caller, counted) = (app.clone(), caller.clone(), count_message(&caller, &app));
             async move {
                 Ok(act_result(match (request?, counted?) {
-                    (request, Ok(())) => act_one(&app, request, deadline).await,
+                    (request, Ok(())) => act_one(&app, &caller, request, deadline).await,
                     (_, Err(busy)) => Err(busy),
                 }))
             }
@@ -90,26 +96,30 @@ impl PolicyService for Handlers {
     }
 
     async fn open_session(&self, request: Request<v1::OpenSessionRequest>) -> Result<Response<v1::Session>, Status> {
+        let caller = caller(request.extensions());
         let v1::OpenSessionRequest { policy, session_id, run_id, seed } = request.into_inner();
         let (policy, options) = open_session(&policy, session_id, run_id, seed).map_err(Error::from)?;
-        Ok(Response::new(sessions::open(&self.0, &policy, options).await?.into()))
+        Ok(Response::new(sessions::open(&self.0, &caller, &policy, options).await?.into()))
     }
 
     async fn get_session(&self, request: Request<v1::GetSessionRequest>) -> Result<Response<v1::Session>, Status> {
-        Ok(Response::new(sessions::get(&self.0, &request.into_inner().session_id)?.into()))
+        let caller = caller(request.extensions());
+        Ok(Response::new(sessions::get(&self.0, &caller, &request.into_inner().session_id)?.into()))
     }
 
     async fn list_sessions(
         &self,
         request: Request<v1::ListSessionsRequest>,
     ) -> Result<Response<v1::ListSessionsResponse>, Status> {
+        let caller = caller(request.extensions());
         let v1::ListSessionsRequest { page_size, page_token } = request.into_inner();
-        let page = sessions::list(&self.0, &PageRequest { size: page_size, token: page_token })?.map(Into::into);
+        let page = sessions::list(&self.0, &caller, &PageRequest { size: page_size, token: page_token })?.map(Into::into);
         Ok(Response::new(v1::ListSessionsResponse { sessions: page.items, next_page_token: page.next_token }))
     }
 
     async fn close_session(&self, request: Request<v1::CloseSessionRequest>) -> Result<Response<v1::Session>, Status> {
-        Ok(Response::new(sessions::close(&self.0, &request.into_inner().session_id).await?.into()))
+        let caller = caller(request.extensions());
+        Ok(Response::new(sessions::close(&self.0, &caller, &request.into_inner().session_id).await?.into()))
     }
 
     async fn list_policies(

@@ -20,6 +20,7 @@ use self::parameters::Parameters;
 use super::convert::tensors::{INPUTS, Tensor, element_count, fleet_input};
 use crate::invalid::Invalid;
 use crate::service::act::{self, MemoryLocation};
+use crate::service::keys::Caller;
 use crate::service::{App, Error};
 
 /// Name of the server in its metadata.
@@ -73,7 +74,7 @@ pub struct InferResponse {
 /// # Errors
 /// [`Error::Invalid`] for input that is not accepted, [`Error::NotFound`] for a model that is unknown or not loaded, and the
 /// errors of [`act::act`].
-pub async fn infer(app: &App, request: InferRequest, deadline: Option<Instant>) -> Result<InferResponse, Error> {
+pub async fn infer(app: &App, caller: &Caller, request: InferRequest, deadline: Option<Instant>) -> Result<InferResponse, Error> {
     let InferRequest { model, version, id, parameters, inputs, outputs } = request;
     let spec = policy_spec(&model, &version)?;
     let Parameters { sequence, step, seed, timeout } = Parameters::read(parameters)?;
@@ -95,7 +96,7 @@ pub async fn infer(app: &App, request: InferRequest, deadline: Option<Instant>) 
     let timeout = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
     let deadline = deadline.into_iter().chain(timeout).min();
     let request = act::Request { policy: Some(spec.clone()), input, memory, step, run_id: None, seed };
-    let response = act::act(app, request, deadline).await.map_err(|error| model_error(&spec, error))?;
+    let response = act::act(app, caller, request, deadline).await.map_err(|error| model_error(&spec, error))?;
     let reference = &response.policy.reference;
     let (version, digest, step) = (reference.version, reference.digest_hex(), response.decision.step);
     Ok(InferResponse { model, version, id, step, digest, outputs: outputs.tensors(response) })

@@ -20,6 +20,7 @@ use crate::api::convert::request::ActFields;
 use crate::api::convert::response::{self, actions, degrees};
 use crate::api::offload;
 use crate::invalid::Invalid;
+use crate::service::keys::Caller;
 use crate::service::{App, Error, act};
 use crate::serving::{self, Decision, FleetInput};
 
@@ -166,9 +167,10 @@ impl ActResponse {
 )]
 async fn decide(
     State(app): State<Arc<App>>,
+    caller: Caller,
     extract::Json(request): extract::Json<ActRequest>,
 ) -> Result<Json<ActResponse>, Error> {
     let q_values = request.return_q_values;
     let request = offload(request.is_large(), move || act::Request::try_from(request)).await??;
-    Ok(Json(ActResponse::new(act::act(&app, request, None).await?, q_values)))
+    Ok(Json(ActResponse::new(act::act(&app, &caller, request, None).await?, q_values)))
 }

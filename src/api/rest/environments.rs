@@ -25,6 +25,7 @@ use super::schemas::Seconds;
 use crate::api::convert::environments::{create_environment, is_large};
 use crate::api::offload;
 use crate::env::{self, EnvConfig};
+use crate::service::keys::Caller;
 use crate::service::{App, Error, environments};
 use crate::serving::{self, EnvironmentInfo, EnvironmentReset, EnvironmentStep};
 
@@ -137,7 +138,7 @@ struct HostedEnvironment {
 
 impl From<EnvironmentInfo> for HostedEnvironment {
     fn from(info: EnvironmentInfo) -> Self {
-        let EnvironmentInfo { id, spec, cursor, created_at, ttl } = info;
+        let EnvironmentInfo { owner: _, id, spec, cursor, created_at, ttl } = info;
         Self {
             environment_id: id,
             headings: spec.config.actions(),
@@ -252,11 +253,12 @@ impl From<serving::FinishedEpisode> for FinishedEpisode {
 )]
 async fn create(
     State(app): AppState,
+    caller: Caller,
     extract::Json(request): extract::Json<CreateEnvironmentRequest>,
 ) -> Result<impl IntoResponse, Error> {
     let CreateEnvironmentRequest { environment, seed, count, auto_reset, environment_id } = request;
     let create = create_environment(environment_id, environment.into(), seed, count, auto_reset)?;
-    let environment = HostedEnvironment::from(environments::create(&app, create).await?);
+    let environment = HostedEnvironment::from(environments::create(&app, &caller, create).await?);
     Ok((StatusCode::CREATED, [(header::CACHE_CONTROL, "no-store")], Json(environment)))
 }
 
@@ -265,8 +267,8 @@ async fn create(
     get, path = "/v1/environments", operation_id = "listEnvironments", tag = "environments", params(Paging),
     responses((status = 200, description = "A page of environments.", body = EnvironmentPage), BadRequest)
 )]
-async fn list(State(app): AppState, Query(paging): Query<Paging>) -> Result<Json<EnvironmentPage>, Error> {
-    let page = environments::list(&app, &paging.into())?.map(Into::into);
+async fn list(State(app): AppState, caller: Caller, Query(paging): Query<Paging>) -> Result<Json<EnvironmentPage>, Error> {
+    let page = environments::list(&app, &caller, &paging.into())?.map(Into::into);
     Ok(Json(EnvironmentPage { environments: page.items, next_page_token: page.next_token }))
 }
 
@@ -277,9 +279,10 @@ async fn list(State(app): AppState, Query(paging): Query<Paging>) -> Result<Json
 )]
 async fn get(
     State(app): AppState,
+    caller: Caller,
     Path(EnvironmentPath { id }): Path<EnvironmentPath>,
 ) -> Result<Json<HostedEnvironment>, Error> {
-    Ok(Json(environments::get(&app, &id)?.into()))
+    Ok(Json(environments::get(&app, &caller, &id)?.into()))
 }
 
 /// Delete an environment, after a step that is in progress
@@ -291,9 +294,10 @@ async fn get(
 )]
 async fn delete(
     State(app): AppState,
+    caller: Caller,
     Path(EnvironmentPath { id }): Path<EnvironmentPath>,
 ) -> Result<Json<HostedEnvironment>, Error> {
-    Ok(Json(environments::delete(&app, &id).await?.into()))
+    Ok(Json(environments::delete(&app, &caller, &id).await?.into()))
 }
 
 /// Begin an episode in every copy
@@ -304,11 +308,12 @@ async fn delete(
 )]
 async fn reset(
     State(app): AppState,
+    caller: Caller,
     Path(EnvironmentPath { id }): Path<EnvironmentPath>,
     extract::Json(request): extract::Json<ResetRequest>,
 ) -> Result<Response, Error> {
     let ResetRequest { seed, episode, return_graph } = request;
-    let state = environments::reset(&app, &id, EnvironmentReset { seed, episode, graph: return_graph }).await?;
+    let state = environments::reset(&app, &caller, &id, EnvironmentReset { seed, episode, graph: return_graph }).await?;
     offload(is_large(&state), || Json(EnvironmentState::new(id, state)).into_response()).await
 }
 
@@ -320,11 +325,12 @@ async fn reset(
 )]
 async fn step(
     State(app): AppState,
+    caller: Caller,
     Path(EnvironmentPath { id }): Path<EnvironmentPath>,
     extract::Json(request): extract::Json<StepRequest>,
 ) -> Result<Response, Error> {
     let StepRequest { actions, step, return_graph } = request;
     let actions = actions.into_iter().map(|copy| copy.headings).collect();
-    let state = environments::step(&app, &id, EnvironmentStep { actions, step, graph: return_graph }).await?;
+    let state = environments::step(&app, &caller, &id, EnvironmentStep { actions, step, graph: return_graph }).await?;
     offload(is_large(&state), || Json(EnvironmentState::new(id, state)).into_response()).await
 }

@@ -5,7 +5,7 @@ use std::future::ready;
 use std::sync::Arc;
 
 use axum::extract::State;
-use axum::http::{Extensions, HeaderMap, HeaderName, HeaderValue, StatusCode};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use futures::{StreamExt, TryStreamExt};
@@ -18,9 +18,9 @@ use utoipa_axum::routes;
 use super::extract::{Path, Query};
 use super::jobs::{JobPath, MetricRow};
 use super::openapi::{BadRequest, Draining, NotFound};
-use crate::api::auth::StreamCaller;
 use crate::api::errors::log_internal;
 use crate::invalid::Invalid;
+use crate::service::keys::Caller;
 use crate::service::{App, Error, events};
 use crate::store::{JobEvent, JobEventKind, JobState};
 
@@ -122,10 +122,10 @@ const UNBUFFERED: (HeaderName, HeaderValue) = (HeaderName::from_static("x-accel-
 )]
 async fn follow(
     State(app): State<Arc<App>>,
+    caller: Caller,
     Path(JobPath { id }): Path<JobPath>,
     Query(query): Query<FollowQuery>,
     headers: HeaderMap,
-    extensions: Extensions,
 ) -> Result<Response, Error> {
     let after = match headers.get(LAST_EVENT_ID) {
         None => query.after,
@@ -135,13 +135,13 @@ async fn follow(
             .and_then(|text| text.parse().ok())
             .ok_or_else(|| Invalid::new("last-event-id", format!("{value:?}"), "the id of an event of this job"))?,
     };
-    let watch = events::watch(&app, &id, after).await?;
+    let watch = events::watch(&app, &caller, &id, after).await?;
     if watch.has_ended() {
         return Ok(StatusCode::NO_CONTENT.into_response());
     }
     // An error ends the stream. If the caller reconnects, the response contains the error.
-    let (live, caller) = (app.clone(), StreamCaller::new(&extensions));
-    let to_event = move |event| ready(caller.check(&live).and_then(|()| ServerSentEvent::try_from(event)));
+    let clock = app.clock.clone();
+    let to_event = move |event| ready(caller.check(clock.now()).and_then(|()| ServerSentEvent::try_from(event)));
     let events = watch.events().and_then(to_event).inspect_err(log_internal);
     let events = events.map(Result::ok).take_while(|event| ready(event.is_some())).filter_map(ready);
     let events = events.map(|event| Ok::<_, Infallible>(Event::from(event)));

@@ -247,11 +247,6 @@ struct CheckpointOfJob {
     checkpoint_id: String,
 }
 
-/// The API key that moves an alias, for its history.
-fn key_id(caller: Option<Extension<Caller>>) -> Option<String> {
-    caller.map(|Extension(caller)| caller.id().to_owned())
-}
-
 /// Publish a checkpoint as the next version of a policy
 ///
 /// Publishing identical bytes under the same name returns the existing version.
@@ -272,7 +267,7 @@ async fn upload(
     Path(NamePath { name }): Path<NamePath>,
     Query(UploadQuery { alias }): Query<UploadQuery>,
     Extension(MaxBody(limit)): Extension<MaxBody>,
-    caller: Option<Extension<Caller>>,
+    caller: Caller,
     request: Request,
 ) -> Result<impl IntoResponse, Error> {
     // Checked before the body, which may be large, is read.
@@ -288,7 +283,7 @@ async fn upload(
         }
         kind => return Err(extract::unsupported(kind, "application/octet-stream, or application/json with a checkpoint_id")),
     };
-    let (published, new) = policies::publish(&app, policies::PublishRequest { name, source, alias, by: key_id(caller) }).await?;
+    let (published, new) = policies::publish(&app, &caller, policies::PublishRequest { name, source, alias }).await?;
     let location = [(header::LOCATION, format!("/v1/policies/{}", published.info.reference))];
     Ok((if new { StatusCode::CREATED } else { StatusCode::OK }, location, Json(Policy::from(published))))
 }
@@ -396,10 +391,10 @@ struct MovedAlias {
 async fn set_alias(
     State(app): AppState,
     Path(AliasPath { name, alias }): Path<AliasPath>,
-    caller: Option<Extension<Caller>>,
+    caller: Caller,
     extract::Json(SetAlias { version, expected }): extract::Json<SetAlias>,
 ) -> Result<impl IntoResponse, Error> {
-    let target = policies::AliasChange { name, alias: alias.clone(), expected, by: key_id(caller) };
+    let target = policies::AliasChange { name, alias: alias.clone(), expected, by: caller.key_id().map(str::to_owned) };
     let previous = policies::set_alias(&app, target, version).await?;
     let status = if previous.is_none() { StatusCode::CREATED } else { StatusCode::OK };
     Ok((status, Json(MovedAlias { alias, version, previous })))
@@ -424,9 +419,9 @@ async fn delete_alias(
     State(app): AppState,
     Path(AliasPath { name, alias }): Path<AliasPath>,
     Query(DeleteAliasQuery { expected }): Query<DeleteAliasQuery>,
-    caller: Option<Extension<Caller>>,
+    caller: Caller,
 ) -> Result<StatusCode, Error> {
-    policies::delete_alias(&app, policies::AliasChange { name, alias, expected, by: key_id(caller) }).await?;
+    policies::delete_alias(&app, policies::AliasChange { name, alias, expected, by: caller.key_id().map(str::to_owned) }).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 

@@ -18,6 +18,7 @@ use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
 use super::policies::{Paging, PolicyRef};
 use super::schemas::{self, Seconds};
 use crate::api::convert::request::open_session;
+use crate::service::keys::Caller;
 use crate::service::{App, Error, sessions};
 use crate::serving::SessionInfo;
 
@@ -93,11 +94,12 @@ struct SessionPage {
 )]
 async fn open(
     State(app): AppState,
+    caller: Caller,
     extract::Json(request): extract::Json<OpenSessionRequest>,
 ) -> Result<impl IntoResponse, Error> {
     let OpenSessionRequest { policy, session_id, run_id, seed } = request;
     let (policy, options) = open_session(&policy, session_id, run_id, seed)?;
-    let session = Session::from(sessions::open(&app, &policy, options).await?);
+    let session = Session::from(sessions::open(&app, &caller, &policy, options).await?);
     Ok((StatusCode::CREATED, [(header::CACHE_CONTROL, "no-store")], Json(session)))
 }
 
@@ -106,8 +108,8 @@ async fn open(
     get, path = "/v1/sessions", operation_id = "listSessions", tag = "sessions", params(Paging),
     responses((status = 200, description = "A page of sessions.", body = SessionPage), BadRequest)
 )]
-async fn list(State(app): AppState, Query(paging): Query<Paging>) -> Result<Json<SessionPage>, Error> {
-    let page = sessions::list(&app, &paging.into())?.map(Into::into);
+async fn list(State(app): AppState, caller: Caller, Query(paging): Query<Paging>) -> Result<Json<SessionPage>, Error> {
+    let page = sessions::list(&app, &caller, &paging.into())?.map(Into::into);
     Ok(Json(SessionPage { sessions: page.items, next_page_token: page.next_token }))
 }
 
@@ -116,8 +118,8 @@ async fn list(State(app): AppState, Query(paging): Query<Paging>) -> Result<Json
     get, path = "/v1/sessions/{id}", operation_id = "getSession", tag = "sessions", params(SessionPath),
     responses((status = 200, description = "The open session.", body = Session), BadRequest, NotFound, Conflict)
 )]
-async fn get(State(app): AppState, Path(SessionPath { id }): Path<SessionPath>) -> Result<Json<Session>, Error> {
-    Ok(Json(sessions::get(&app, &id)?.into()))
+async fn get(State(app): AppState, caller: Caller, Path(SessionPath { id }): Path<SessionPath>) -> Result<Json<Session>, Error> {
+    Ok(Json(sessions::get(&app, &caller, &id)?.into()))
 }
 
 /// Close a session, after a step that is in progress
@@ -125,6 +127,10 @@ async fn get(State(app): AppState, Path(SessionPath { id }): Path<SessionPath>) 
     delete, path = "/v1/sessions/{id}", operation_id = "closeSession", tag = "sessions", params(SessionPath),
     responses((status = 200, description = "The session as it ended.", body = Session), BadRequest, NotFound, Conflict)
 )]
-async fn close(State(app): AppState, Path(SessionPath { id }): Path<SessionPath>) -> Result<Json<Session>, Error> {
-    Ok(Json(sessions::close(&app, &id).await?.into()))
+async fn close(
+    State(app): AppState,
+    caller: Caller,
+    Path(SessionPath { id }): Path<SessionPath>,
+) -> Result<Json<Session>, Error> {
+    Ok(Json(sessions::close(&app, &caller, &id).await?.into()))
 }

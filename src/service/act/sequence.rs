@@ -12,7 +12,7 @@ use super::session::{self, SessionStep};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::service::{App, Error};
-use crate::serving::{FleetInput, PolicySpec, Session};
+use crate::serving::{FleetInput, Owner, PolicySpec, Session};
 
 /// Prefix of the names of sessions that are sequences.
 pub const SEQUENCE_PREFIX: &str = "sequence:";
@@ -22,13 +22,19 @@ pub const SEQUENCE_PREFIX: &str = "sequence:";
 /// The first slot begins the sequence on the version that the policy's name resolves to at that time; sent again, it begins
 /// the sequence again, with the same result. Later slots may be repeated by their step as in any session, the last one for a
 /// short time after the sequence has ended.
-pub(super) async fn act(app: &App, sequence: &Sequence, request: Request, deadline: Option<Instant>) -> Result<Response, Error> {
+pub(super) async fn act(
+    app: &App,
+    owner: &Owner,
+    sequence: &Sequence,
+    request: Request,
+    deadline: Option<Instant>,
+) -> Result<Response, Error> {
     let Some(spec) = request.policy.clone() else {
         return Err(Invalid::missing("policy", "the policy of the sequence").into());
     };
     let name = format!("{SEQUENCE_PREFIX}{}:{}", spec.name, sequence.id);
     let (session, response) = if sequence.start {
-        start(app, &name, &spec, request, deadline).await?
+        start(app, (owner, &name), &spec, request, deadline).await?
     } else {
         let unknown = |error| match error {
             // If the policy is unknown, report that instead of the sequence.
@@ -38,7 +44,7 @@ pub(super) async fn act(app: &App, sequence: &Sequence, request: Request, deadli
             },
             other => other,
         };
-        let session = app.sessions.get(&name).map_err(|e| unknown(e.into()))?;
+        let session = app.sessions.get(owner, &name).map_err(|e| unknown(e.into()))?;
         let response = session::act(app, &session, request, deadline).await.map_err(unknown)?;
         (session, response)
     };
@@ -56,7 +62,7 @@ fn not_started(id: &SequenceId, policy: &str) -> Error {
 /// Runs the first slot. If its input is invalid, a running sequence of this name continues unchanged.
 async fn start(
     app: &App,
-    name: &str,
+    (owner, name): (&Owner, &str),
     spec: &PolicySpec,
     request: Request,
     deadline: Option<Instant>,
@@ -69,7 +75,8 @@ async fn start(
     let FleetInput { fleet, canonical_of_request, content } = request.input;
     let graph = compute::convert(content, fleet.size(), &policy).await?;
     let step = SessionStep { fleet, canonical_of_request, graph, step: Some(0), run_id: None };
-    let mut guard = StartGuard { app, session: app.sessions.start_replacing(name, policy, request.seed)?, completed: false };
+    let session = app.sessions.start_replacing(owner, name, policy, request.seed)?;
+    let mut guard = StartGuard { app, session, completed: false };
     let response = session::advance(app, &guard.session, step, deadline).await?;
     guard.completed = true;
     Ok((guard.session.clone(), response))

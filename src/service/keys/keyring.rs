@@ -15,6 +15,7 @@ use super::scope::{Scope, Scopes};
 use super::secret;
 use crate::clock::Clock;
 use crate::service::Error;
+use crate::serving::{Owner, Table, TableEntry};
 use crate::store::{KeyRecord, Store};
 
 /// All API keys, including revoked and expired ones.
@@ -32,6 +33,8 @@ pub struct Keyring {
 #[derive(Debug)]
 struct Key {
     id: String,
+    /// Owner of what the key makes.
+    owner: Owner,
     digest: [u8; 32],
     scopes: Scopes,
     limit: Option<(Rate, TokenBucket)>,
@@ -43,9 +46,10 @@ struct Key {
     stored_last_used_at: AtomicI64,
 }
 
-/// The sender of a request, identified by its API key. Transports put it into the extensions of the request.
-#[derive(Clone, Debug)]
-pub struct Caller(Arc<Key>);
+/// The sender of a request: an API key, or anybody (the default) on a server without keys. Transports put it into the extensions of
+/// a request with a key.
+#[derive(Clone, Debug, Default)]
+pub struct Caller(Option<Arc<Key>>);
 
 impl Keyring {
     /// A keyring without keys. `default_rate` applies to keys that have no rate of their own.
@@ -86,16 +90,16 @@ impl Keyring {
         Ok(())
     }
 
-    /// Identifies the caller by the API key `presented`. Returns `None` when the server requires no key.
+    /// Identifies the caller by the API key `presented`.
     ///
     /// # Errors
     /// [`Error::Unauthenticated`] when the key is missing, unknown, wrong, revoked or expired.
-    pub fn authenticate(&self, presented: Option<&str>, now: Timestamp) -> Result<Option<Caller>, Error> {
+    pub fn authenticate(&self, presented: Option<&str>, now: Timestamp) -> Result<Caller, Error> {
         const MISSING: Error =
             Error::Unauthenticated("an API key is required, as header authorization: Bearer KEY or x-api-key: KEY");
         const UNKNOWN: Error = Error::Unauthenticated("the API key is unknown");
         if !self.required() {
-            return Ok(None);
+            return Ok(Caller::default());
         }
         let (id, secret) = secret::parse(presented.ok_or(MISSING)?).ok_or(UNKNOWN)?;
         let key = self.keys.read().unwrap_or_else(PoisonError::into_inner).get(id).cloned().ok_or(UNKNOWN)?;
@@ -103,7 +107,7 @@ impl Keyring {
             return Err(UNKNOWN);
         }
         key.check(now)?;
-        Ok(Some(Caller(key)))
+        Ok(Caller(Some(key)))
     }
 
     /// Saves the time of last use of the keys that were used since the last call.
@@ -140,6 +144,7 @@ impl Key {
             expires_at: AtomicI64::new(i64::MAX),
             last_used_at: AtomicI64::new(used_at),
             stored_last_used_at: AtomicI64::new(used_at),
+            owner: Owner::new(&record.id),
             id: record.id.clone(),
         };
         key.update(&record);
@@ -164,9 +169,51 @@ impl Key {
 }
 
 impl Caller {
-    /// Public id of the API key.
-    pub fn id(&self) -> &str {
-        &self.0.id
+    /// Public id of the API key, if there is one.
+    pub fn key_id(&self) -> Option<&str> {
+        self.0.as_ref().map(|key| key.id.as_str())
+    }
+
+    /// Owner of the sessions, environments and jobs that the caller makes.
+    pub fn owner(&self) -> &Owner {
+        static NOBODY: Owner = Owner::NOBODY;
+        self.0.as_ref().map_or(&NOBODY, |key| &key.owner)
+    }
+
+    /// Whether the caller sees what others own and may change everything: everybody on a server without keys, and keys with the
+    /// scope `admin`.
+    pub fn is_admin(&self) -> bool {
+        self.0.as_ref().is_none_or(|key| key.scopes.allows(Scope::Admin))
+    }
+
+    /// The owner whose things the caller sees; `None`: it sees those of all.
+    pub fn sees(&self) -> Option<&Owner> {
+        (!self.is_admin()).then(|| self.owner())
+    }
+
+    /// The owner whose entry `id` the caller means: its own, or with `admin` that of another owner if its own has none.
+    pub(in crate::service) fn owner_among<T: TableEntry>(&self, table: &Table<T>, id: &str) -> Owner {
+        let other = || if self.sees_other_owners() { table.owner_of(id) } else { None };
+        let own = self.owner();
+        if table.contains(own, id) { own.clone() } else { other().unwrap_or_else(|| own.clone()) }
+    }
+
+    fn sees_other_owners(&self) -> bool {
+        self.0.is_some() && self.is_admin()
+    }
+
+    /// The token of the page after an entry. It contains the owner only where a list has those of several.
+    pub(in crate::service) fn list_token(&self, owner: &Owner, id: &str) -> String {
+        if self.sees_other_owners() { format!("{}/{id}", owner.id().unwrap_or_default()) } else { id.to_owned() }
+    }
+
+    /// The owner and the id in a token; any text is a position in the list.
+    pub(in crate::service) fn list_position<'a>(&self, token: &'a str) -> (Owner, &'a str) {
+        match token.split_once('/').filter(|_| self.sees_other_owners()) {
+            Some(("", id)) => (Owner::NOBODY, id),
+            Some((owner, id)) => (Owner::new(owner), id),
+            None => (self.owner().clone(), token),
+        }
     }
 
     /// Checks that the key is still valid. Streams call this repeatedly.
@@ -174,7 +221,7 @@ impl Caller {
     /// # Errors
     /// [`Error::Unauthenticated`] when the key is revoked or expired.
     pub fn check(&self, now: Timestamp) -> Result<(), Error> {
-        self.0.check(now)
+        self.0.as_ref().map_or(Ok(()), |key| key.check(now))
     }
 
     /// Checks that the key has `scope`.
@@ -182,10 +229,8 @@ impl Caller {
     /// # Errors
     /// [`Error::PermissionDenied`] when it does not.
     pub fn authorize(&self, scope: Scope) -> Result<(), Error> {
-        if self.0.scopes.allows(scope) {
-            return Ok(());
-        }
-        let (scope, id, scopes) = (scope.name(), self.id(), self.0.scopes);
+        let Some(key) = self.0.as_ref().filter(|key| !key.scopes.allows(scope)) else { return Ok(()) };
+        let (scope, id, scopes) = (scope.name(), &key.id, key.scopes);
         let message = format!("this operation requires the scope {scope}; the API key {id} has {scopes}");
         Err(Error::PermissionDenied { message, scope })
     }
@@ -195,7 +240,7 @@ impl Caller {
     /// # Errors
     /// [`Error::Busy`] when the key is over its rate.
     pub fn acquire(&self, clock: &Clock) -> Result<(), Error> {
-        let key = &self.0;
+        let Some(key) = &self.0 else { return Ok(()) };
         let ms = clock.now().as_millisecond();
         // One second of precision is enough, and most requests write nothing.
         if ms.saturating_sub(key.last_used_at.load(Ordering::Relaxed)) >= 1000 {
@@ -211,7 +256,7 @@ impl Caller {
     /// Counts `requests` more after an accepted request turned out to contain them (the slots of a batch). The request is not
     /// refused; later requests of the key wait.
     pub fn charge(&self, requests: u32, clock: &Clock) {
-        if let Some((_, bucket)) = &self.0.limit {
+        if let Some((_, bucket)) = self.0.as_ref().and_then(|key| key.limit.as_ref()) {
             bucket.charge(requests, nanoseconds(clock.monotonic()));
         }
     }

@@ -13,6 +13,7 @@ use crate::checkpoint::Checkpoint;
 use crate::invalid::Invalid;
 use crate::policy::baselines;
 use crate::policy::{Identity, ObservationKind, Policy};
+use crate::service::keys::Caller;
 use crate::service::{App, Error, checkpoints};
 use crate::serving::{LoadedPolicy, PolicyDetails, PolicyInfo, PolicyKind, PolicyRef, PolicySpec, VersionSelector, check_name};
 use crate::store::{NewPolicyVersion, PolicyVersion, Store};
@@ -35,8 +36,6 @@ pub struct PublishRequest {
     pub source: CheckpointSource,
     /// An alias to point to the version.
     pub alias: Option<String>,
-    /// Id of the caller's API key.
-    pub by: Option<String>,
 }
 
 /// Checks that a policy may be published as `name`.
@@ -66,18 +65,18 @@ pub async fn publish_bytes(app: &App, name: &str, bytes: Vec<u8>) -> Result<Poli
 /// # Errors
 /// As [`publish_bytes`]; [`Error::NotFound`] for an unknown checkpoint, [`Error::Precondition`] for an alias to an unloaded version,
 /// [`Error::Draining`].
-pub async fn publish(app: &App, request: PublishRequest) -> Result<(PolicyDetails, bool), Error> {
+pub async fn publish(app: &App, caller: &Caller, request: PublishRequest) -> Result<(PolicyDetails, bool), Error> {
     app.admit()?;
-    let PublishRequest { name, source, alias, by } = request;
+    let PublishRequest { name, source, alias } = request;
     check_publishable(&name)?;
     if let Some(alias) = &alias {
         check_name("alias", alias)?;
     }
     let checkpoint = match source {
         CheckpointSource::Bytes(bytes, permit) => CheckpointBytes { bytes, _permit: Some(permit) },
-        CheckpointSource::Job(id) => CheckpointBytes { bytes: checkpoints::get(app, &id).await?.1, _permit: None },
+        CheckpointSource::Job(id) => CheckpointBytes { bytes: checkpoints::get(app, caller, &id).await?.1, _permit: None },
     };
-    let (reference, new) = store_version(app, &name, checkpoint, alias, by).await?;
+    let (reference, new) = store_version(app, &name, checkpoint, alias, caller.key_id().map(str::to_owned)).await?;
     let spec = PolicySpec { name, version: VersionSelector::Version(reference.version) };
     Ok((app.registry.describe(&spec)?, new))
 }

@@ -14,8 +14,8 @@ use super::state::EnvironmentState;
 use crate::clock::Clock;
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
-use crate::serving::Error;
 use crate::serving::table::{LastUse, TableEntry};
+use crate::serving::{Error, Owner};
 
 /// Environments with more work per step are stepped on blocking threads, not on those that serve connections.
 pub(super) const MAX_INLINE_WORK: usize = 16_384;
@@ -23,6 +23,8 @@ pub(super) const MAX_INLINE_WORK: usize = 16_384;
 /// Description of an environment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EnvironmentInfo {
+    /// Who created it.
+    pub owner: Owner,
     /// Its name.
     pub id: String,
     /// Its specification, with the seed of the last reset that gave one.
@@ -60,6 +62,7 @@ pub struct EnvironmentStep {
 /// A hosted environment.
 #[derive(Debug)]
 pub struct Environment {
+    owner: Owner,
     id: String,
     spec: EnvironmentSpec,
     created_at: Timestamp,
@@ -76,7 +79,7 @@ pub struct Environment {
 
 impl Environment {
     pub(super) fn new(
-        id: String,
+        (owner, id): (Owner, String),
         spec: EnvironmentSpec,
         simulation: Simulation,
         memory_permit: OwnedSemaphorePermit,
@@ -84,6 +87,7 @@ impl Environment {
     ) -> Self {
         let created_at = clock.now();
         Self {
+            owner,
             id,
             spec,
             created_at,
@@ -105,7 +109,8 @@ impl Environment {
     pub fn info(&self, ttl: Duration) -> EnvironmentInfo {
         let cursor = *self.cursor();
         let spec = EnvironmentSpec { seed: cursor.seed, ..self.spec.clone() };
-        EnvironmentInfo { id: self.id.clone(), spec, cursor, created_at: self.created_at, ttl }
+        let (owner, id) = (self.owner.clone(), self.id.clone());
+        EnvironmentInfo { owner, id, spec, cursor, created_at: self.created_at, ttl }
     }
 
     /// Handles a second creation under the same name: a retry if the environment was created from `spec` and is unused.
@@ -215,6 +220,10 @@ impl Environment {
 impl TableEntry for Environment {
     const KIND: &'static str = "environment";
     const EXPIRED: ErrorCode = ErrorCode::EnvironmentExpired;
+
+    fn owner(&self) -> &Owner {
+        &self.owner
+    }
 
     fn id(&self) -> &str {
         &self.id

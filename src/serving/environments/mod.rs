@@ -16,7 +16,7 @@ use std::sync::Arc;
 use tokio::sync::Semaphore;
 
 use super::table::{Lookup, Table, generate_id};
-use super::{Error, Limits};
+use super::{Error, Limits, Owner};
 use crate::clock::Clock;
 use simulation::Simulation;
 
@@ -57,25 +57,25 @@ impl Environments {
         &self.table
     }
 
-    /// Creates an environment named `id`, or with a generated name. If an unused environment of that name was created from
+    /// Creates an environment of `owner` named `id`, or with a generated name. If an unused environment of that name was created from
     /// the same `spec`, the call is a retry and returns that environment.
     ///
     /// # Errors
     /// [`Error::Conflict`] if the name is taken, [`Error::Busy`] if the number or the memory of environments is exhausted.
-    pub async fn create(&self, id: Option<String>, spec: EnvironmentSpec) -> Result<EnvironmentInfo, Error> {
-        let id = id.unwrap_or_else(generate_id);
+    pub async fn create(&self, owner: &Owner, id: Option<String>, spec: EnvironmentSpec) -> Result<EnvironmentInfo, Error> {
+        let name = (owner.clone(), id.unwrap_or_else(generate_id));
         // Checked first, so that a retry succeeds and a conflict is reported even if no memory is left.
-        let environment = match self.table.get(&id) {
+        let environment = match self.table.get(owner, &name.1) {
             Ok(existing) => {
                 existing.recreate(&spec).await?;
                 existing
             }
-            Err(_) => self.build(id, spec).await?,
+            Err(_) => self.build(name, spec).await?,
         };
         Ok(environment.info(self.table.ttl()))
     }
 
-    async fn build(&self, id: String, spec: EnvironmentSpec) -> Result<Arc<Environment>, Error> {
+    async fn build(&self, name: (Owner, String), spec: EnvironmentSpec) -> Result<Arc<Environment>, Error> {
         let memory_units = u32::try_from(spec.bytes().div_ceil(MEMORY_UNIT)).unwrap_or(u32::MAX);
         let acquire = || self.memory_units.clone().try_acquire_many_owned(memory_units);
         let memory_permit = acquire().or_else(|_| {
@@ -95,28 +95,28 @@ impl Environments {
             built.await.map_err(|e| Error::Internal(e.to_string()))??
         };
         let clock = self.table.clock().clone();
-        let make = || Environment::new(id.clone(), spec.clone(), simulation, memory_permit, clock);
-        match self.table.find_or_add(&id, make)? {
+        let make = || Environment::new(name.clone(), spec.clone(), simulation, memory_permit, clock);
+        match self.table.find_or_add(&name.0, &name.1, make)? {
             Lookup::Added(environment) => Ok(environment),
             // A concurrent call created it.
             Lookup::Found(environment) => environment.recreate(&spec).await.map(|()| environment),
         }
     }
 
-    /// Describes environment `id`, and counts as a use of it.
+    /// Describes environment `id` of `owner`, and counts as a use of it.
     ///
     /// # Errors
     /// `environment_expired`, or [`Error::NotFound`].
-    pub fn describe(&self, id: &str) -> Result<EnvironmentInfo, Error> {
-        Ok(self.table.get(id)?.info(self.table.ttl()))
+    pub fn describe(&self, owner: &Owner, id: &str) -> Result<EnvironmentInfo, Error> {
+        Ok(self.table.get(owner, id)?.info(self.table.ttl()))
     }
 
-    /// Deletes environment `id`. Waits for the step in flight.
+    /// Deletes environment `id` of `owner`. Waits for the step in flight.
     ///
     /// # Errors
     /// `environment_expired`, or [`Error::NotFound`].
-    pub async fn delete(&self, id: &str) -> Result<EnvironmentInfo, Error> {
-        let environment = self.table.get(id)?;
+    pub async fn delete(&self, owner: &Owner, id: &str) -> Result<EnvironmentInfo, Error> {
+        let environment = self.table.get(owner, id)?;
         self.table.remove(&environment);
         environment.delete().await;
         Ok(environment.info(self.table.ttl()))

@@ -9,13 +9,13 @@ pub use session::{PendingStep, Session, SessionInfo, SessionOptions, StepStart};
 use std::sync::Arc;
 
 use super::table::{Lookup, Table, generate_id};
-use super::{Error, LoadedPolicy};
+use super::{Error, LoadedPolicy, Owner};
 
 /// All sessions of this server.
 pub type Sessions = Table<Session>;
 
 impl Sessions {
-    /// Opens a session pinned to `policy`.
+    /// Opens a session of `owner`, pinned to `policy`.
     ///
     /// If a session of that name is open, the call is a retry, provided that the session was opened with the same options and
     /// has no step. With a new `run_id` the call restarts that session, on the version that it is pinned to.
@@ -23,10 +23,10 @@ impl Sessions {
     /// # Errors
     /// [`Error::Conflict`] if the name is taken, `run_fenced` if `run_id` names a former run, [`Error::Busy`] if the number of
     /// sessions is exhausted.
-    pub async fn open(&self, policy: Arc<LoadedPolicy>, options: SessionOptions) -> Result<SessionInfo, Error> {
+    pub async fn open(&self, owner: &Owner, policy: Arc<LoadedPolicy>, options: SessionOptions) -> Result<SessionInfo, Error> {
         let id = options.id.clone().unwrap_or_else(generate_id);
-        let make = || Session::new(id.clone(), policy.clone(), &options, self.clock().clone());
-        let session = match self.find_or_add(&id, make)? {
+        let make = || Session::new((owner.clone(), id.clone()), policy.clone(), &options, self.clock().clone());
+        let session = match self.find_or_add(owner, &id, make)? {
             Lookup::Added(session) => session,
             Lookup::Found(session) => {
                 session.retry_or_restart(&policy, &options).await?;
@@ -36,14 +36,21 @@ impl Sessions {
         Ok(session.info(self.ttl()))
     }
 
-    /// Starts session `id` pinned to `policy`, in place of the session of that name, if any. Steps of that session that are in
+    /// Starts session `id` of `owner`, pinned to `policy`, in place of the session of that name, if any. Steps of that session that are in
     /// flight complete.
     ///
     /// # Errors
     /// [`Error::Busy`] if the number of sessions is exhausted.
-    pub fn start_replacing(&self, id: &str, policy: Arc<LoadedPolicy>, seed: Option<u64>) -> Result<Arc<Session>, Error> {
+    pub fn start_replacing(
+        &self,
+        owner: &Owner,
+        id: &str,
+        policy: Arc<LoadedPolicy>,
+        seed: Option<u64>,
+    ) -> Result<Arc<Session>, Error> {
         let options = SessionOptions { seed, ..SessionOptions::default() };
-        self.replace(id, || Session::new(id.to_owned(), policy, &options, self.clock().clone()))
+        let name = (owner.clone(), id.to_owned());
+        self.replace(owner, id, || Session::new(name, policy, &options, self.clock().clone()))
     }
 
     /// Removes a session that [`Sessions::start_replacing`] started, unless another session has taken its name.
@@ -51,20 +58,20 @@ impl Sessions {
         self.remove(session);
     }
 
-    /// Describes session `id`, and counts as a use of it.
+    /// Describes session `id` of `owner`, and counts as a use of it.
     ///
     /// # Errors
     /// `session_expired`, or [`Error::NotFound`].
-    pub fn describe(&self, id: &str) -> Result<SessionInfo, Error> {
-        Ok(self.get(id)?.info(self.ttl()))
+    pub fn describe(&self, owner: &Owner, id: &str) -> Result<SessionInfo, Error> {
+        Ok(self.get(owner, id)?.info(self.ttl()))
     }
 
-    /// Closes session `id`. Waits for the step in flight.
+    /// Closes session `id` of `owner`. Waits for the step in flight.
     ///
     /// # Errors
     /// `session_expired`, or [`Error::NotFound`].
-    pub async fn close(&self, id: &str) -> Result<SessionInfo, Error> {
-        let session = self.get(id)?;
+    pub async fn close(&self, owner: &Owner, id: &str) -> Result<SessionInfo, Error> {
+        let session = self.get(owner, id)?;
         self.remove(&session);
         session.close().await;
         Ok(session.info(self.ttl()))

@@ -13,7 +13,7 @@ use super::seed::{run_hash, session_seed};
 use crate::clock::Clock;
 use crate::error_code::ErrorCode;
 use crate::serving::table::{LastUse, TableEntry};
-use crate::serving::{Decision, Error, FleetIds, LoadedPolicy, OutputBuffers, PolicyRef, TaskOutput};
+use crate::serving::{Decision, Error, FleetIds, LoadedPolicy, OutputBuffers, Owner, PolicyRef, TaskOutput};
 
 /// Maximum number of former runs that a session remembers, in order to reject them.
 const MAX_FORMER_RUNS: usize = 64;
@@ -21,6 +21,8 @@ const MAX_FORMER_RUNS: usize = 64;
 /// Description of a session.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SessionInfo {
+    /// Who opened it.
+    pub owner: Owner,
     /// Its name.
     pub id: String,
     /// The policy version that it is pinned to.
@@ -47,6 +49,7 @@ pub struct SessionOptions {
 /// A fleet whose memory the server keeps, pinned to one policy version.
 #[derive(Debug)]
 pub struct Session {
+    owner: Owner,
     id: String,
     policy: Arc<LoadedPolicy>,
     opened_at: Timestamp,
@@ -108,7 +111,7 @@ pub struct PendingStep<'a> {
 }
 
 impl Session {
-    pub(super) fn new(id: String, policy: Arc<LoadedPolicy>, options: &SessionOptions, clock: Clock) -> Self {
+    pub(super) fn new((owner, id): (Owner, String), policy: Arc<LoadedPolicy>, options: &SessionOptions, clock: Clock) -> Self {
         let opened_at = clock.now();
         let state = SessionState {
             closed: false,
@@ -125,7 +128,7 @@ impl Session {
         };
         let last_use = LastUse::at(clock.monotonic());
         let (steps, ended) = (AtomicU64::new(0), AtomicBool::new(false));
-        Self { id, policy, opened_at, clock, last_use, steps, ended, state: Mutex::new(state) }
+        Self { owner, id, policy, opened_at, clock, last_use, steps, ended, state: Mutex::new(state) }
     }
 
     /// The policy version that the session is pinned to.
@@ -231,6 +234,7 @@ impl Session {
     /// Describes the session.
     pub fn info(&self, ttl: Duration) -> SessionInfo {
         SessionInfo {
+            owner: self.owner.clone(),
             id: self.id.clone(),
             policy: self.policy.reference.clone(),
             steps: self.steps.load(Ordering::Relaxed),
@@ -243,6 +247,10 @@ impl Session {
 impl TableEntry for Session {
     const KIND: &'static str = "session";
     const EXPIRED: ErrorCode = ErrorCode::SessionExpired;
+
+    fn owner(&self) -> &Owner {
+        &self.owner
+    }
 
     fn id(&self) -> &str {
         &self.id

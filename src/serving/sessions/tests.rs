@@ -79,8 +79,8 @@ async fn step_once(session: &Session, step: Option<u64>, run: Option<&str>) -> R
 #[tokio::test]
 async fn steps_are_sequential_and_the_last_may_be_repeated() {
     let (sessions, _) = sessions(10);
-    sessions.open(policy("p"), SessionOptions { seed: Some(0), ..named("s") }).await.unwrap();
-    let s = sessions.get("s").unwrap();
+    sessions.open(&Owner::NOBODY, policy("p"), SessionOptions { seed: Some(0), ..named("s") }).await.unwrap();
+    let s = sessions.get(&Owner::NOBODY, "s").unwrap();
     assert_eq!(step_once(&s, Some(1), None).await, Err("wrong_step"));
     assert_eq!(step_once(&s, Some(0), None).await, Ok((0, vec![1.0; 2])));
     assert_eq!(step_once(&s, Some(0), None).await, Ok((0, vec![1.0; 2])));
@@ -90,14 +90,17 @@ async fn steps_are_sequential_and_the_last_may_be_repeated() {
     for wrong in [0, 1, 4, u64::MAX] {
         assert_eq!(step_once(&s, Some(wrong), None).await, Err("wrong_step"), "{wrong}");
     }
-    assert_eq!(sessions.describe("s").unwrap().steps, 3);
+    assert_eq!(sessions.describe(&Owner::NOBODY, "s").unwrap().steps, 3);
 }
 
 #[tokio::test]
 async fn dropped_step_leaves_the_session_unchanged() {
     let (sessions, _) = sessions(10);
-    sessions.open(policy("p"), SessionOptions { seed: Some(0), run_id: Some("r1".into()), ..named("s") }).await.unwrap();
-    let s = sessions.get("s").unwrap();
+    sessions
+        .open(&Owner::NOBODY, policy("p"), SessionOptions { seed: Some(0), run_id: Some("r1".into()), ..named("s") })
+        .await
+        .unwrap();
+    let s = sessions.get(&Owner::NOBODY, "s").unwrap();
     step_once(&s, Some(0), None).await.unwrap();
     drop(s.begin_step(&fleet(["a", "b"]), Some(1), None).await.unwrap());
     drop(s.begin_step(&fleet(["c", "d"]), Some(0), Some("r2")).await.unwrap());
@@ -108,8 +111,11 @@ async fn dropped_step_leaves_the_session_unchanged() {
 #[tokio::test]
 async fn new_run_restarts_the_session_and_fences_the_former_run() {
     let (sessions, _) = sessions(10);
-    sessions.open(policy("p"), SessionOptions { seed: Some(0), run_id: Some("r1".into()), ..named("s") }).await.unwrap();
-    let s = sessions.get("s").unwrap();
+    sessions
+        .open(&Owner::NOBODY, policy("p"), SessionOptions { seed: Some(0), run_id: Some("r1".into()), ..named("s") })
+        .await
+        .unwrap();
+    let s = sessions.get(&Owner::NOBODY, "s").unwrap();
     step_once(&s, Some(0), Some("r1")).await.unwrap();
     step_once(&s, Some(1), Some("r1")).await.unwrap();
     assert_eq!(step_once(&s, Some(2), Some("r2")).await, Err("wrong_step"));
@@ -119,17 +125,17 @@ async fn new_run_restarts_the_session_and_fences_the_former_run() {
     assert_eq!(step_once(&s, Some(0), Some("r1")).await, Err("run_fenced"));
     assert_eq!(step_once(&s, Some(1), None).await, Ok((1, vec![2.0; 2])), "without run_id, the current run continues");
     let restarted = SessionOptions { seed: Some(7), run_id: Some("r3".into()), ..named("s") };
-    assert_eq!(sessions.open(policy("p"), restarted).await.unwrap().steps, 0);
+    assert_eq!(sessions.open(&Owner::NOBODY, policy("p"), restarted).await.unwrap().steps, 0);
     assert_eq!(step_once(&s, Some(0), Some("r3")).await, Ok((0, vec![8.0; 2])));
     let fenced = SessionOptions { run_id: Some("r2".into()), ..named("s") };
-    assert_eq!(code(&sessions.open(policy("p"), fenced).await.unwrap_err()), "run_fenced");
+    assert_eq!(code(&sessions.open(&Owner::NOBODY, policy("p"), fenced).await.unwrap_err()), "run_fenced");
 }
 
 #[tokio::test]
 async fn ids_of_a_run_may_not_change() {
     let (sessions, _) = sessions(10);
-    sessions.open(policy("p"), named("s")).await.unwrap();
-    let s = sessions.get("s").unwrap();
+    sessions.open(&Owner::NOBODY, policy("p"), named("s")).await.unwrap();
+    let s = sessions.get(&Owner::NOBODY, "s").unwrap();
     step_once(&s, None, None).await.unwrap();
     let other = s.begin_step(&fleet(["a", "c"]), None, None).await.map(|_| ()).unwrap_err();
     assert!(matches!(&other, Error::Invalid(e) if e.field == "uavs" && e.value.as_deref() == Some("\"c\" instead of \"b\"")));
@@ -139,59 +145,59 @@ async fn ids_of_a_run_may_not_change() {
 #[tokio::test]
 async fn opening_twice_is_a_retry_only_with_equal_options() {
     let (sessions, _) = sessions(10);
-    let first = sessions.open(policy("p"), named("s")).await.unwrap();
-    assert_eq!(sessions.open(policy("p"), named("s")).await.unwrap(), first);
-    assert_eq!(code(&sessions.open(policy("q"), named("s")).await.unwrap_err()), "exists");
+    let first = sessions.open(&Owner::NOBODY, policy("p"), named("s")).await.unwrap();
+    assert_eq!(sessions.open(&Owner::NOBODY, policy("p"), named("s")).await.unwrap(), first);
+    assert_eq!(code(&sessions.open(&Owner::NOBODY, policy("q"), named("s")).await.unwrap_err()), "exists");
     let seeded = SessionOptions { seed: Some(1), ..named("s") };
-    assert_eq!(code(&sessions.open(policy("p"), seeded).await.unwrap_err()), "exists");
-    step_once(&sessions.get("s").unwrap(), None, None).await.unwrap();
-    assert_eq!(code(&sessions.open(policy("p"), named("s")).await.unwrap_err()), "exists");
-    assert_ne!(sessions.open(policy("p"), SessionOptions::default()).await.unwrap().id, "s");
+    assert_eq!(code(&sessions.open(&Owner::NOBODY, policy("p"), seeded).await.unwrap_err()), "exists");
+    step_once(&sessions.get(&Owner::NOBODY, "s").unwrap(), None, None).await.unwrap();
+    assert_eq!(code(&sessions.open(&Owner::NOBODY, policy("p"), named("s")).await.unwrap_err()), "exists");
+    assert_ne!(sessions.open(&Owner::NOBODY, policy("p"), SessionOptions::default()).await.unwrap().id, "s");
 }
 
 #[tokio::test]
 async fn idle_session_expires_with_its_own_error() {
     let (sessions, pass) = sessions(2);
-    sessions.open(policy("p"), named("s")).await.unwrap();
+    sessions.open(&Owner::NOBODY, policy("p"), named("s")).await.unwrap();
     pass(600);
-    sessions.get("s").unwrap();
+    sessions.get(&Owner::NOBODY, "s").unwrap();
     pass(599);
-    sessions.get("s").unwrap();
+    sessions.get(&Owner::NOBODY, "s").unwrap();
     pass(601);
-    assert_eq!(code(&sessions.get("s").unwrap_err()), "session_expired");
-    assert_eq!(code(&sessions.close("s").await.unwrap_err()), "session_expired");
-    assert_eq!(code(&sessions.get("never").unwrap_err()), "unknown");
-    sessions.open(policy("p"), named("s")).await.unwrap();
-    assert!(sessions.get("s").is_ok(), "a name may be used again");
-    sessions.close("s").await.unwrap();
-    assert_eq!(code(&sessions.get("s").unwrap_err()), "unknown");
+    assert_eq!(code(&sessions.get(&Owner::NOBODY, "s").unwrap_err()), "session_expired");
+    assert_eq!(code(&sessions.close(&Owner::NOBODY, "s").await.unwrap_err()), "session_expired");
+    assert_eq!(code(&sessions.get(&Owner::NOBODY, "never").unwrap_err()), "unknown");
+    sessions.open(&Owner::NOBODY, policy("p"), named("s")).await.unwrap();
+    assert!(sessions.get(&Owner::NOBODY, "s").is_ok(), "a name may be used again");
+    sessions.close(&Owner::NOBODY, "s").await.unwrap();
+    assert_eq!(code(&sessions.get(&Owner::NOBODY, "s").unwrap_err()), "unknown");
 }
 
 #[tokio::test]
 async fn corrected_wall_time_neither_expires_nor_keeps_sessions() {
     let time = ManualClock::new(Timestamp::UNIX_EPOCH);
     let sessions = Sessions::new(Limits { ttl: Duration::from_secs(600), max: 2 }, time.clock());
-    sessions.open(policy("p"), named("s")).await.unwrap();
+    sessions.open(&Owner::NOBODY, policy("p"), named("s")).await.unwrap();
     time.set_wall(Timestamp::from_second(1_000_000).unwrap());
-    sessions.get("s").unwrap();
+    sessions.get(&Owner::NOBODY, "s").unwrap();
     time.advance(Duration::from_secs(601));
     time.set_wall(Timestamp::UNIX_EPOCH);
-    assert_eq!(code(&sessions.get("s").unwrap_err()), "session_expired");
+    assert_eq!(code(&sessions.get(&Owner::NOBODY, "s").unwrap_err()), "session_expired");
 }
 
 #[tokio::test]
 async fn numbers_of_open_and_of_expired_sessions_are_bounded() {
     let (sessions, pass) = sessions(2);
-    sessions.open(policy("p"), named("a")).await.unwrap();
-    sessions.open(policy("p"), named("b")).await.unwrap();
-    assert_eq!(code(&sessions.open(policy("p"), named("c")).await.unwrap_err()), "busy");
+    sessions.open(&Owner::NOBODY, policy("p"), named("a")).await.unwrap();
+    sessions.open(&Owner::NOBODY, policy("p"), named("b")).await.unwrap();
+    assert_eq!(code(&sessions.open(&Owner::NOBODY, policy("p"), named("c")).await.unwrap_err()), "busy");
     pass(601);
-    sessions.open(policy("p"), named("c")).await.unwrap();
+    sessions.open(&Owner::NOBODY, policy("p"), named("c")).await.unwrap();
     assert_eq!(sessions.len(), 1, "idle sessions were removed");
     pass(601);
     sessions.remove_expired();
     assert!(sessions.is_empty());
-    let codes = ["a", "b", "c"].map(|id| code(&sessions.get(id).unwrap_err()));
+    let codes = ["a", "b", "c"].map(|id| code(&sessions.get(&Owner::NOBODY, id).unwrap_err()));
     assert_eq!(codes.iter().filter(|c| **c == "session_expired").count(), 2);
     assert_eq!(codes[2], "session_expired", "the newest expired name is remembered");
 }
@@ -199,8 +205,8 @@ async fn numbers_of_open_and_of_expired_sessions_are_bounded() {
 #[tokio::test]
 async fn step_of_a_closed_session_is_rejected() {
     let (sessions, _) = sessions(2);
-    sessions.open(policy("p"), named("s")).await.unwrap();
-    let s = sessions.get("s").unwrap();
-    sessions.close("s").await.unwrap();
+    sessions.open(&Owner::NOBODY, policy("p"), named("s")).await.unwrap();
+    let s = sessions.get(&Owner::NOBODY, "s").unwrap();
+    sessions.close(&Owner::NOBODY, "s").await.unwrap();
     assert_eq!(step_once(&s, None, None).await, Err("unknown"));
 }

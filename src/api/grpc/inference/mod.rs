@@ -11,9 +11,10 @@ use tonic::{Request, Response, Status, Streaming};
 
 use self::messages::{config, final_response, infer_request, infer_response, metadata};
 use super::{GrpcResult, deadline, stream};
-use crate::api::auth::StreamCaller;
+use crate::api::auth::{caller, count_message};
 use crate::api::errors::act_error;
 use crate::api::oip;
+use crate::service::keys::Caller;
 use crate::service::{App, Error};
 use crate::wire::oip as wire;
 use crate::wire::oip::grpc_inference_service_server::{GrpcInferenceService, GrpcInferenceServiceServer};
@@ -28,22 +29,24 @@ struct Service(Arc<App>);
 
 async fn infer(
     app: &App,
+    caller: &Caller,
     request: wire::ModelInferRequest,
     deadline: Option<Instant>,
 ) -> Result<wire::ModelInferResponse, Error> {
-    Ok(infer_response(oip::infer(app, infer_request(request)?, deadline).await?))
+    Ok(infer_response(oip::infer(app, caller, infer_request(request)?, deadline).await?))
 }
 
 /// The response to one request of a stream. `counted` refuses the request if the caller exceeds its rate.
 async fn infer_in_stream(
     app: &App,
+    caller: &Caller,
     request: wire::ModelInferRequest,
     counted: Result<(), Error>,
     deadline: Option<Instant>,
 ) -> wire::ModelStreamInferResponse {
     let (model_name, id) = (request.model_name.clone(), request.id.clone());
     let inferred = match counted {
-        Ok(()) => infer(app, request, deadline).await,
+        Ok(()) => infer(app, caller, request, deadline).await,
         Err(busy) => Err(busy),
     };
     let (error_message, mut response) = match inferred {
@@ -89,8 +92,8 @@ impl GrpcInferenceService for Service {
     }
 
     async fn model_infer(&self, request: Request<wire::ModelInferRequest>) -> GrpcResult<wire::ModelInferResponse> {
-        let deadline = deadline(request.extensions());
-        Ok(Response::new(infer(&self.0, request.into_inner(), deadline).await?))
+        let (deadline, caller) = (deadline(request.extensions()), caller(request.extensions()));
+        Ok(Response::new(infer(&self.0, &caller, request.into_inner(), deadline).await?))
     }
 
     type ModelStreamInferStream = BoxStream<'static, Result<wire::ModelStreamInferResponse, Status>>;
@@ -99,13 +102,13 @@ impl GrpcInferenceService for Service {
         &self,
         request: Request<Streaming<wire::ModelInferRequest>>,
     ) -> GrpcResult<Self::ModelStreamInferStream> {
-        let (deadline, caller) = (deadline(request.extensions()), StreamCaller::new(request.extensions()));
+        let (deadline, caller) = (deadline(request.extensions()), caller(request.extensions()));
         let app = self.0.clone();
         let requests = stream::requests(app.clone(), request.into_inner());
         // One after another, because the slots of a sequence need not have steps.
         let responses = requests.then(move |request| {
-            let (app, counted) = (app.clone(), caller.count_message(&app));
-            async move { Ok(infer_in_stream(&app, request?, counted?, deadline).await) }
+            let (app, caller, counted) = (app.clone(), caller.clone(), count_message(&caller, &app));
+            async move { Ok(infer_in_stream(&app, &caller, request?, counted?, deadline).await) }
         });
         Ok(Response::new(responses.boxed()))
     }

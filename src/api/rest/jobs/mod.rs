@@ -16,6 +16,7 @@ use super::extract::{Json, Path, Query};
 use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
 use super::schemas;
 use crate::invalid::Invalid;
+use crate::service::keys::Caller;
 use crate::service::{App, Error, PageRequest, checkpoints, jobs};
 use crate::store::{JobAction, JobState};
 pub(super) use types::MetricRow;
@@ -67,7 +68,12 @@ pub(super) struct JobPath {
         BadBody, Conflict, Draining
     )
 )]
-async fn submit(State(app): AppState, headers: HeaderMap, Json(request): Json<JobRequest>) -> Result<Response, Error> {
+async fn submit(
+    State(app): AppState,
+    caller: Caller,
+    headers: HeaderMap,
+    Json(request): Json<JobRequest>,
+) -> Result<Response, Error> {
     const KEY: HeaderName = HeaderName::from_static("idempotency-key");
     let key = match headers.get(KEY) {
         None => None,
@@ -76,7 +82,7 @@ async fn submit(State(app): AppState, headers: HeaderMap, Json(request): Json<Jo
             Err(_) => return Err(Invalid::new("idempotency-key", format!("{value:?}"), "ASCII").into()),
         },
     };
-    let (job, new) = jobs::submit(&app, request.into(), key).await?;
+    let (job, new) = jobs::submit(&app, &caller, request.into(), key).await?;
     let location = (header::LOCATION, format!("/v1/jobs/{}", job.id));
     let replayed = (HeaderName::from_static("idempotency-replayed"), (!new).to_string());
     // The status is the one of the first response, which the caller of a retry did not receive.
@@ -112,9 +118,9 @@ struct JobPage {
     get, path = "/v1/jobs", operation_id = "listJobs", tag = "jobs", params(ListQuery),
     responses((status = 200, description = "A page of jobs.", body = JobPage), BadRequest)
 )]
-async fn list(State(app): AppState, Query(query): Query<ListQuery>) -> Result<axum::Json<JobPage>, Error> {
+async fn list(State(app): AppState, caller: Caller, Query(query): Query<ListQuery>) -> Result<axum::Json<JobPage>, Error> {
     let ListQuery { state, page_size, page_token } = query;
-    let page = jobs::list(&app, state, &PageRequest { size: page_size, token: page_token }).await?.map(Into::into);
+    let page = jobs::list(&app, &caller, state, &PageRequest { size: page_size, token: page_token }).await?.map(Into::into);
     Ok(axum::Json(JobPage { jobs: page.items, next_page_token: page.next_token }))
 }
 
@@ -123,8 +129,8 @@ async fn list(State(app): AppState, Query(query): Query<ListQuery>) -> Result<ax
     get, path = "/v1/jobs/{id}", operation_id = "getJob", tag = "jobs", params(JobPath),
     responses((status = 200, description = "The job.", body = Job), BadRequest, NotFound)
 )]
-async fn get(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Job>, Error> {
-    Ok(axum::Json(jobs::get(&app, &id).await?.into()))
+async fn get(State(app): AppState, caller: Caller, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Job>, Error> {
+    Ok(axum::Json(jobs::get(&app, &caller, &id).await?.into()))
 }
 
 /// Delete a job that has ended
@@ -132,8 +138,8 @@ async fn get(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Resul
     delete, path = "/v1/jobs/{id}", operation_id = "deleteJob", tag = "jobs", params(JobPath),
     responses((status = 204, description = "The job is deleted."), BadRequest, NotFound, Conflict)
 )]
-async fn delete(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Result<StatusCode, Error> {
-    jobs::change(&app, &id, JobAction::Delete).await?;
+async fn delete(State(app): AppState, caller: Caller, Path(JobPath { id }): Path<JobPath>) -> Result<StatusCode, Error> {
+    jobs::change(&app, &caller, &id, JobAction::Delete).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 
@@ -142,8 +148,8 @@ async fn delete(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Re
     post, path = "/v1/jobs/{id}/cancel", operation_id = "cancelJob", tag = "jobs", params(JobPath),
     responses((status = 200, description = "The job.", body = Job), BadRequest, NotFound, Conflict)
 )]
-async fn cancel(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Job>, Error> {
-    Ok(axum::Json(jobs::change(&app, &id, JobAction::Cancel).await?.into()))
+async fn cancel(State(app): AppState, caller: Caller, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Job>, Error> {
+    Ok(axum::Json(jobs::change(&app, &caller, &id, JobAction::Cancel).await?.into()))
 }
 
 /// Pause a job; a running job saves a snapshot first
@@ -151,8 +157,8 @@ async fn cancel(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Re
     post, path = "/v1/jobs/{id}/pause", operation_id = "pauseJob", tag = "jobs", params(JobPath),
     responses((status = 200, description = "The job.", body = Job), BadRequest, NotFound, Conflict)
 )]
-async fn pause(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Job>, Error> {
-    Ok(axum::Json(jobs::change(&app, &id, JobAction::Pause).await?.into()))
+async fn pause(State(app): AppState, caller: Caller, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Job>, Error> {
+    Ok(axum::Json(jobs::change(&app, &caller, &id, JobAction::Pause).await?.into()))
 }
 
 /// Put a paused job back into the queue; it continues from its snapshot
@@ -160,8 +166,8 @@ async fn pause(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Res
     post, path = "/v1/jobs/{id}/resume", operation_id = "resumeJob", tag = "jobs", params(JobPath),
     responses((status = 200, description = "The job.", body = Job), BadRequest, NotFound, Conflict, Draining)
 )]
-async fn resume(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Job>, Error> {
-    Ok(axum::Json(jobs::change(&app, &id, JobAction::Resume).await?.into()))
+async fn resume(State(app): AppState, caller: Caller, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Job>, Error> {
+    Ok(axum::Json(jobs::change(&app, &caller, &id, JobAction::Resume).await?.into()))
 }
 
 #[derive(Clone, Copy, Default, Deserialize, ToSchema)]
@@ -215,12 +221,13 @@ struct MetricPage {
 )]
 async fn metrics(
     State(app): AppState,
+    caller: Caller,
     Path(JobPath { id }): Path<JobPath>,
     Query(query): Query<MetricsQuery>,
 ) -> Result<Response, Error> {
     let MetricsQuery { name, format, page_size, page_token } = query;
     let mut request = PageRequest { size: page_size, token: page_token };
-    let mut page = jobs::metrics(&app, &id, name.as_deref(), &request).await?;
+    let mut page = jobs::metrics(&app, &caller, &id, name.as_deref(), &request).await?;
     if let Format::Json = format {
         let page = page.map(Into::into);
         return Ok(axum::Json(MetricPage { metrics: page.items, next_page_token: page.next_token }).into_response());
@@ -228,7 +235,7 @@ async fn metrics(
     // CSV has all rows unless the request sets a page size.
     while page_size == 0 && !page.next_token.is_empty() {
         request.token = std::mem::take(&mut page.next_token);
-        let more = jobs::metrics(&app, &id, name.as_deref(), &request).await?;
+        let more = jobs::metrics(&app, &caller, &id, name.as_deref(), &request).await?;
         page.items.extend(more.items);
         page.next_token = more.next_token;
     }
@@ -249,8 +256,12 @@ struct Checkpoints {
     get, path = "/v1/jobs/{id}/checkpoints", operation_id = "listCheckpoints", tag = "jobs", params(JobPath),
     responses((status = 200, description = "The best and the last checkpoint.", body = Checkpoints), BadRequest, NotFound)
 )]
-async fn checkpoints(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Checkpoints>, Error> {
-    let checkpoints = jobs::checkpoints(&app, &id).await?.into_iter().map(Into::into).collect();
+async fn checkpoints(
+    State(app): AppState,
+    caller: Caller,
+    Path(JobPath { id }): Path<JobPath>,
+) -> Result<axum::Json<Checkpoints>, Error> {
+    let checkpoints = jobs::checkpoints(&app, &caller, &id).await?.into_iter().map(Into::into).collect();
     Ok(axum::Json(Checkpoints { checkpoints }))
 }
 
@@ -264,8 +275,8 @@ struct Attempts {
     get, path = "/v1/jobs/{id}/logs", operation_id = "listJobLogs", tag = "jobs", params(JobPath),
     responses((status = 200, description = "All attempts.", body = Attempts), BadRequest, NotFound)
 )]
-async fn logs(State(app): AppState, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Attempts>, Error> {
-    let attempts = jobs::logs(&app, &id).await?.into_iter().map(Into::into).collect();
+async fn logs(State(app): AppState, caller: Caller, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Attempts>, Error> {
+    let attempts = jobs::logs(&app, &caller, &id).await?.into_iter().map(Into::into).collect();
     Ok(axum::Json(Attempts { attempts }))
 }
 
@@ -292,8 +303,12 @@ struct CheckpointPath {
         BadRequest, NotFound
     )
 )]
-async fn checkpoint(State(app): AppState, Path(CheckpointPath { id }): Path<CheckpointPath>) -> Result<Response, Error> {
-    let (checkpoint, bytes) = checkpoints::get(&app, &id).await?;
+async fn checkpoint(
+    State(app): AppState,
+    caller: Caller,
+    Path(CheckpointPath { id }): Path<CheckpointPath>,
+) -> Result<Response, Error> {
+    let (checkpoint, bytes) = checkpoints::get(&app, &caller, &id).await?;
     let headers = [
         (header::CONTENT_TYPE, "application/octet-stream".to_owned()),
         (header::ETAG, format!("\"{}\"", checkpoint.sha256)),

@@ -18,6 +18,7 @@ use super::extract::{Path, Raw, parse};
 use crate::api::convert::tensors::TensorShape;
 use crate::api::errors::Problem;
 use crate::api::oip;
+use crate::service::keys::Caller;
 use crate::service::{App, Error};
 
 /// Header with the length of the JSON before the binary data, in requests and responses.
@@ -132,12 +133,18 @@ async fn config(State(app): Shared, Path(path): Path<ModelPath>) -> Result<Json<
     })))
 }
 
-async fn infer(State(app): Shared, Path(path): Path<ModelPath>, headers: HeaderMap, Raw(body): Raw) -> Result<Response, Error> {
+async fn infer(
+    State(app): Shared,
+    caller: Caller,
+    Path(path): Path<ModelPath>,
+    headers: HeaderMap,
+    Raw(body): Raw,
+) -> Result<Response, Error> {
     let ModelPath { model, version } = path;
     let large = body.len() > LARGE;
     let decode = move || request::decode(&headers, body, model, version);
     let (request, binary) = if large { tokio::task::spawn_blocking(decode).await.map_err(Error::internal)?? } else { decode()? };
-    Ok(response::encode(oip::infer(&app, request, None).await?, &binary))
+    Ok(response::encode(oip::infer(&app, &caller, request, None).await?, &binary))
 }
 
 #[derive(Debug, Default, Deserialize)]
