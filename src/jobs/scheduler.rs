@@ -209,10 +209,10 @@ impl Scheduler {
             let ended = async {
                 self.0.store.store_log(lease, &text).await?;
                 let (max_attempts, now) = (self.0.config.max_attempts, self.0.clock.now());
-                self.0.store.end_attempt(EndedAttempt { lease, result, policy: None, max_attempts, now }).await
+                self.0.store.end_attempt(EndedAttempt { lease, result, publish: None, max_attempts, now }).await
             };
             match ended.await {
-                Ok(Some(job)) => {
+                Ok(Some((job, _))) => {
                     tracing::warn!(state = %job.state, reason = job.reason, "the worker ended without reporting a result");
                     return;
                 }

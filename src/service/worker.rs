@@ -9,7 +9,7 @@ use crate::error_code::ErrorCode;
 use crate::invalid::{Invalid, in_range};
 use crate::jobs::{Directive, equal_secrets, token_digest};
 use crate::store::{
-    EndedAttempt, JobId, Lease, Metric, NewCheckpoint, PartialSnapshot, PendingAction, Snapshot, WorkerResult, is_metric_name,
+    EndedAttempt, Job, JobId, Lease, Metric, NewCheckpoint, PartialSnapshot, Snapshot, WorkerResult, is_metric_name,
 };
 use crate::train_config::TrainConfig;
 
@@ -132,46 +132,50 @@ pub async fn heartbeat(app: &App, lease: Lease) -> Result<Directive, Error> {
     Ok(app.scheduler.directive(job.pending_action))
 }
 
-/// Ends the attempt. The best policy of a job that succeeds is published.
+/// Ends the attempt. The best policy of a job that succeeds is published in the same transaction, so no job is cancelled with a
+/// published policy, and none succeeds without one.
 ///
 /// # Errors
 /// [`Error::Precondition`] when the attempt has ended, [`Error::Internal`] when the database fails.
 pub async fn finish(app: &App, lease: Lease, result: WorkerResult) -> Result<(), Error> {
-    let (result, policy) = match result {
-        WorkerResult::Succeeded => publish_best(app, lease).await?,
-        WorkerResult::Stopped => (WorkerResult::Stopped, None),
+    let job = match result {
+        WorkerResult::Succeeded => match new_version(app, lease).await {
+            Ok(Some(version)) => policies::publish_and_end(app, version, lease).await?,
+            Ok(None) => end(app, lease, &WorkerResult::Succeeded).await?,
+            // Another attempt would fail with the same checkpoint.
+            Err(Error::Invalid(e)) => {
+                let reason = format!("the policy cannot be published: {e}");
+                end(app, lease, &WorkerResult::Failed { reason, permanent: true }).await?
+            }
+            Err(e) => return Err(e),
+        },
+        WorkerResult::Stopped => end(app, lease, &WorkerResult::Stopped).await?,
         WorkerResult::Failed { reason, permanent } => {
-            (WorkerResult::Failed { reason: reason.chars().take(2000).collect(), permanent }, None)
+            let reason = reason.chars().take(2000).collect();
+            end(app, lease, &WorkerResult::Failed { reason, permanent }).await?
         }
     };
-    let max_attempts = app.scheduler.config().max_attempts;
-    let ended = EndedAttempt { lease, result: &result, policy: policy.as_deref(), max_attempts, now: app.clock.now() };
-    let job = app.store.end_attempt(ended).await?.ok_or_else(|| attempt_ended(lease))?;
+    let job = job.ok_or_else(|| attempt_ended(lease))?;
     tracing::info!(job = %job.id, attempt = lease.attempt, state = %job.state, reason = job.reason, "attempt ended");
     app.scheduler.job_changed(lease.job_row);
     Ok(())
 }
 
-/// Publishes the best policy of a job, unless the job is being cancelled. Publishing the same policy again changes nothing,
-/// so a server that stops between publishing and ending the attempt loses nothing.
-async fn publish_best(app: &App, lease: Lease) -> Result<(WorkerResult, Option<String>), Error> {
+/// Ends the attempt without publishing anything.
+async fn end(app: &App, lease: Lease, result: &WorkerResult) -> Result<Option<Job>, Error> {
+    let max_attempts = app.scheduler.config().max_attempts;
+    let ended = EndedAttempt { lease, result, publish: None, max_attempts, now: app.clock.now() };
+    Ok(app.store.end_attempt(ended).await?.map(|(job, _)| job))
+}
+
+/// The best policy of a job, under the name that it is published as; `None` if the job has no checkpoint.
+async fn new_version(app: &App, lease: Lease) -> Result<Option<policies::NewVersion>, Error> {
     let job = app.store.job(lease.job_id).await?.ok_or_else(|| attempt_ended(lease))?;
-    if job.pending_action == Some(PendingAction::Cancel) {
-        return Ok((WorkerResult::Stopped, None));
-    }
-    let Some(checkpoint) = app.store.best_checkpoint(lease.job_id).await? else { return Ok((WorkerResult::Succeeded, None)) };
+    let Some(checkpoint) = app.store.best_checkpoint(lease.job_id).await? else { return Ok(None) };
     // The end of an id is random. Its beginning is the time, which jobs submitted together share.
     let id = lease.job_id.to_string();
     let name = job.spec.name.unwrap_or_else(|| format!("job-{}", &id[id.len() - 8..]));
-    match policies::publish_bytes(app, &name, checkpoint).await {
-        Ok(policy) => Ok((WorkerResult::Succeeded, Some(policy.to_string()))),
-        // Another attempt would fail with the same checkpoint.
-        Err(Error::Invalid(e)) => {
-            let reason = format!("the policy cannot be published: {e}");
-            Ok((WorkerResult::Failed { reason, permanent: true }, None))
-        }
-        Err(e) => Err(e),
-    }
+    policies::NewVersion::from_bytes(&name, checkpoint).await.map(Some)
 }
 
 /// Size and digest that an upload declares.

@@ -6,6 +6,7 @@ use sqlx::SqliteConnection;
 
 use super::jobs::{Transition, find, transition};
 use super::named_enum::named_enum;
+use super::policies::{NewPolicyVersion, PublishedPolicy, publish};
 use super::{Job, JobId, JobState, PendingAction, Result, Store, corrupt, timestamp};
 
 named_enum! {
@@ -70,8 +71,8 @@ pub struct EndedAttempt<'a> {
     pub lease: Lease,
     /// How it ended.
     pub result: &'a WorkerResult,
-    /// `NAME:VERSION` under which its policy was published.
-    pub policy: Option<&'a str>,
+    /// The policy to publish if the job succeeds, in the same transaction.
+    pub publish: Option<NewPolicyVersion<'a>>,
     /// Failed attempts after which the job has failed.
     pub max_attempts: u32,
     /// When it ended.
@@ -113,9 +114,10 @@ pub(super) async fn is_active(db: &mut SqliteConnection, lease: Lease) -> Result
     Ok(sqlx::query(sql).bind(lease.job_row).bind(lease.attempt).fetch_optional(&mut *db).await?.is_some())
 }
 
-/// Ends an attempt and changes the state of its job. Does nothing if the attempt has already ended.
-async fn end(db: &mut SqliteConnection, ended: EndedAttempt<'_>) -> Result<Option<Job>> {
-    let EndedAttempt { lease, result, policy, max_attempts, now } = ended;
+/// Ends an attempt and changes the state of its job; publishes the policy of a job that succeeds. Does nothing if the attempt
+/// has already ended.
+async fn end(db: &mut SqliteConnection, ended: EndedAttempt<'_>) -> Result<Option<(Job, Option<PublishedPolicy>)>> {
+    let EndedAttempt { lease, result, publish: policy, max_attempts, now } = ended;
     if !is_active(db, lease).await? {
         return Ok(None);
     }
@@ -149,11 +151,16 @@ async fn end(db: &mut SqliteConnection, ended: EndedAttempt<'_>) -> Result<Optio
         .execute(&mut *db)
         .await?;
     let failed = i64::from(outcome == AttemptOutcome::Failed);
-    let policy = policy.filter(|_| state == JobState::Succeeded);
+    let (mut name, mut published) = (None, None);
+    if let Some(policy) = policy.filter(|_| state == JobState::Succeeded) {
+        let new = publish(db, policy).await?;
+        name = Some(format!("{}:{}", policy.name, new.version));
+        published = Some(new);
+    }
     let sql = "UPDATE jobs SET failures = failures + ?2, policy = coalesce(?3, policy) WHERE number = ?1";
-    sqlx::query(sql).bind(lease.job_row).bind(failed).bind(policy).execute(&mut *db).await?;
+    sqlx::query(sql).bind(lease.job_row).bind(failed).bind(name).execute(&mut *db).await?;
     transition(db, Transition { job: lease.job_row, to: state, attempt: lease.attempt, reason, now }).await?;
-    find(db, lease.job_id).await
+    Ok(find(db, lease.job_id).await?.map(|job| (job, published)))
 }
 
 impl Store {
@@ -183,17 +190,18 @@ impl Store {
         Ok(Some(lease))
     }
 
-    /// Ends an attempt and changes the state of its job. Returns the job, or `None` if the attempt has already ended.
+    /// Ends an attempt, changes the state of its job, and publishes the policy if the job succeeds, in one transaction. Returns
+    /// the job and what was published, or `None` if the attempt has already ended.
     ///
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
-    pub async fn end_attempt(&self, ended: EndedAttempt<'_>) -> Result<Option<Job>> {
+    pub async fn end_attempt(&self, ended: EndedAttempt<'_>) -> Result<Option<(Job, Option<PublishedPolicy>)>> {
         let mut tx = self.begin().await?;
         let job_row = ended.lease.job_row;
-        let job = end(&mut tx, ended).await?;
+        let result = end(&mut tx, ended).await?;
         tx.commit().await?;
         self.notify(job_row);
-        Ok(job)
+        Ok(result)
     }
 
     /// Stores the last output of an attempt's worker.
@@ -219,8 +227,8 @@ impl Store {
             let id = JobId::parse(&id).ok_or_else(|| corrupt("job", &id, "not an id"))?;
             let lease = Lease { job_id: id, job_row: job, attempt: attempt as u32 };
             // A stopped attempt is not a failure, so the limit has no effect.
-            let ended = EndedAttempt { lease, result: &WorkerResult::Stopped, policy: None, max_attempts: u32::MAX, now };
-            jobs.extend(end(&mut tx, ended).await?);
+            let ended = EndedAttempt { lease, result: &WorkerResult::Stopped, publish: None, max_attempts: u32::MAX, now };
+            jobs.extend(end(&mut tx, ended).await?.map(|(job, _)| job));
         }
         sqlx::query("DELETE FROM snapshots WHERE sha256 IS NULL").execute(&mut *tx).await?;
         tx.commit().await?;

@@ -67,16 +67,7 @@ impl Store {
     /// [`Error`](super::Error) when the database fails.
     pub async fn publish_policy(&self, new: NewPolicyVersion<'_>) -> Result<PublishedPolicy, Error> {
         let mut tx = self.begin().await?;
-        let sql = "SELECT version, created_at FROM policy_versions WHERE name = ? AND digest = ?";
-        let known: Option<(i64, i64)> = sqlx::query_as(sql).bind(new.name).bind(new.digest).fetch_optional(&mut *tx).await?;
-        let published = match known {
-            Some((version, created_at)) => PublishedPolicy { version: version as u64, created_at, new: false },
-            None => insert(&mut tx, new).await?,
-        };
-        if let Some(alias) = new.alias {
-            let NewPolicyVersion { name, now: at, by, .. } = new;
-            move_alias(&mut tx, AliasMove { name, alias, to: Some(published.version), at, by }).await?;
-        }
+        let published = publish(&mut tx, new).await?;
         tx.commit().await?;
         Ok(published)
     }
@@ -134,6 +125,21 @@ impl Store {
         let rows: Vec<(String, i64)> = sqlx::query_as(sql).fetch_all(&self.read).await?;
         Ok(rows.into_iter().map(|(name, version)| (name, version as u64)).collect())
     }
+}
+
+/// Publishes a checkpoint as a new version, or finds the version of the policy with this digest, and moves the alias to it.
+pub(super) async fn publish(db: &mut SqliteConnection, new: NewPolicyVersion<'_>) -> Result<PublishedPolicy, Error> {
+    let sql = "SELECT version, created_at FROM policy_versions WHERE name = ? AND digest = ?";
+    let known: Option<(i64, i64)> = sqlx::query_as(sql).bind(new.name).bind(new.digest).fetch_optional(&mut *db).await?;
+    let published = match known {
+        Some((version, created_at)) => PublishedPolicy { version: version as u64, created_at, new: false },
+        None => insert(db, new).await?,
+    };
+    if let Some(alias) = new.alias {
+        let NewPolicyVersion { name, now: at, by, .. } = new;
+        move_alias(db, AliasMove { name, alias, to: Some(published.version), at, by }).await?;
+    }
+    Ok(published)
 }
 
 async fn insert(db: &mut SqliteConnection, new: NewPolicyVersion<'_>) -> Result<PublishedPolicy, Error> {

@@ -4,5 +4,6 @@ mod events;
 mod harness;
 mod processes;
 mod protocol;
+mod publishing;
 mod scheduling;
 mod submission;

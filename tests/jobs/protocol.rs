@@ -131,7 +131,7 @@ async fn snapshot_is_returned_unchanged_and_a_corrupt_upload_changes_nothing() {
     assert!(received == bytes);
 }
 
-async fn upload(server: &Server, worker: &Worker, kind: v1::CheckpointKind, step: u64, bytes: &[u8]) -> String {
+pub async fn upload(server: &Server, worker: &Worker, kind: v1::CheckpointKind, step: u64, bytes: &[u8]) -> String {
     use v1::upload_checkpoint_request::Part;
     let header = v1::CheckpointHeader {
         kind: kind.into(),

@@ -114,7 +114,7 @@ async fn a_checkpoint_of_a_job_is_published_by_its_id() {
     let bytes = mine.to_bytes();
     let new = NewCheckpoint { kind: CheckpointKind::Best, step: 1234, sha256: digest(&bytes), metrics: BTreeMap::new(), bytes };
     let id = store.store_checkpoint(lease, new, now).await.unwrap().unwrap();
-    let ended = EndedAttempt { lease, result: &WorkerResult::Succeeded, policy: None, max_attempts: 1, now };
+    let ended = EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: None, max_attempts: 1, now };
     store.end_attempt(ended).await.unwrap().unwrap();
     drop(store);
 

@@ -15,8 +15,10 @@ use crate::policy::baselines;
 use crate::policy::{Identity, ObservationKind, Policy};
 use crate::service::keys::Caller;
 use crate::service::{App, Error, checkpoints};
-use crate::serving::{LoadedPolicy, PolicyDetails, PolicyInfo, PolicyKind, PolicyRef, PolicySpec, VersionSelector, check_name};
-use crate::store::{NewPolicyVersion, PolicyVersion, Store};
+use crate::serving::{
+    LoadedPolicy, PolicyDetails, PolicyInfo, PolicyKind, PolicyRef, PolicySpec, Registry, VersionSelector, check_name,
+};
+use crate::store::{EndedAttempt, Job, Lease, NewPolicyVersion, PolicyVersion, PublishedPolicy, Store, WorkerResult};
 
 /// The checkpoint to publish.
 #[derive(Debug)]
@@ -56,7 +58,8 @@ pub fn check_publishable(name: &str) -> Result<(), Invalid> {
 /// # Errors
 /// [`Error::Invalid`] for a name or bytes that cannot be published, [`Error::Internal`] when the database fails.
 pub async fn publish_bytes(app: &App, name: &str, bytes: Vec<u8>) -> Result<PolicyRef, Error> {
-    let (reference, _) = store_version(app, name, CheckpointBytes { bytes, _permit: None }, None, None).await?;
+    let version = NewVersion::parse(name, CheckpointBytes { bytes, _permit: None }).await?;
+    let (reference, _) = version.publish(app, None, None).await?;
     Ok(reference)
 }
 
@@ -76,54 +79,91 @@ pub async fn publish(app: &App, caller: &Caller, request: PublishRequest) -> Res
         CheckpointSource::Bytes(bytes, permit) => CheckpointBytes { bytes, _permit: Some(permit) },
         CheckpointSource::Job(id) => CheckpointBytes { bytes: checkpoints::get(app, caller, &id).await?.1, _permit: None },
     };
-    let (reference, new) = store_version(app, &name, checkpoint, alias, caller.key_id().map(str::to_owned)).await?;
+    let by = caller.key_id().map(str::to_owned);
+    let (reference, new) = NewVersion::parse(&name, checkpoint).await?.publish(app, alias, by).await?;
     let spec = PolicySpec { name, version: VersionSelector::Version(reference.version) };
     Ok((app.registry.describe(&spec)?, new))
 }
 
-async fn store_version(
-    app: &App,
-    name: &str,
-    checkpoint: CheckpointBytes,
-    alias: Option<String>,
-    by: Option<String>,
-) -> Result<(PolicyRef, bool), Error> {
-    check_publishable(name)?;
-    let parsed = ParsedCheckpoint::parse(checkpoint).await?;
-    let mut reference = PolicyRef { name: name.to_owned(), version: 0, digest: parsed.digest };
-    let now = app.clock.now();
+/// Ends the attempt of a job that succeeded and publishes `version`, in one transaction. Nothing is published if the job is
+/// being cancelled. Returns the job, or `None` if the attempt has already ended.
+///
+/// # Errors
+/// [`Error::Internal`] when the database fails.
+pub(in crate::service) async fn publish_and_end(app: &App, version: NewVersion, lease: Lease) -> Result<Option<Job>, Error> {
+    let (max_attempts, now) = (app.scheduler.config().max_attempts, app.clock.now());
     one_at_a_time(app, async move |PolicyStores { store, registry }| {
-        let of_name = registry.versions_of(&reference.name);
-        let known = of_name.into_iter().find(|(info, _)| info.reference.digest == reference.digest);
-        if let Some(alias) = &alias {
-            check_alias(&registry, &reference.name, alias)?;
-            if let Some((info, false)) = &known {
-                return Err(unloaded(&info.reference));
+        let new = version.row(now, None, None);
+        let ended = EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: Some(new), max_attempts, now };
+        let Some((job, published)) = store.end_attempt(ended).await? else { return Ok(None) };
+        if let Some(published) = published {
+            version.register(&registry, published, None);
+        }
+        Ok(Some(job))
+    })
+    .await
+}
+
+/// A parsed checkpoint that is to become a version of policy `name`.
+pub(in crate::service) struct NewVersion {
+    name: String,
+    digest_hex: String,
+    parsed: ParsedCheckpoint,
+}
+
+impl NewVersion {
+    /// Checks the name and parses a checkpoint that is already in memory, such as the best one of a job.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] for a name or bytes that cannot be published.
+    pub(in crate::service) async fn from_bytes(name: &str, bytes: Vec<u8>) -> Result<Self, Error> {
+        Self::parse(name, CheckpointBytes { bytes, _permit: None }).await
+    }
+
+    async fn parse(name: &str, source: CheckpointBytes) -> Result<Self, Error> {
+        check_publishable(name)?;
+        let parsed = ParsedCheckpoint::parse(source).await?;
+        Ok(Self { name: name.to_owned(), digest_hex: hex::encode(parsed.digest), parsed })
+    }
+
+    fn row<'a>(&'a self, now: Timestamp, alias: Option<&'a str>, by: Option<&'a str>) -> NewPolicyVersion<'a> {
+        let (name, digest, checkpoint) = (&self.name, &self.digest_hex, &self.parsed.source.bytes);
+        NewPolicyVersion { name, digest, checkpoint, now, alias, by }
+    }
+
+    /// Publishes the version. Returns it, and whether it is new.
+    async fn publish(self, app: &App, alias: Option<String>, by: Option<String>) -> Result<(PolicyRef, bool), Error> {
+        let now = app.clock.now();
+        one_at_a_time(app, async move |PolicyStores { store, registry }| {
+            if let Some(alias) = &alias {
+                check_alias(&registry, &self.name, alias)?;
+                let of_name = registry.versions_of(&self.name);
+                let known = of_name.into_iter().find(|(info, _)| info.reference.digest == self.parsed.digest);
+                if let Some((info, false)) = &known {
+                    return Err(unloaded(&info.reference));
+                }
             }
+            let published = store.publish_policy(self.row(now, alias.as_deref(), by.as_deref())).await?;
+            Ok((self.register(&registry, published, alias.as_deref()), published.new))
+        })
+        .await
+    }
+
+    /// Adds the version to the registry, after it was committed to the database. A known version stays as it is: loaded or
+    /// unloaded.
+    fn register(self, registry: &Registry, published: PublishedPolicy, alias: Option<&str>) -> PolicyRef {
+        let reference = PolicyRef { name: self.name, version: published.version, digest: self.parsed.digest };
+        if !registry.versions_of(&reference.name).iter().any(|(info, _)| info.reference.version == published.version) {
+            registry.insert(self.parsed.into_policy(reference.clone(), published.created_at));
         }
-        let new = NewPolicyVersion {
-            name: &reference.name,
-            digest: &reference.digest_hex(),
-            checkpoint: &parsed.source.bytes,
-            now,
-            alias: alias.as_deref(),
-            by: by.as_deref(),
-        };
-        let published = store.publish_policy(new).await?;
-        reference.version = published.version;
-        // A known version stays as it is: loaded or unloaded.
-        if known.is_none() {
-            registry.insert(parsed.into_policy(reference.clone(), published.created_at));
-        }
-        if let Some(alias) = &alias {
+        if let Some(alias) = alias {
             registry.set_alias(&reference.name, alias, reference.version);
         }
         if published.new {
             tracing::info!(policy = %reference, digest = reference.digest_hex(), alias, "policy published");
         }
-        Ok((reference, published.new))
-    })
-    .await
+        reference
+    }
 }
 
 /// A checkpoint in memory, with the permit of its upload if it was uploaded.
