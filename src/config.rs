@@ -20,7 +20,7 @@ pub struct Config {
     pub data_dir: PathBuf,
     /// CPU budget: threads that all running jobs may use together.
     pub cpu_budget: usize,
-    /// Failed attempts after which a job fails.
+    /// Consecutive attempts that fail without progress after which a job fails.
     pub max_attempts: u32,
     /// Time between snapshots of a running job.
     pub snapshot_every: Duration,

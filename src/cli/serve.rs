@@ -41,7 +41,7 @@ pub struct ServeArgs {
     /// CPU budget: threads that all running training jobs may use together [default: all cores]
     #[arg(long, env = "QEDGIX_CPU_BUDGET", value_name = "THREADS")]
     cpu_budget: Option<usize>,
-    /// Failed attempts after which a job fails
+    /// Failed attempts, without a new snapshot between them, after which a job fails
     #[arg(long, env = "QEDGIX_MAX_ATTEMPTS", default_value_t = 3, value_name = "ATTEMPTS")]
     max_attempts: u32,
     /// Time between two snapshots of a running job; after a crash the job continues from its last snapshot

@@ -1,9 +1,10 @@
 //! Executors: the trait that starts workers, and its types.
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use futures::future::BoxFuture;
+use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
 use crate::store::Lease;
@@ -38,12 +39,20 @@ pub trait Executor: Send + Sync + 'static {
 
 /// The last part of a worker's output; cheap to clone.
 #[derive(Clone, Debug, Default)]
-pub struct LogTail(Arc<Mutex<Tail>>);
+pub struct LogTail(Arc<Shared>);
+
+#[derive(Debug, Default)]
+struct Shared {
+    tail: Mutex<Tail>,
+    /// Notified when output has arrived.
+    pushed: Notify,
+}
 
 #[derive(Debug, Default)]
 struct Tail {
     bytes: VecDeque<u8>,
-    truncated: bool,
+    /// Bytes that have ever arrived.
+    total: u64,
 }
 
 impl LogTail {
@@ -52,21 +61,36 @@ impl LogTail {
 
     /// Appends output. Beyond [`LogTail::LIMIT`] the oldest bytes are dropped.
     pub fn push(&self, bytes: &[u8]) {
-        let mut tail = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut tail = self.tail();
+        tail.total += bytes.len() as u64;
         tail.bytes.extend(bytes);
         let excess = tail.bytes.len().saturating_sub(Self::LIMIT);
-        if excess > 0 {
-            tail.truncated = true;
-            tail.bytes.drain(..excess);
-        }
+        tail.bytes.drain(..excess);
+        drop(tail);
+        self.0.pushed.notify_one();
+    }
+
+    /// Returns when output has arrived since the last call.
+    pub async fn pushed(&self) {
+        self.0.pushed.notified().await;
+    }
+
+    /// Number of bytes that have ever arrived.
+    pub fn total(&self) -> u64 {
+        self.tail().total
     }
 
     /// The kept output, from the beginning of a line.
     pub fn text(&self) -> String {
-        let tail = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let skip = if tail.truncated { tail.bytes.iter().position(|&b| b == b'\n').map_or(0, |i| i + 1) } else { 0 };
+        let tail = self.tail();
+        let truncated = tail.total > tail.bytes.len() as u64;
+        let skip = if truncated { tail.bytes.iter().position(|&b| b == b'\n').map_or(0, |i| i + 1) } else { 0 };
         let bytes: Vec<u8> = tail.bytes.iter().skip(skip).copied().collect();
         String::from_utf8_lossy(&bytes).replace('\0', "\u{fffd}")
+    }
+
+    fn tail(&self) -> MutexGuard<'_, Tail> {
+        self.0.tail.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

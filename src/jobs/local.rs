@@ -84,11 +84,17 @@ async fn supervise(mut child: Child, launch: Launch) -> WorkerExit {
     WorkerExit(status.map_or_else(|e| format!("an unknown status: {e}"), describe_exit))
 }
 
+/// Copies output of a worker to its log. A worker that floods its output waits for this, instead of taking the server's time.
 async fn copy(from: Option<impl AsyncRead + Unpin>, log: &LogTail) {
+    /// Pause after a full buffer: at most 3 MiB per second are read.
+    const PAUSE: Duration = Duration::from_millis(20);
     let Some(mut from) = from else { return };
-    let mut buffer = [0; 4096];
+    let mut buffer = vec![0; LogTail::LIMIT];
     while let Ok(n @ 1..) = from.read(&mut buffer).await {
         log.push(&buffer[..n]);
+        if n == buffer.len() {
+            tokio::time::sleep(PAUSE).await;
+        }
     }
 }
 

@@ -29,11 +29,11 @@ use crate::store::{self, Lease, PendingAction, Store};
 pub struct SchedulerConfig {
     /// Threads that all running jobs may use together.
     pub cpu_budget: usize,
-    /// Failed attempts after which a job has failed.
+    /// Consecutive attempts that fail without progress after which a job has failed.
     pub max_attempts: u32,
     /// Time between snapshots of a job.
     pub snapshot_every: Duration,
-    /// Time without a heartbeat after which a worker is killed.
+    /// Time without a heartbeat after which a worker is killed. Time in which this server did not run does not count.
     pub heartbeat_timeout: Duration,
     /// Time after a cancel after which the worker is killed.
     pub cancel_grace: Duration,

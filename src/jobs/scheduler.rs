@@ -4,6 +4,7 @@
 //! jobs behind it, so that a job with many threads does not wait forever.
 
 use std::collections::HashMap;
+use std::convert::Infallible;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -26,6 +27,13 @@ enum KillReason {
 
 /// Time between two tries to use a database that fails.
 const RETRY_DELAY: Duration = Duration::from_secs(1);
+
+/// Delays before a worker that could not be started is started again: the first, which doubles, and the longest.
+const START_DELAY: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5)];
+/// Time in which output of a worker is collected before it is stored.
+const LOG_DELAY: Duration = Duration::from_millis(100);
+/// Time between two writes of a worker's output, and that time when the worker floods its output.
+const LOG_INTERVAL: [Duration; 2] = [Duration::from_millis(400), Duration::from_secs(10)];
 
 /// Why no attempt could begin: the database, or the system's source of random numbers.
 type StartError = Box<dyn std::error::Error + Send + Sync>;
@@ -120,13 +128,64 @@ impl Scheduler {
 
     /// Starts a worker, waits for its end and records it.
     async fn supervise(&self, launch: Launch, running: &RunningAttempt) {
-        let (lease, kill) = (launch.lease, launch.kill.clone());
+        let lease = launch.lease;
         tracing::info!(threads = running.threads, "starting a worker");
-        let result = match self.0.executor.start(launch).await {
-            Ok(exit) => self.wait(lease, exit, &kill, running).await,
-            Err(e) => failed(format!("the worker could not be started: {e}")),
+        let work = async {
+            let Some(exit) = self.start_worker(&launch, running).await else { return WorkerResult::Stopped };
+            self.wait(lease, exit, &launch.kill, running).await
+        };
+        let result = tokio::select! {
+            result = work => result,
+            never = self.store_log(lease, &running.log) => match never {},
         };
         self.end(lease, &result, &running.log).await;
+    }
+
+    /// Starts a worker. When that fails, the host is in trouble (no file descriptor, no memory, no program) and not the job, so it
+    /// is tried again until it succeeds. Returns `None` if the job or this server is to stop before.
+    async fn start_worker(&self, launch: &Launch, running: &RunningAttempt) -> Option<BoxFuture<'static, WorkerExit>> {
+        let [mut delay, longest] = START_DELAY;
+        loop {
+            match self.0.executor.start(launch.clone()).await {
+                Ok(exit) => return Some(exit),
+                Err(error) => {
+                    tracing::error!(%error, ?delay, "a worker could not be started; trying again");
+                    metrics::counter!("qedgix_worker_start_failures_total").increment(1);
+                    launch.log.push(format!("a worker could not be started: {error}; trying again in {delay:?}\n").as_bytes());
+                }
+            }
+            let next = self.0.clock.monotonic().saturating_add(delay);
+            delay = (delay * 2).min(longest);
+            loop {
+                tokio::select! {
+                    () = self.0.clock.sleep_until(next) => break,
+                    () = running.job_changed.notified() => {
+                        if !matches!(self.grace(launch.lease, false).await, Ok(None)) {
+                            return None;
+                        }
+                    }
+                    () = self.0.draining.wait() => return None,
+                }
+            }
+        }
+    }
+
+    /// Stores the output of the worker while it runs, so that it survives a crash of this server. Never returns.
+    async fn store_log(&self, lease: Lease, log: &LogTail) -> Infallible {
+        let [short, long] = LOG_INTERVAL;
+        let mut stored = 0;
+        loop {
+            log.pushed().await;
+            tokio::time::sleep(LOG_DELAY).await;
+            let (total, text) = (log.total(), log.text());
+            if let Err(error) = self.0.store.store_log(lease, &text).await {
+                // The next output, or the end of the attempt, stores it.
+                tracing::debug!(%error, "the output of a worker could not be stored");
+            }
+            let flood = total - stored > LogTail::LIMIT as u64;
+            stored = total;
+            tokio::time::sleep(if flood { long } else { short }).await;
+        }
     }
 
     /// Waits for the end of the worker process, and kills it if it does not stop in time. Returns the result of an attempt whose
@@ -160,46 +219,65 @@ impl Scheduler {
     }
 
     /// Returns when the worker must be killed.
+    ///
+    /// The worker is not blamed for time in which this server did not run, because it was stopped or the machine was: after such a
+    /// gap, the worker has the whole time for its next heartbeat, and what is left of its grace period.
     async fn kill_reason(&self, lease: Lease, running: &RunningAttempt) -> KillReason {
         let (config, clock) = (&self.0.config, &self.0.clock);
+        let longest_gap = config.heartbeat_timeout / 4;
+        let tick = (config.heartbeat_timeout / 16).clamp(Duration::from_millis(1), Duration::from_secs(1));
+        let mut last_tick = clock.monotonic();
         let mut deadline: Option<Duration> = None;
         let mut drained = false;
         loop {
-            let heartbeat_deadline = running.last_heartbeat().saturating_add(config.heartbeat_timeout);
-            let next = deadline.map_or(heartbeat_deadline, |deadline| deadline.min(heartbeat_deadline));
-            tokio::select! {
-                () = running.job_changed.notified() => {}
-                () = self.0.draining.wait(), if !drained => drained = true,
-                () = clock.sleep_until(next) => {
-                    let now = clock.monotonic();
-                    if deadline.is_some_and(|deadline| deadline <= now) {
-                        return KillReason::GraceExpired;
-                    }
-                    // A heartbeat may have arrived while this slept.
-                    if running.last_heartbeat().saturating_add(config.heartbeat_timeout) <= now {
-                        return KillReason::HeartbeatLost;
-                    }
-                    continue;
+            let ticked = tokio::select! {
+                () = running.job_changed.notified() => false,
+                () = self.0.draining.wait(), if !drained => {
+                    drained = true;
+                    false
                 }
-            }
-            let grace = match self.0.store.job(lease.job_id).await {
-                Ok(Some(Job { state: JobState::Running, pending_action, .. })) => match pending_action {
-                    Some(PendingAction::Cancel) => Some(config.cancel_grace),
-                    Some(PendingAction::Pause) => Some(config.pause_grace),
-                    None => drained.then_some(config.pause_grace),
-                },
-                // The attempt has ended, so its process has to end, too.
-                Ok(_) => Some(config.cancel_grace),
-                Err(e) => {
-                    tracing::error!(error = %e, "the job could not be read");
-                    None
-                }
+                () = clock.sleep_until(last_tick.saturating_add(tick)) => true,
             };
-            if let Some(grace) = grace {
-                let by = clock.monotonic().saturating_add(grace);
-                deadline = Some(deadline.map_or(by, |deadline| deadline.min(by)));
+            let now = clock.monotonic();
+            let gap = now.saturating_sub(last_tick);
+            last_tick = now;
+            if gap > longest_gap {
+                tracing::warn!(seconds = gap.as_secs_f64(), "this server did not run; the lease of the worker is renewed");
+                *running.last_heartbeat() = now;
+                deadline = deadline.map(|deadline| deadline.saturating_add(gap));
+            }
+            if ticked {
+                if deadline.is_some_and(|deadline| deadline <= now) {
+                    return KillReason::GraceExpired;
+                }
+                if running.last_heartbeat().saturating_add(config.heartbeat_timeout) <= now {
+                    return KillReason::HeartbeatLost;
+                }
+                continue;
+            }
+            match self.grace(lease, drained).await {
+                Ok(Some(grace)) => {
+                    let by = now.saturating_add(grace);
+                    deadline = Some(deadline.map_or(by, |deadline| deadline.min(by)));
+                }
+                Ok(None) => {}
+                Err(error) => tracing::error!(%error, "the job could not be read"),
             }
         }
+    }
+
+    /// The time that the worker has to stop; `None` while it may run.
+    async fn grace(&self, lease: Lease, drained: bool) -> Result<Option<Duration>, crate::store::Error> {
+        let config = &self.0.config;
+        Ok(match self.0.store.job(lease.job_id).await? {
+            Some(Job { state: JobState::Running, pending_action, .. }) => match pending_action {
+                Some(PendingAction::Cancel) => Some(config.cancel_grace),
+                Some(PendingAction::Pause) => Some(config.pause_grace),
+                None => drained.then_some(config.pause_grace),
+            },
+            // The attempt has ended, so its process has to end, too.
+            _ => Some(config.cancel_grace),
+        })
     }
 
     /// Stores the log of the worker, and ends the attempt unless the worker has ended it. Retries until the database works.
@@ -299,13 +377,46 @@ mod tests {
             tokio::task::yield_now().await;
         }
         assert_eq!(scheduler.0.store.job(id).await.unwrap().unwrap().state, JobState::Running);
-        time.advance(scheduler.config().heartbeat_timeout);
+        pass(&time, scheduler.config().heartbeat_timeout).await;
         while scheduler.0.store.job(id).await.unwrap().unwrap().state != JobState::Failed {
             changes.changed().await.unwrap();
         }
         let attempt = scheduler.0.store.attempts(id).await.unwrap().remove(0);
         assert_eq!(attempt.started_at.as_second(), 1_000);
         assert_eq!(attempt.ended_at.unwrap().as_second(), 90_030);
+        running.abort();
+    }
+
+    /// Lets time pass as a server that runs sees it: in small steps.
+    async fn pass(time: &ManualClock, total: Duration) {
+        for _ in 0..30 {
+            time.advance(total / 30);
+            for _ in 0..20 {
+                tokio::task::yield_now().await;
+            }
+        }
+    }
+
+    #[tokio::test]
+    async fn a_worker_is_not_blamed_for_the_pauses_of_its_server() {
+        let time = ManualClock::new(Timestamp::from_second(1_000).unwrap());
+        let (_dir, scheduler, id) = with_a_job(time.clock()).await;
+        let running = tokio::spawn(scheduler.clone().run("http://127.0.0.1:1".into()));
+        let mut changes = scheduler.0.store.changes(1);
+        while scheduler.0.store.job(id).await.unwrap().unwrap().state != JobState::Running {
+            changes.changed().await.unwrap();
+        }
+        let timeout = scheduler.config().heartbeat_timeout;
+        for _ in 0..3 {
+            // The server was stopped for longer than the lease, and then runs for a part of it.
+            time.advance(timeout * 10);
+            pass(&time, timeout / 2).await;
+        }
+        assert_eq!(scheduler.0.store.job(id).await.unwrap().unwrap().state, JobState::Running);
+        pass(&time, timeout).await;
+        while scheduler.0.store.job(id).await.unwrap().unwrap().state != JobState::Failed {
+            changes.changed().await.unwrap();
+        }
         running.abort();
     }
 }

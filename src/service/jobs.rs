@@ -1,4 +1,4 @@
-//! The use cases of jobs: submit, get, list, cancel, pause, resume, delete, and read metrics, checkpoints and logs.
+//! The use cases of jobs: submit, get, list, cancel, pause, resume, retry, delete, and read metrics, checkpoints and logs.
 
 use uuid::Uuid;
 
@@ -84,7 +84,7 @@ pub async fn list(app: &App, caller: &Caller, state: Option<JobState>, page: &Pa
 /// # Errors
 /// [`Error::NotFound`], or [`Error::Precondition`] when the state of the job does not allow the action.
 pub async fn change(app: &App, caller: &Caller, id: &str, action: JobAction) -> Result<Job, Error> {
-    if action == JobAction::Resume {
+    if matches!(action, JobAction::Resume | JobAction::Retry) {
         app.admit()?;
     }
     match app.store.change_job(parse_id(id)?, action, app.clock.now()).await? {
@@ -99,6 +99,7 @@ pub async fn change(app: &App, caller: &Caller, id: &str, action: JobAction) -> 
                 JobAction::Cancel => "only a job that has not ended can be cancelled",
                 JobAction::Pause => "only a queued or running job can be paused",
                 JobAction::Resume => "only a paused job can be resumed",
+                JobAction::Retry => "only a failed job can be retried",
                 JobAction::Delete => "only a job that has ended can be deleted; cancel it first",
             };
             let pending = match job.pending_action {
@@ -146,7 +147,7 @@ pub async fn checkpoints(app: &App, caller: &Caller, id: &str) -> Result<Vec<Che
     Ok(app.store.checkpoints(job.id).await?)
 }
 
-/// All attempts of a job with the last output of their workers, oldest first.
+/// The newest attempts of a job with the last output of their workers, oldest first.
 ///
 /// # Errors
 /// [`Error::NotFound`].

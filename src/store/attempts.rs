@@ -20,7 +20,7 @@ named_enum! {
         Cancelled = "cancelled",
         /// A caller paused the job.
         Paused = "paused",
-        /// The server or the worker was stopped. Not a failure.
+        /// The server or the worker was stopped, or the host could not run the worker. Not a failure of the job.
         Interrupted = "interrupted",
     }
 }
@@ -73,11 +73,14 @@ pub struct EndedAttempt<'a> {
     pub result: &'a WorkerResult,
     /// The policy to publish if the job succeeds, in the same transaction.
     pub publish: Option<NewPolicyVersion<'a>>,
-    /// Failed attempts after which the job has failed.
+    /// Consecutive attempts that fail without progress after which the job has failed.
     pub max_attempts: u32,
     /// When it ended.
     pub now: Timestamp,
 }
+
+/// Attempts of a job that are kept. The number of attempts of a job has no limit.
+pub const KEPT_ATTEMPTS: i64 = 100;
 
 /// The current record of an attempt.
 #[derive(Clone, Debug, PartialEq)]
@@ -92,7 +95,7 @@ pub struct Attempt {
     pub outcome: Option<AttemptOutcome>,
     /// Why the attempt failed.
     pub reason: Option<String>,
-    /// Last output of the worker. Stored when the worker process has ended.
+    /// Last output of the worker. While the worker runs, it is stored with a delay of a second.
     pub log: String,
 }
 
@@ -133,7 +136,7 @@ async fn end(db: &mut SqliteConnection, ended: EndedAttempt<'_>) -> Result<Optio
         (WorkerResult::Failed { .. }, Some(PendingAction::Cancel)) => (AttemptOutcome::Failed, JobState::Cancelled),
         (WorkerResult::Failed { permanent, .. }, pending) => {
             let state = match pending {
-                _ if *permanent || job.failures + 1 >= max_attempts => JobState::Failed,
+                _ if *permanent || job.consecutive_failures + 1 >= max_attempts => JobState::Failed,
                 Some(_) => JobState::Paused,
                 None => JobState::Queued,
             };
@@ -157,7 +160,8 @@ async fn end(db: &mut SqliteConnection, ended: EndedAttempt<'_>) -> Result<Optio
         name = Some(format!("{}:{}", policy.name, new.version));
         published = Some(new);
     }
-    let sql = "UPDATE jobs SET failures = failures + ?2, policy = coalesce(?3, policy) WHERE number = ?1";
+    let sql = "UPDATE jobs SET failures = failures + ?2, consecutive_failures = consecutive_failures + ?2,
+               policy = coalesce(?3, policy) WHERE number = ?1";
     sqlx::query(sql).bind(lease.job_row).bind(failed).bind(name).execute(&mut *db).await?;
     transition(db, Transition { job: lease.job_row, to: state, attempt: lease.attempt, reason, now }).await?;
     Ok(find(db, lease.job_id).await?.map(|job| (job, published)))
@@ -181,6 +185,8 @@ impl Store {
             .bind(now.as_millisecond())
             .execute(&mut *tx)
             .await?;
+        let sql = "DELETE FROM attempts WHERE job = ? AND number <= ?";
+        sqlx::query(sql).bind(lease.job_row).bind(i64::from(lease.attempt) - KEPT_ATTEMPTS).execute(&mut *tx).await?;
         let sql = "UPDATE jobs SET attempts = ? WHERE number = ?";
         sqlx::query(sql).bind(lease.attempt).bind(lease.job_row).execute(&mut *tx).await?;
         let to = JobState::Running;
@@ -247,7 +253,7 @@ impl Store {
         Ok(row.map(|(job, token, active)| LeaseRecord { lease: Lease { job_id: id, job_row: job, attempt }, token, active }))
     }
 
-    /// All attempts of a job, oldest first.
+    /// The newest attempts of a job (at most [`KEPT_ATTEMPTS`]), oldest first.
     ///
     /// # Errors
     /// [`Error`](super::Error) when the database fails.

@@ -161,6 +161,8 @@ pub struct Job<S = JobSpec> {
     pub attempts: u32,
     /// Number of attempts that have failed.
     pub failures: u32,
+    /// Number of attempts that have failed since the job last made progress.
+    pub consecutive_failures: u32,
     /// Environment steps done.
     pub step: u64,
     /// `NAME:VERSION` of the published policy.
@@ -180,7 +182,7 @@ impl Job {
     pub fn split(self) -> (JobSummary, TrainConfig) {
         let spec = SpecSummary::from(&self.spec);
         let Self { spec: JobSpec { config, .. }, id, row_id, state, pending_action, reason, attempts, failures, .. } = self;
-        let Self { step, policy, last_event, created_at, started_at, ended_at, .. } = self;
+        let Self { consecutive_failures, step, policy, last_event, created_at, started_at, ended_at, .. } = self;
         let summary = Job {
             id,
             row_id,
@@ -190,6 +192,7 @@ impl Job {
             spec,
             attempts,
             failures,
+            consecutive_failures,
             step,
             policy,
             last_event,
@@ -212,6 +215,7 @@ from_row! {
         spec: String,
         attempts: i64,
         failures: i64,
+        consecutive_failures: i64,
         step: i64,
         policy: Option<String>,
         seq: i64,
@@ -234,6 +238,7 @@ impl<S: DeserializeOwned> TryFrom<JobRow> for Job<S> {
             spec: serde_json::from_str(&row.spec).map_err(|e| corrupt("job", &row.id, e))?,
             attempts: row.attempts as u32,
             failures: row.failures as u32,
+            consecutive_failures: row.consecutive_failures as u32,
             step: row.step as u64,
             policy: row.policy,
             last_event: row.seq as u64,
@@ -277,6 +282,8 @@ pub enum JobAction {
     Pause,
     /// Queue a paused job again.
     Resume,
+    /// Queue a failed job again.
+    Retry,
     /// Delete the record of a job that has ended.
     Delete,
 }
@@ -301,7 +308,8 @@ pub(super) struct Transition<'a> {
     pub(super) now: Timestamp,
 }
 
-/// Moves a job to another state and appends an event. Deletes the snapshot of a job that ends.
+/// Moves a job to another state and appends an event. Deletes the snapshot of a job that ends, unless it failed: a failed job can
+/// be retried.
 pub(super) async fn transition(db: &mut SqliteConnection, t: Transition<'_>) -> Result<()> {
     let now = t.now.as_millisecond();
     let ended = t.to.ended().then_some(now);
@@ -314,7 +322,7 @@ pub(super) async fn transition(db: &mut SqliteConnection, t: Transition<'_>) -> 
     let sql = "INSERT INTO events (job, at, state, attempt, reason, seq) VALUES (?, ?, ?, ?, ?, ?)";
     let insert = sqlx::query(sql).bind(t.job).bind(now).bind(state).bind(t.attempt).bind(t.reason).bind(seq);
     insert.execute(&mut *db).await?;
-    if t.to.ended() {
+    if t.to.ended() && t.to != JobState::Failed {
         sqlx::query("DELETE FROM snapshots WHERE job = ?").bind(t.job).execute(&mut *db).await?;
     }
     Ok(())
@@ -376,7 +384,8 @@ impl Store {
         /// Bytes of a summary besides its texts.
         const FIXED: usize = 512;
         let sql =
-            "SELECT number, id, state, wanted, reason, attempts, failures, step, policy, seq, created_at, started_at, ended_at,
+            "SELECT number, id, state, wanted, reason, attempts, failures, consecutive_failures, step, policy, seq,
+                   created_at, started_at, ended_at,
                    json_extract(spec, '$.kind', '$.name', '$.labels', '$.threads', '$.priority', '$.config.algorithm',
                    '$.config.preset', '$.config.seed', '$.config.training.steps') AS spec
                    FROM jobs WHERE (?1 IS NULL OR state = ?1) AND (?2 IS NULL OR number < ?2) ORDER BY number DESC";
@@ -420,7 +429,7 @@ impl Store {
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
     pub async fn change_job(&self, id: JobId, action: JobAction, now: Timestamp) -> Result<ActionResult> {
-        use JobState::{Cancelled, Paused, Queued, Running};
+        use JobState::{Cancelled, Failed, Paused, Queued, Running};
         let mut tx = self.begin().await?;
         let Some(job) = find(&mut tx, id).await? else { return Ok(ActionResult::NotFound) };
         match (action, job.state, job.pending_action) {
@@ -428,11 +437,16 @@ impl Store {
             | (JobAction::Cancel, Running, Some(PendingAction::Cancel))
             | (JobAction::Pause, Paused, _)
             | (JobAction::Pause, Running, Some(PendingAction::Pause))
-            | (JobAction::Resume, Queued, _)
-            | (JobAction::Resume, Running, None) => return Ok(ActionResult::Accepted(Box::new(job))),
+            | (JobAction::Resume | JobAction::Retry, Queued, _)
+            | (JobAction::Resume | JobAction::Retry, Running, None) => return Ok(ActionResult::Accepted(Box::new(job))),
             (JobAction::Cancel, Queued | Paused, _) => transition_now(&mut tx, &job, Cancelled, now).await?,
             (JobAction::Pause, Queued, _) => transition_now(&mut tx, &job, Paused, now).await?,
             (JobAction::Resume, Paused, _) => transition_now(&mut tx, &job, Queued, now).await?,
+            (JobAction::Retry, Failed, _) => {
+                let sql = "UPDATE jobs SET consecutive_failures = 0 WHERE number = ?";
+                sqlx::query(sql).bind(job.row_id).execute(&mut *tx).await?;
+                transition_now(&mut tx, &job, Queued, now).await?;
+            }
             (JobAction::Cancel, Running, _) => set_pending_action(&mut tx, &job, PendingAction::Cancel).await?,
             (JobAction::Pause, Running, None) => set_pending_action(&mut tx, &job, PendingAction::Pause).await?,
             (JobAction::Delete, state, _) if state.ended() => {

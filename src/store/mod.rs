@@ -56,8 +56,14 @@ macro_rules! migrations {
 }
 
 /// Name and content of every file in `migrations/`.
-const MIGRATIONS: [(&str, &str); 5] =
-    migrations!["0001_jobs.sql", "0002_policies.sql", "0003_promotions.sql", "0004_events.sql", "0005_api_keys.sql"];
+const MIGRATIONS: [(&str, &str); 6] = migrations![
+    "0001_jobs.sql",
+    "0002_policies.sql",
+    "0003_promotions.sql",
+    "0004_events.sql",
+    "0005_api_keys.sql",
+    "0009_consecutive_failures.sql",
+];
 
 /// Name of the database file inside the data directory.
 pub const FILE: &str = "qedgix.sqlite";

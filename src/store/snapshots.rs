@@ -83,7 +83,8 @@ impl Store {
         Ok(true)
     }
 
-    /// Makes the snapshot the job's newest and deletes the previous one. Returns false if the attempt has ended.
+    /// Makes the snapshot the job's newest and deletes the previous one. If their contents differ, the job has made progress, so
+    /// its earlier failures no longer count. Returns false if the attempt has ended.
     ///
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
@@ -92,6 +93,9 @@ impl Store {
         if !is_active(&mut tx, partial.lease).await? {
             return Ok(false);
         }
+        let sql = "UPDATE jobs SET consecutive_failures = 0 WHERE number = ?1 AND consecutive_failures > 0
+                   AND NOT EXISTS (SELECT 1 FROM snapshots WHERE job = ?1 AND sha256 = ?2)";
+        sqlx::query(sql).bind(partial.lease.job_row).bind(sha256).execute(&mut *tx).await?;
         let sql = "UPDATE snapshots SET size = ?, sha256 = ? WHERE id = ?";
         sqlx::query(sql).bind(partial.size as i64).bind(sha256).bind(partial.id).execute(&mut *tx).await?;
         let sql = "DELETE FROM snapshots WHERE job = ? AND id <> ?";

@@ -26,10 +26,14 @@ pub struct Process {
 
 impl Process {
     pub async fn start(data_dir: &Path) -> Self {
+        Self::start_program(Path::new(env!("CARGO_BIN_EXE_qedgix")), data_dir).await
+    }
+
+    async fn start_program(program: &Path, data_dir: &Path) -> Self {
         let endpoints = data_dir.join("endpoints.json");
         // Left by a killed server.
         let _ = std::fs::remove_file(&endpoints);
-        let child = Command::new(env!("CARGO_BIN_EXE_qedgix"))
+        let child = Command::new(program)
             .args(["serve", "--grpc-addr", "127.0.0.1:0", "--http-addr", "127.0.0.1:0", "--cpu-budget", "1"])
             .args(["--snapshot-every", "0.05", "--data-dir"])
             .arg(data_dir)
@@ -250,7 +254,9 @@ async fn killed_server_resumes_its_jobs() {
     let server = Process::start(dir.path()).await;
     let done = server.rest.reaches(&id, "succeeded").await;
     assert_eq!((&done["attempts"], &done["failures"]), (&json!(2), &json!(0)));
-    assert_eq!(attempts(&server.rest, &id).await[0]["outcome"], "interrupted");
+    let attempts = attempts(&server.rest, &id).await;
+    assert_eq!(attempts[0]["outcome"], "interrupted");
+    assert!(attempts[0]["log"].as_str().unwrap().contains("training"), "{}", attempts[0]["log"]);
     assert_same(&rows(&server.rest, &id).await, &uninterrupted(&job()).0);
     server.rest.reaches(&waiting, "succeeded").await;
 }
@@ -310,13 +316,48 @@ async fn output_and_exit_code_of_a_worker_are_stored() {
     assert_eq!(logs["attempts"].as_array().unwrap().len(), 3);
     assert!(logs["attempts"][2]["log"].as_str().unwrap().contains("tethered"), "{logs}");
 
+}
+
+#[tokio::test]
+async fn a_worker_that_cannot_be_started_is_not_a_failure_of_the_job() {
     let dir = tempfile::tempdir().unwrap();
-    let executor = LocalProcess { program: "/nowhere/qedgix".into() };
+    let program = dir.path().join("qedgix");
+    let executor = LocalProcess { program: program.clone() };
     let server = Server::start_on(dir.path(), 1, |s| s.max_attempts = 1, Some(Arc::new(executor))).await;
     let id = server.submit(&tiny()).await;
-    let job = server.reaches(&id, "failed").await;
-    assert_eq!(job["attempts"], 1);
-    assert!(!job["reason"].as_str().unwrap().is_empty(), "{job}");
+    let logs = format!("/v1/jobs/{id}/logs");
+    let tried = async || {
+        within(async {
+            while !server.get(&logs).await["attempts"][0]["log"].as_str().unwrap_or("").contains("No such file") {
+                tokio::time::sleep(POLL).await;
+            }
+        })
+        .await;
+    };
+    tried().await;
+    // It can be paused, resumed and cancelled meanwhile, as any job.
+    server.post(&format!("/v1/jobs/{id}/pause")).await;
+    server.reaches(&id, "paused").await;
+    server.post(&format!("/v1/jobs/{id}/resume")).await;
+    let cancelled = server.submit(&tiny()).await;
+    server.post(&format!("/v1/jobs/{cancelled}/cancel")).await;
+    // The trouble of the host ends.
+    std::fs::copy(env!("CARGO_BIN_EXE_qedgix"), &program).unwrap();
+    let job = server.reaches(&id, "succeeded").await;
+    assert_eq!((&job["failures"], &job["attempts"]), (&json!(0), &json!(2)));
+    assert_eq!(server.state(&cancelled).await, "cancelled");
+}
+
+#[tokio::test]
+async fn a_server_whose_program_was_replaced_starts_workers() {
+    let dir = tempfile::tempdir().unwrap();
+    let program = dir.path().join("qedgix");
+    std::fs::copy(env!("CARGO_BIN_EXE_qedgix"), &program).unwrap();
+    let server = Process::start_program(&program, dir.path()).await;
+    std::fs::remove_file(&program).unwrap();
+    std::fs::write(&program, "another version").unwrap();
+    let id = server.rest.submit(&tiny()).await;
+    server.rest.reaches(&id, "succeeded").await;
 }
 
 #[tokio::test]

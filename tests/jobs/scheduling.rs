@@ -6,6 +6,7 @@ use qedgix::jobs::SchedulerConfig;
 use qedgix::wire::v1;
 use reqwest::{Method, StatusCode};
 use serde_json::json;
+use sha2::{Digest, Sha256};
 use tonic::Code;
 
 use super::harness::{Server, TIMEOUT, Worker, expect, named, signed, tiny, with, within};
@@ -159,6 +160,85 @@ async fn job_fails_after_max_attempts_with_reason_and_log() {
         assert_eq!(attempt["outcome"], "failed");
     }
     assert!(server.workers.try_recv().is_err());
+}
+
+/// Uploads a snapshot of these bytes, taken at `step`.
+async fn upload(server: &Server, worker: &Worker, step: u64, bytes: &'static [u8]) {
+    use v1::upload_snapshot_request::Part;
+    let header = v1::SnapshotHeader { step, size: bytes.len() as u64, sha256: hex::encode(Sha256::digest(bytes)) };
+    let parts = [Part::Header(header), Part::Data(bytes.into())].map(|part| v1::UploadSnapshotRequest { part: Some(part) });
+    let request = signed(&worker.launch, &worker.launch.token, futures::stream::iter(parts));
+    server.worker_client().await.upload_snapshot(request).await.unwrap();
+}
+
+#[tokio::test]
+async fn failures_that_progress_lies_between_do_not_add_up() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Server::start_with(dir.path(), 1, |s| s.max_attempts = 2).await;
+    let id = server.submit(&tiny()).await;
+    for (step, snapshot) in [(20, &b"at 20"[..]), (40, b"at 40"), (60, b"at 60")] {
+        let worker = server.worker().await;
+        upload(&server, &worker, step, snapshot).await;
+        worker.exit("killed by signal 9");
+    }
+    // The third of them has uploaded what it started from: that is no progress.
+    let worker = server.worker().await;
+    upload(&server, &worker, 60, b"at 60").await;
+    worker.exit("killed by signal 9");
+    let job = server.reaches(&id, "failed").await;
+    assert_eq!((&job["attempts"], &job["failures"]), (&json!(4), &json!(4)));
+}
+
+#[tokio::test]
+async fn a_failed_job_keeps_its_snapshot_and_can_be_retried() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Server::start_with(dir.path(), 1, |s| s.max_attempts = 2).await;
+    let id = server.submit(&tiny()).await;
+    let retry = format!("/v1/jobs/{id}/retry");
+    let first = server.worker().await;
+    // A job that has not failed stays as it is.
+    assert_eq!(server.post(&retry).await["state"], "running");
+    upload(&server, &first, 20, b"at 20").await;
+    first.exit("exit code 1");
+    server.worker().await.exit("exit code 1");
+    server.reaches(&id, "failed").await;
+    let job = server.post(&retry).await;
+    assert_eq!((&job["reason"], &job["ended_at"]), (&json!(null), &json!(null)));
+    // A lost response: the caller repeats the request, here over gRPC.
+    server.jobs().await.retry_job(v1::RetryJobRequest { id: id.clone() }).await.unwrap();
+    let third = server.worker().await;
+    let fetch = signed(&third.launch, &third.launch.token, v1::FetchRequest {});
+    let task = server.worker_client().await.fetch(fetch).await.unwrap().into_inner();
+    assert_eq!(task.snapshot_step, Some(20));
+    // Its earlier failures do not count any more.
+    third.exit("exit code 1");
+    let fourth = server.worker().await;
+    finish(&server, &fourth, v1::Outcome::Succeeded).await;
+    fourth.exit("exit code 0");
+    server.reaches(&id, "succeeded").await;
+    expect(server.request(Method::POST, &retry), StatusCode::CONFLICT).await;
+    let missing = format!("/v1/jobs/{}/retry", uuid::Uuid::nil());
+    expect(server.request(Method::POST, &missing), StatusCode::NOT_FOUND).await;
+}
+
+#[tokio::test]
+async fn output_of_a_running_worker_survives_a_crash_of_the_server() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut server = Server::start(dir.path(), 1).await;
+    let id = server.submit(&tiny()).await;
+    let worker = server.worker().await;
+    worker.launch.log.push(b"training\n");
+    let row = server.app.store.job(worker.launch.lease.job_id).await.unwrap().unwrap();
+    within(async {
+        while server.app.store.attempts(row.id).await.unwrap()[0].log.is_empty() {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    })
+    .await;
+    server.crash().await;
+    let restarted = Server::start(dir.path(), 1).await;
+    let logs = restarted.get(&format!("/v1/jobs/{id}/logs")).await;
+    assert_eq!((&logs["attempts"][0]["log"], &logs["attempts"][0]["outcome"]), (&json!("training\n"), &json!("interrupted")));
 }
 
 #[tokio::test]

@@ -74,6 +74,10 @@ impl JobService for Service {
         self.change(caller(request.extensions()), &request.into_inner().id, JobAction::Resume).await
     }
 
+    async fn retry_job(&self, request: Request<v1::RetryJobRequest>) -> GrpcResult<v1::Job> {
+        self.change(caller(request.extensions()), &request.into_inner().id, JobAction::Retry).await
+    }
+
     async fn get_job_metrics(&self, request: Request<v1::GetJobMetricsRequest>) -> GrpcResult<v1::GetJobMetricsResponse> {
         let caller = caller(request.extensions());
         let v1::GetJobMetricsRequest { id, name, page_size, page_token } = request.into_inner();

@@ -130,6 +130,7 @@ const LINKS: [Link; 6] = [
             "getJob",
             "pauseJob",
             "resumeJob",
+            "retryJob",
             "cancelJob",
             "deleteJob",
             "listJobMetrics",

@@ -16,14 +16,15 @@ use crate::jobs::Directive;
 use crate::wire::v1;
 use crate::wire::v1::worker_service_client::WorkerServiceClient;
 
-/// Time for which a failing call is retried. Then the worker gives up, and the server starts another attempt.
-const RETRY_TIMEOUT: Duration = Duration::from_secs(10);
+/// Time for which a failing call is retried: the server may be stopped, or wait for space on its disk. A local worker ends with
+/// its server in any case.
+const RETRY_TIMEOUT: Duration = Duration::from_secs(3600);
 /// Time limit of one call.
 const CALL_TIMEOUT: Duration = Duration::from_secs(8);
 /// Time limit of one upload or download.
 const TRANSFER_TIMEOUT: Duration = Duration::from_secs(600);
-/// Time between two tries of a call.
-const RETRY_DELAY: Duration = Duration::from_millis(200);
+/// Time between two tries of a call: the first, which doubles, and the longest.
+const RETRY_DELAY: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(2)];
 /// Bytes per message of an upload.
 pub(super) const CHUNK_SIZE: usize = 1 << 20;
 
@@ -154,6 +155,7 @@ where
     F: Future<Output = Result<T, Status>>,
 {
     let mut failing_since = None;
+    let [mut delay, longest] = RETRY_DELAY;
     loop {
         let status = match tokio::time::timeout(limit, call()).await {
             Ok(Ok(answer)) => return Ok(answer),
@@ -172,6 +174,7 @@ where
         if failing_since.get_or_insert_with(Instant::now).elapsed() > RETRY_TIMEOUT {
             return Err(ClientError::Unavailable(text));
         }
-        tokio::time::sleep(RETRY_DELAY).await;
+        tokio::time::sleep(delay).await;
+        delay = (delay * 2).min(longest);
     }
 }

@@ -1,8 +1,8 @@
 //! The worker process, which works on one attempt of a job. It reaches the server only through `WorkerService`, so it can run
 //! on any machine.
 //!
-//! Training runs on its own thread and never waits for the network. It puts reports into a queue, and a task sends them in
-//! order, so the server has all metrics that come before a snapshot.
+//! Training runs on its own thread. It puts reports into a queue, and a task sends them in order, so the server has all metrics
+//! that come before a snapshot. Training waits only when the queue is full, because the server does not answer for long.
 
 mod client;
 mod report;
@@ -31,6 +31,9 @@ pub const ENV_JOB: &str = "QEDGIX_JOB";
 pub const ENV_ATTEMPT: &str = "QEDGIX_ATTEMPT";
 /// Environment variable with the attempt's secret.
 pub const ENV_TOKEN: &str = "QEDGIX_TOKEN";
+
+/// Maximum number of reports in the queue.
+const QUEUE: usize = 1024;
 
 /// Time between two heartbeats, and so the maximum delay of a directive.
 const HEARTBEAT_INTERVAL: Duration = Duration::from_millis(400);
@@ -167,7 +170,7 @@ async fn train(client: &Client, stop: Arc<StopSignal>) -> Result<WorkerResult, E
     let snapshot_every = Duration::from_millis(task.snapshot_every_ms);
     let task = TrainingTask { config, threads: task.threads as usize, snapshot, snapshot_every };
 
-    let (sender, receiver) = mpsc::unbounded_channel();
+    let (sender, receiver) = mpsc::channel(QUEUE);
     let reports = ReportQueue::new(sender);
     let snapshot_pending = reports.snapshot_pending();
     let (result_sender, result) = oneshot::channel();

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use sha2::{Digest, Sha256};
-use tokio::sync::mpsc::UnboundedReceiver;
+use tokio::sync::mpsc::Receiver;
 
 use super::client::{Client, ClientError};
 use super::training::Report;
@@ -19,7 +19,7 @@ const BATCH_SIZE: usize = 2000;
 /// Sends all reports until training has closed the queue. Clears `snapshot_pending` after each snapshot.
 pub(super) async fn send_all(
     client: &Client,
-    mut reports: UnboundedReceiver<Report>,
+    mut reports: Receiver<Report>,
     snapshot_pending: &AtomicBool,
 ) -> Result<(), ClientError> {
     let mut received = Vec::new();

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use tokio::sync::mpsc::UnboundedSender;
+use tokio::sync::mpsc::Sender;
 
 use super::StopSignal;
 use crate::checkpoint::Checkpoint;
@@ -43,14 +43,14 @@ pub(super) struct TrainingTask {
     pub snapshot_every: Duration,
 }
 
-/// The queue of reports. Adding a report never waits.
+/// The queue of reports. Adding a report waits while the queue is full.
 pub(super) struct ReportQueue {
-    reports: UnboundedSender<Report>,
+    reports: Sender<Report>,
     snapshot_pending: Arc<AtomicBool>,
 }
 
 impl ReportQueue {
-    pub(super) fn new(reports: UnboundedSender<Report>) -> Self {
+    pub(super) fn new(reports: Sender<Report>) -> Self {
         Self { reports, snapshot_pending: Arc::default() }
     }
 
@@ -61,7 +61,7 @@ impl ReportQueue {
 
     fn push(&self, report: Report) {
         // The receiver is dropped when the process is about to end.
-        let _ = self.reports.send(report);
+        let _ = self.reports.blocking_send(report);
     }
 
     fn snapshot(&self, trainer: &Trainer) {

@@ -32,6 +32,7 @@ pub(super) fn router() -> OpenApiRouter<Arc<App>> {
         .routes(routes!(cancel))
         .routes(routes!(pause))
         .routes(routes!(resume))
+        .routes(routes!(retry))
         .routes(routes!(metrics))
         .routes(routes!(checkpoints))
         .routes(routes!(logs))
@@ -168,6 +169,15 @@ async fn pause(State(app): AppState, caller: Caller, Path(JobPath { id }): Path<
 )]
 async fn resume(State(app): AppState, caller: Caller, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Job>, Error> {
     Ok(axum::Json(jobs::change(&app, &caller, &id, JobAction::Resume).await?.into()))
+}
+
+/// Put a failed job back into the queue; it continues from its snapshot
+#[utoipa::path(
+    post, path = "/v1/jobs/{id}/retry", operation_id = "retryJob", tag = "jobs", params(JobPath),
+    responses((status = 200, description = "The job.", body = Job), BadRequest, NotFound, Conflict, Draining)
+)]
+async fn retry(State(app): AppState, caller: Caller, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Job>, Error> {
+    Ok(axum::Json(jobs::change(&app, &caller, &id, JobAction::Retry).await?.into()))
 }
 
 #[derive(Clone, Copy, Default, Deserialize, ToSchema)]
