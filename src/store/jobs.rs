@@ -383,8 +383,7 @@ impl Store {
     ) -> Result<(Vec<JobSummary>, bool)> {
         /// Bytes of a summary besides its texts.
         const FIXED: usize = 512;
-        let sql =
-            "SELECT number, id, state, wanted, reason, attempts, failures, consecutive_failures, step, policy, seq,
+        let sql = "SELECT number, id, state, wanted, reason, attempts, failures, consecutive_failures, step, policy, seq,
                    created_at, started_at, ended_at,
                    json_extract(spec, '$.kind', '$.name', '$.labels', '$.threads', '$.priority', '$.config.algorithm',
                    '$.config.preset', '$.config.seed', '$.config.training.steps') AS spec

@@ -55,7 +55,10 @@ fn describe() {
     describe_gauge!("qedgix_policy_versions", "Loaded policy versions.");
     describe_gauge!("qedgix_jobs", "Jobs, by state.");
     describe_counter!("qedgix_jobs_submitted_total", "Jobs submitted since the process started.");
-    describe_counter!("qedgix_worker_start_failures_total", "Tries to start a worker that failed, because the host is in trouble.");
+    describe_counter!(
+        "qedgix_worker_start_failures_total",
+        "Tries to start a worker that failed, because the host is in trouble."
+    );
     describe_gauge!("qedgix_job_watchers", "Open streams of job events.");
     describe_gauge!("qedgix_training_threads_busy", "Threads used by running jobs.");
     describe_gauge!("qedgix_training_threads", "CPU budget: threads that all running jobs may use together.");

@@ -315,7 +315,6 @@ async fn output_and_exit_code_of_a_worker_are_stored() {
     let logs = server.get(&format!("/v1/jobs/{id}/logs")).await;
     assert_eq!(logs["attempts"].as_array().unwrap().len(), 3);
     assert!(logs["attempts"][2]["log"].as_str().unwrap().contains("tethered"), "{logs}");
-
 }
 
 #[tokio::test]
