@@ -260,13 +260,7 @@ impl TrainConfig {
     /// The sizes of the agents.
     pub fn dims(&self) -> Dims {
         let env = &self.environment;
-        Dims {
-            uavs: env.uavs,
-            users: env.users,
-            actions: env.actions(),
-            detection_range: env.detection_range,
-            episode_slots: env.slots,
-        }
+        Dims { uavs: env.uavs, users: env.users, env: env.into() }
     }
 
     /// Checks each field and their combination.

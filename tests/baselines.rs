@@ -4,7 +4,8 @@ use std::sync::Arc;
 
 use qedgix::env::{EnvConfig, EpisodeMetrics, Point};
 use qedgix::learner::{difference, evaluate, layout_list};
-use qedgix::policy::baselines::{self, EnvParams, LIST};
+use qedgix::policy::EnvParams;
+use qedgix::policy::baselines::{self, LIST};
 use qedgix::policy::{FleetGraph, FleetStep, Policy, RequiredInput};
 
 fn policy(name: &str) -> Arc<dyn Policy> {
@@ -61,11 +62,11 @@ fn mean_aoi_for_the_sizes_of_the_paper() {
 fn tour_plans_once_and_again_after_users_have_moved() {
     let policy = policy("tour");
     let users: Vec<Point> = (0..5).map(|j| [0.1 + 0.2 * j as f64, 0.3]).collect();
-    let scene = |users: &[Point]| FleetGraph::from_scene(&[[0.5, 0.5]; 3], users, &[0.0; 5], policy.detection_range());
+    let scene = |users: &[Point]| FleetGraph::from_scene(&[[0.5, 0.5]; 3], users, &[0.0; 5], policy.env().detection_range);
     let mut memory = vec![0.0; policy.memory_len(3, 5)];
     let fly = |graph: &FleetGraph, step, memory: &mut Vec<f32>| {
         let mut headings = [99; 3];
-        policy.act(&mut [FleetStep { graph, step, memory, headings: &mut headings, q_values: None }]);
+        policy.act(&mut [FleetStep { env: policy.env(), graph, step, memory, headings: &mut headings, q_values: None }]);
         headings
     };
     fly(&scene(&users), 0, &mut memory);
@@ -124,11 +125,18 @@ impl Fleet {
         let aoi: Vec<f32> = (0..users).map(|i| (i * 7 % 11) as f32).collect();
         let mut memory = vec![7.0; policy.memory_len(uavs, users)];
         policy.start(uavs, users, seed, &mut memory);
-        Self { graph: FleetGraph::from_scene(&own, &all, &aoi, policy.detection_range()), memory, headings: vec![99; uavs] }
+        Self { graph: FleetGraph::from_scene(&own, &all, &aoi, policy.env().detection_range), memory, headings: vec![99; uavs] }
     }
 
     fn turn(&mut self, step: u64) -> FleetStep<'_> {
-        FleetStep { graph: &self.graph, step, memory: &mut self.memory, headings: &mut self.headings, q_values: None }
+        FleetStep {
+            env: EnvParams::default(),
+            graph: &self.graph,
+            step,
+            memory: &mut self.memory,
+            headings: &mut self.headings,
+            q_values: None,
+        }
     }
 }
 

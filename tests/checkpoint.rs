@@ -250,9 +250,10 @@ fn run_policy(checkpoint: &Checkpoint, seed: u64) {
         for step in 0..3 {
             let (at, of): (Vec<_>, Vec<_>) = ((0..uavs).map(|_| place()).collect(), (0..users).map(|_| place()).collect());
             let aoi: Vec<f32> = (0..users).map(|user| (user * 1000) as f32).collect();
-            let graph = FleetGraph::from_scene(&at, &of, &aoi, policy.detection_range());
+            let graph = FleetGraph::from_scene(&at, &of, &aoi, policy.env().detection_range);
             let (mut headings, mut q) = (vec![255; uavs], vec![0.0; uavs * policy.actions()]);
             policy.act(&mut [FleetStep {
+                env: policy.env(),
                 graph: &graph,
                 step,
                 memory: &mut memory,

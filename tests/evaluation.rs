@@ -5,7 +5,8 @@ use std::sync::Mutex;
 use qedgix::env::{EnvConfig, EpisodeMetrics};
 use qedgix::invalid::Invalid;
 use qedgix::learner::{Disturbance, LostUav, TracedEvaluation, evaluate, evaluate_traced, layout_list};
-use qedgix::policy::baselines::{self, EnvParams};
+use qedgix::policy::EnvParams;
+use qedgix::policy::baselines;
 use qedgix::policy::{FleetStep, Policy, RequiredInput};
 
 fn evaluated(name: &str, env: &EnvConfig, disturbance: &Disturbance, threads: usize) -> TracedEvaluation {
@@ -105,8 +106,8 @@ impl Policy for RecordingPolicy {
     fn needs(&self) -> RequiredInput {
         RequiredInput::FullScene
     }
-    fn detection_range(&self) -> f64 {
-        0.28
+    fn env(&self) -> EnvParams {
+        EnvParams::default()
     }
     fn check_fleet(&self, _uavs: usize, _users: usize) -> Result<(), Invalid> {
         Ok(())

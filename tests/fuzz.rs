@@ -329,6 +329,7 @@ impl Subject {
         let (mut memory, mut headings) = (vec![0.0; policy.memory_len(3, 5)], [0; 3]);
         policy.start(3, 5, 1, &mut memory);
         policy.act(&mut [FleetStep {
+            env: policy.env(),
             graph: &self.graph,
             step: 0,
             memory: &mut memory,

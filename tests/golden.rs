@@ -14,8 +14,8 @@ use qedgix::learner::loss::{Loss, TdLambda, Trace};
 use qedgix::nn::Adam;
 use qedgix::policy::mixer::MixerKind;
 use qedgix::policy::{
-    AgentConfig, Aggregation, Dims, Geometry, GeometryConfig, Gnn, HopSearch, Identity, ObservationKind, TOKEN, flat_observation,
-    flat_state,
+    AgentConfig, Aggregation, Dims, EnvParams, Geometry, GeometryConfig, Gnn, HopSearch, Identity, ObservationKind, TOKEN,
+    flat_observation, flat_state,
 };
 use safetensors::{Dtype, SafeTensors};
 
@@ -124,9 +124,13 @@ impl Config {
             dims: Dims {
                 uavs: count("M")?,
                 users: count("N")?,
-                actions: count("A")?,
-                detection_range: real("d")?,
-                episode_slots: count("K")?,
+                env: EnvParams {
+                    actions: count("A")?,
+                    detection_range: real("d")?,
+                    communication_range: real("d")?,
+                    slots: count("K")?,
+                    ..EnvParams::default()
+                },
             },
             mixer: match text("mixer")? {
                 "qmix" => MixerKind::Qmix,
@@ -206,7 +210,7 @@ fn check(file: &Path) -> Checked<String> {
     let all = SafeTensors::deserialize(&bytes).map_err(|e| e.to_string())?;
     let mut tensors = Tensors { all, read: BTreeSet::new() };
     let mut report = Report::default();
-    let Dims { uavs: m, users: n, episode_slots: k, actions, .. } = config.dims;
+    let Dims { uavs: m, users: n, env: EnvParams { slots: k, actions, .. } } = config.dims;
     let b = config.batch;
 
     let episodes = Episodes {
@@ -269,10 +273,11 @@ fn check(file: &Path) -> Checked<String> {
 
 /// Compares the detections of all pairs, exactly, and the flat observation of every node and the flat state if recorded.
 fn check_features(config: &Config, episodes: &Episodes, tensors: &mut Tensors<'_>, report: &mut Report) -> Checked<()> {
-    let Dims { uavs: m, users: n, episode_slots: k, detection_range: range, .. } = config.dims;
+    let Dims { uavs: m, users: n, env: EnvParams { slots: k, detection_range: range, .. } } = config.dims;
     let (b, nodes, width) = (episodes.len, m + n, 2 * m + 3 * n);
     // With one layer, the geometry has the detections of users too.
-    let wanted = GeometryConfig { range, episode_slots: k, layers: 1, self_loops: config.agent.self_loops, hops: 1 };
+    let wanted =
+        GeometryConfig { ranges: range.into(), episode_slots: k, layers: 1, self_loops: config.agent.self_loops, hops: 1 };
     let (mut geometry, mut search) = (Geometry::default(), HopSearch::default());
     geometry.clear();
     let mut state = vec![0.0; b * (k + 1) * width];

@@ -7,7 +7,7 @@ use qedgix::nn::{
     Batch, Graph, GraphLayer, Gru, HIDDEN, LayerCache, LayerScratch, Linear, Mlp, MlpCache, ParameterLayout, Weights,
 };
 use qedgix::policy::mixer::MixerKind;
-use qedgix::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, ObservationKind};
+use qedgix::policy::{AgentConfig, Aggregation, Dims, EnvParams, Gnn, Identity, ObservationKind};
 use qedgix::rng;
 use rand::RngExt;
 use sample::{AGENT, episodes};
@@ -246,7 +246,7 @@ fn whole_loss() {
         ("iql", AgentConfig { gnn: Gnn::None, identity: Identity::Token, ..set }, MixerKind::None),
     ];
     for (name, agent, mixer) in cases {
-        let dims = Dims { uavs: 3, users: 4, actions: 9, detection_range: 0.28, episode_slots: 3 };
+        let dims = Dims { uavs: 3, users: 4, env: EnvParams { actions: 9, slots: 3, ..EnvParams::default() } };
         let td_lambda = TdLambda { gamma: 0.95, lambda: 0.6 };
         let mut loss = Loss::<f64>::new(agent, dims, mixer, td_lambda, 1);
         let layout = loss.layout().clone();

@@ -9,14 +9,16 @@ use qedgix::learner::{Algorithm, Learner, Preset, TrainConfig};
 use qedgix::nn::{Batch, Graph, GraphLayer, HIDDEN, LayerCache, ParameterLayout, Rows, Weights};
 use qedgix::policy::mixer::{Mixer, MixerCache, MixerKind};
 use qedgix::policy::{
-    Agent, AgentConfig, BatchedAgent, Dims, FleetGraph, FleetStep, Geometry, GeometryConfig, Gnn, HopSearch, Identity,
+    Agent, AgentConfig, BatchedAgent, Dims, EnvParams, FleetGraph, FleetStep, Geometry, GeometryConfig, Gnn, HopSearch, Identity,
     LearnedPolicy, ObservationKind, Policy, RequiredInput, StepInput, TOKEN,
 };
 use qedgix::rng;
 use rand::RngExt;
 use sample::{AGENT, episodes};
 
-const DIMS: Dims = Dims { uavs: 3, users: 5, actions: 8, detection_range: 0.28, episode_slots: 80 };
+const ENV: EnvParams =
+    EnvParams { speed: 0.04, transmission_range: 0.12, detection_range: 0.28, communication_range: 0.28, actions: 8, slots: 80 };
+const DIMS: Dims = Dims { uavs: 3, users: 5, env: ENV };
 const SET: AgentConfig =
     AgentConfig { observation: ObservationKind::Set, identity: Identity::Phase, self_position: true, ..AGENT };
 
@@ -34,7 +36,7 @@ fn graph(uavs: usize, users: usize, seed: u64) -> FleetGraph {
     let mut points = |n: usize| -> Vec<Point> { (0..n).map(|_| [0, 1].map(|_| 0.3 + 0.4 * stream.random::<f64>())).collect() };
     let (uavs, users) = (points(uavs), points(users));
     let aoi: Vec<f32> = (0..users.len()).map(|i| (i * 7 % 40) as f32).collect();
-    FleetGraph::from_scene(&uavs, &users, &aoi, DIMS.detection_range)
+    FleetGraph::from_scene(&uavs, &users, &aoi, DIMS.env.detection_range)
 }
 
 /// A fleet with its graph, memory and last results.
@@ -55,7 +57,7 @@ impl Fleet {
 
     fn turn(&mut self) -> FleetStep<'_> {
         let Self { graph, memory, headings, q } = self;
-        FleetStep { graph, step: 0, memory, headings, q_values: Some(q) }
+        FleetStep { env: ENV, graph, step: 0, memory, headings, q_values: Some(q) }
     }
 
     fn bits(&self) -> (Vec<u32>, Vec<u8>, Vec<u32>) {
@@ -98,7 +100,7 @@ fn more_hops_observe_exactly_the_nodes_within_that_many_links() {
     let users: Vec<Point> = (1..=4).map(|i| [0.2 * f64::from(i), 0.0]).collect();
     let graph = FleetGraph::from_scene(&[[0.0, 0.0], [1.0, 0.0]], &users, &[8.0, 16.0, 24.0, 32.0], 0.25);
     for (hops, reach) in [(1, [2].as_slice()), (2, &[2, 3]), (3, &[2, 3, 4]), (4, &[2, 3, 4, 5]), (5, &[1, 2, 3, 4, 5])] {
-        let config = GeometryConfig { range: 0.25, episode_slots: 80, layers: 0, self_loops: false, hops };
+        let config = GeometryConfig { ranges: 0.25.into(), episode_slots: 80, layers: 0, self_loops: false, hops };
         let (mut geometry, mut search) = (Geometry::default(), HopSearch::default());
         geometry.clear();
         // Several equal fleets: each gets its own nodes.
@@ -124,7 +126,7 @@ fn more_hops_hold_no_more_detections() {
     let graph = FleetGraph::from_scene(&uavs, &[], &[], 0.05);
     let mut held = Vec::new();
     for (hops, observed) in [(1, 4), (9, 180)] {
-        let config = GeometryConfig { range: 0.05, episode_slots: 80, layers: 0, self_loops: false, hops };
+        let config = GeometryConfig { ranges: 0.05.into(), episode_slots: 80, layers: 0, self_loops: false, hops };
         let (mut geometry, mut search) = (Geometry::default(), HopSearch::default());
         geometry.clear();
         geometry.push_graph(&config, &graph);
@@ -141,8 +143,8 @@ fn batched_agent_policy_and_update_compute_the_same_values() {
     let configs =
         [AGENT, SET, AgentConfig { identity: Identity::Token, ..plain }, AgentConfig { hops: 3, normalise: true, ..plain }];
     for config in configs {
-        let dims = Dims { episode_slots: 6, ..DIMS };
-        let (m, n, slots) = (dims.uavs, dims.users, dims.episode_slots);
+        let dims = Dims { env: EnvParams { slots: 6, ..ENV }, ..DIMS };
+        let (m, n, slots) = (dims.uavs, dims.users, dims.env.slots);
         let ep = episodes(&dims, 2, 8);
         let td_lambda = TdLambda { gamma: 0.99, lambda: 0.6 };
         let mut loss = Loss::<f32>::new(config, dims, MixerKind::Vdn, td_lambda, 1);
@@ -169,12 +171,13 @@ fn batched_agent_policy_and_update_compute_the_same_values() {
                 let (uav_xy, user_xy) = (&ep.uav_xy[at * 2 * m..][..2 * m], &ep.user_xy[e * 2 * n..][..2 * n]);
                 let aoi = &ep.aoi[at * n..][..n];
                 let q = batched_agent.step(&agent, StepInput { uav_xy, user_xy, aoi }).to_vec();
-                assert_eq!(q, trace.q[at * m * dims.actions..][..m * dims.actions], "slot {t}, {config:?}");
+                assert_eq!(q, trace.q[at * m * dims.env.actions..][..m * dims.env.actions], "slot {t}, {config:?}");
 
                 let points = |xy: &[f32]| -> Vec<Point> { xy.chunks_exact(2).map(|p| [p[0].into(), p[1].into()]).collect() };
-                let graph = FleetGraph::from_scene(&points(uav_xy), &points(user_xy), aoi, dims.detection_range);
+                let graph = FleetGraph::from_scene(&points(uav_xy), &points(user_xy), aoi, dims.env.detection_range);
                 let (mut headings, mut served) = (vec![0; m], vec![0.0; q.len()]);
                 let turn = FleetStep {
+                    env: dims.env,
                     graph: &graph,
                     step: 0,
                     memory: &mut memory,
@@ -206,9 +209,16 @@ fn uavs_separate_only_with_an_identity() {
         policy.start(3, 5, seed, &mut memory);
         let mut separated = false;
         for step in 0..80 {
-            let graph = FleetGraph::from_scene(&uavs, &users, &[step as f32; 5], DIMS.detection_range);
+            let graph = FleetGraph::from_scene(&uavs, &users, &[step as f32; 5], DIMS.env.detection_range);
             let mut headings = [0; 3];
-            policy.act(&mut [FleetStep { graph: &graph, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
+            policy.act(&mut [FleetStep {
+                env: policy.env(),
+                graph: &graph,
+                step,
+                memory: &mut memory,
+                headings: &mut headings,
+                q_values: None,
+            }]);
             for (p, h) in uavs.iter_mut().zip(headings) {
                 let (sin, cos) = (f64::from(h) * std::f64::consts::FRAC_PI_4).sin_cos();
                 *p = [(p[0] + 0.04 * cos).clamp(0.0, 1.0), (p[1] + 0.04 * sin).clamp(0.0, 1.0)];
@@ -230,11 +240,18 @@ fn uavs_separate_only_with_an_identity() {
 /// Q-values of one slot, for UAVs and users in the order given.
 fn values(policy: &LearnedPolicy, uavs: &[Point], users: &[(Point, f32)]) -> Vec<f32> {
     let (points, aoi): (Vec<Point>, Vec<f32>) = users.iter().copied().unzip();
-    let graph = FleetGraph::from_scene(uavs, &points, &aoi, DIMS.detection_range);
+    let graph = FleetGraph::from_scene(uavs, &points, &aoi, DIMS.env.detection_range);
     let mut memory = vec![0.0; policy.memory_len(uavs.len(), users.len())];
     policy.start(uavs.len(), users.len(), 0, &mut memory);
     let (mut headings, mut q) = (vec![0; uavs.len()], vec![0.0; uavs.len() * 8]);
-    policy.act(&mut [FleetStep { graph: &graph, step: 0, memory: &mut memory, headings: &mut headings, q_values: Some(&mut q) }]);
+    policy.act(&mut [FleetStep {
+        env: policy.env(),
+        graph: &graph,
+        step: 0,
+        memory: &mut memory,
+        headings: &mut headings,
+        q_values: Some(&mut q),
+    }]);
     q
 }
 

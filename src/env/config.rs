@@ -40,6 +40,35 @@ pub enum Layout {
     Given(Vec<Point>),
 }
 
+/// Ranges within which nodes detect each other, in units of the square's side.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ranges {
+    /// Between a user and any node.
+    pub detection: f64,
+    /// Between two UAVs.
+    pub communication: f64,
+}
+
+impl From<f64> for Ranges {
+    /// One range for all nodes.
+    fn from(range: f64) -> Self {
+        Self { detection: range, communication: range }
+    }
+}
+
+impl Ranges {
+    /// The range between nodes `i` and `j` of a fleet with `uavs` UAVs, which come first.
+    #[inline(always)]
+    pub fn between(&self, i: usize, j: usize, uavs: usize) -> f64 {
+        if i.max(j) < uavs { self.communication } else { self.detection }
+    }
+
+    /// The larger range.
+    pub fn max(&self) -> f64 {
+        self.detection.max(self.communication)
+    }
+}
+
 /// Everything that determines an environment except the episode's seed. Lengths are in units of the square's side.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -56,6 +85,9 @@ pub struct EnvConfig {
     pub transmission_range: f64,
     /// d, range within which nodes detect each other; at least t.
     pub detection_range: f64,
+    /// Range within which UAVs exchange messages and learn each other's positions; absent: d. In the paper it is d.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub communication_range: Option<f64>,
     /// Adds a ninth action that stays in place.
     pub hover: bool,
     /// Rule at the border.
@@ -81,6 +113,7 @@ impl Default for EnvConfig {
             speed: 0.04,
             transmission_range: 0.12,
             detection_range: 0.28,
+            communication_range: None,
             hover: false,
             boundary: Boundary::Clamp,
             reward_scale: None,
@@ -104,6 +137,12 @@ impl EnvConfig {
     /// V = M + N.
     pub fn nodes(&self) -> usize {
         self.uavs + self.users
+    }
+
+    /// Ranges within which nodes detect each other.
+    pub fn ranges(&self) -> Ranges {
+        let detection = self.detection_range;
+        Ranges { detection, communication: self.communication_range.unwrap_or(detection) }
     }
 
     /// `reward_scale`, or its default 1/K.
@@ -133,6 +172,9 @@ impl EnvConfig {
         if self.detection_range < self.transmission_range {
             let expected = format!("at least transmission_range ({})", self.transmission_range);
             return Err(Invalid::new("detection_range", self.detection_range, expected));
+        }
+        if let Some(range) = self.communication_range {
+            in_range("communication_range", range, 0.0..=10.0)?;
         }
         if let Some(scale) = self.reward_scale {
             in_range("reward_scale", scale, 1e-9..=1e9)?;

@@ -9,7 +9,7 @@ mod point;
 mod walk;
 
 pub use batch::{BatchEnv, StepError};
-pub use config::{Boundary, EnvConfig, Layout, Start};
+pub use config::{Boundary, EnvConfig, Layout, Ranges, Start};
 pub use episode::Episode;
 pub use metrics::EpisodeMetrics;
 pub use point::{Point, points};

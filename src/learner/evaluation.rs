@@ -6,7 +6,7 @@
 use super::disturbance::Disturbance;
 use crate::env::{BatchEnv, EnvConfig, EpisodeMetrics, Point, points};
 use crate::invalid::{Invalid, in_range};
-use crate::policy::{FleetGraph, FleetStep, Policy};
+use crate::policy::{EnvParams, FleetGraph, FleetStep, Policy};
 
 /// Runs `policy` on the episodes with these seeds, split among `threads`. Returns the metrics in the order of `seeds`. A policy
 /// with fewer actions than the environment uses the first ones.
@@ -156,7 +156,7 @@ fn run(
     disturbance: &Disturbance,
     observer: &mut impl Observer,
 ) -> Result<Vec<EpisodeMetrics>, Invalid> {
-    let (m, n) = (config.uavs, config.users);
+    let (m, n, params) = (config.uavs, config.users, EnvParams::from(config));
     let mut env = BatchEnv::new(config, seeds.len())?;
     env.reset(seeds);
     let width = policy.memory_len(m, n);
@@ -180,13 +180,20 @@ fn run(
             users.clear();
             users.extend(points(&env.user_xy()[b * n * 2..][..n * 2]));
             disturbance.distort(config, seed, step, &mut uavs, &mut users);
-            graph.set_scene(&uavs, &users, &env.aoi()[b * n..(b + 1) * n], config.detection_range);
+            graph.set_scene(&uavs, &users, &env.aoi()[b * n..(b + 1) * n], params.ranges());
         }
         let mut steps: Vec<FleetStep<'_>> = graphs
             .iter()
             .zip(&mut memories)
             .zip(headings.chunks_exact_mut(m))
-            .map(|((graph, memory), headings)| FleetStep { graph, step: step as u64, memory, headings, q_values: None })
+            .map(|((graph, memory), headings)| FleetStep {
+                env: params,
+                graph,
+                step: step as u64,
+                memory,
+                headings,
+                q_values: None,
+            })
             .collect();
         policy.act(&mut steps);
         env.step(&headings);

@@ -155,7 +155,7 @@ impl<T: Real> Loss<T> {
         assert!(episodes.len > 0, "a batch of at least one episode");
         assert_eq!(
             (episodes.uavs, episodes.users, episodes.slots),
-            (dims.uavs, dims.users, dims.episode_slots),
+            (dims.uavs, dims.users, dims.env.slots),
             "episodes of M, N, K"
         );
         let [prepared_online, prepared_target] = &mut self.prepared;
@@ -199,7 +199,7 @@ impl<T: Real> Loss<T> {
             let join = |part: fn(&Trace<T>) -> &[T]| chunks.iter().flat_map(|c| part(&c.trace)).copied().collect();
             *trace = Trace { q: join(|t| &t.q), q_tot: join(|t| &t.q_tot), target: join(|t| &t.target) };
         }
-        let count = (episodes.len * dims.episode_slots * self.mixer.joint_values_per_slot()) as f64;
+        let count = (episodes.len * dims.env.slots * self.mixer.joint_values_per_slot()) as f64;
         LossMetrics {
             loss: 0.5 * chunks.iter().map(|c| c.loss).sum::<f64>() / count,
             grad_norm: self.norms.iter().sum::<f64>().sqrt(),
@@ -233,7 +233,7 @@ impl<T: Real> Pass<'_, T> {
         }
 
         // Double Q-learning: the online network chooses the action, the target network gives its value. Slot 0 is not needed.
-        let actions = self.agent.dims().actions;
+        let actions = self.agent.dims().env.actions;
         // Row (slot, episode, UAV) of the batch, and the action in the order (episode, slot, UAV).
         let action = |row: usize| {
             let (slot, episode, uav) = (row / per_slot, range.start + row / m % b, row % m);

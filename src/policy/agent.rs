@@ -8,6 +8,7 @@
 //!
 //! Each layer computes all slots of all fleets at once. UAV rows are time-major: slot, fleet, UAV.
 
+use super::EnvParams;
 use super::config::{AgentConfig, Aggregation, Gnn, Identity, ObservationKind};
 use super::features::{Inputs, SetEncoder, flat_observation, identity_width, write_action_identity_position};
 use super::geometry::{Geometry, GeometryConfig};
@@ -26,12 +27,8 @@ pub struct Dims {
     pub uavs: usize,
     /// N.
     pub users: usize,
-    /// A, the number of actions.
-    pub actions: usize,
-    /// d.
-    pub detection_range: f64,
-    /// K, the slots of an episode, by which AoI is divided.
-    pub episode_slots: usize,
+    /// The environment. AoI is divided by its K.
+    pub env: EnvParams,
 }
 
 /// An agent's architecture and the layout of its parameters.
@@ -102,10 +99,10 @@ impl Agent {
         let mut layout = ParameterLayout::default();
         let m = dims.uavs;
         let sets = (config.observation == ObservationKind::Set)
-            .then(|| SetEncoder::new(&mut layout, "agent.sets", dims.detection_range));
+            .then(|| SetEncoder::new(&mut layout, "agent.sets", dims.env.detection_range));
         let observation = if sets.is_some() { SetEncoder::WIDTH } else { 2 * m + 3 * dims.users };
         let position = if config.self_position { 2 } else { 0 };
-        let input = observation + dims.actions + identity_width(config.identity, m) + position;
+        let input = observation + dims.env.actions + identity_width(config.identity, m) + position;
         let fc = Linear::new(&mut layout, "agent.fc", input, HIDDEN);
         let rnn = Gru::new(&mut layout, "agent.rnn");
         let mean = config.aggregation == Aggregation::Mean;
@@ -115,12 +112,12 @@ impl Agent {
             Gnn::Rgcn => &|layout, name| GraphLayer::rgcn(layout, name),
         };
         let body = if config.gnn == Gnn::None {
-            Body::Plain { head: Linear::new(&mut layout, "agent.head", HIDDEN, dims.actions) }
+            Body::Plain { head: Linear::new(&mut layout, "agent.head", HIDDEN, dims.env.actions) }
         } else {
             let w1 = Linear::new(&mut layout, "agent.w1", HIDDEN, HIDDEN);
             let w2 = Linear::new(&mut layout, "agent.w2", observation, HIDDEN);
             let layers = (0..config.layers).map(|l| layer(&mut layout, &format!("agent.layers.{l}"))).collect();
-            Body::Graph { w1, w2, layers, head: Mlp::new(&mut layout, "agent.head", 2 * HIDDEN, dims.actions) }
+            Body::Graph { w1, w2, layers, head: Mlp::new(&mut layout, "agent.head", 2 * HIDDEN, dims.env.actions) }
         };
         Self { config, dims, layout, sets, fc, rnn, body, observation_width: observation }
     }
@@ -143,10 +140,10 @@ impl Agent {
     /// Configuration of geometries for this agent.
     pub fn geometry_config(&self) -> GeometryConfig {
         let layers = if self.config.gnn == Gnn::None { 0 } else { self.config.layers };
-        let Dims { detection_range, episode_slots, .. } = self.dims;
+        let env = &self.dims.env;
         GeometryConfig {
-            range: detection_range,
-            episode_slots,
+            ranges: env.ranges(),
+            episode_slots: env.slots,
             layers,
             self_loops: self.config.self_loops,
             hops: self.config.hops,
@@ -199,7 +196,7 @@ impl Agent {
 
     /// Factor of relative positions in flat observations.
     fn flat_scale(&self) -> f64 {
-        if self.config.normalise { 1.0 / self.dims.detection_range } else { 1.0 }
+        if self.config.normalise { 1.0 / self.dims.env.detection_range } else { 1.0 }
     }
 
     /// Writes the observations of rows `first` and following, `stride` apart.
@@ -247,14 +244,14 @@ impl Agent {
         c.input.resize(self.fc.inputs, uavs);
         self.observe(w, (inputs.geometry, 0), &mut c.search, (c.input.as_mut_slice(), self.fc.inputs));
         for (r, input) in c.input.as_mut_slice().chunks_exact_mut(self.fc.inputs).enumerate() {
-            write_action_identity_position(&self.config, self.dims.actions, inputs, r, &mut input[self.observation_width..]);
+            write_action_identity_position(&self.config, self.dims.env.actions, inputs, r, &mut input[self.observation_width..]);
         }
         c.x.resize(HIDDEN, uavs);
         self.fc.forward(w, c.input.rows(), c.x.rows_mut());
         relu(c.x.as_mut_slice());
         self.rnn.forward(w, c.x.rows(), slots, &mut c.gates, &mut c.h);
         let h = hidden(&c.h, uavs);
-        c.q.resize(self.dims.actions, uavs);
+        c.q.resize(self.dims.env.actions, uavs);
         match &self.body {
             Body::Plain { head } => head.forward(w, h, c.q.rows_mut()),
             Body::Graph { w1, w2, layers, head } => {

@@ -2,7 +2,7 @@
 //! (docs/model.md, "Observations").
 
 use super::neighbor_search::{Detection, NeighborSearch};
-use crate::env::Point;
+use crate::env::{Point, Ranges};
 
 /// What all nodes of a fleet detect in one slot, as lists of detections. Nodes 0..M are UAVs, nodes M..M+N are users. No node is
 /// in its own list.
@@ -34,15 +34,15 @@ impl PartialEq for FleetGraph {
 }
 
 impl FleetGraph {
-    /// The graph of a scene: nodes within `range` (distance^2 <= range^2, in f64) detect each other.
+    /// The graph of a scene: nodes within range (distance^2 <= range^2, in f64) detect each other.
     ///
     /// Work and memory grow with the nodes and the detections, not with the square of the nodes.
     ///
     /// # Panics
     /// When `aoi` does not have one entry per user.
-    pub fn from_scene(uavs: &[Point], users: &[Point], aoi: &[f32], range: f64) -> Self {
+    pub fn from_scene(uavs: &[Point], users: &[Point], aoi: &[f32], ranges: impl Into<Ranges>) -> Self {
         let mut graph = Self::default();
-        graph.set_scene(uavs, users, aoi, range);
+        graph.set_scene(uavs, users, aoi, ranges.into());
         graph
     }
 
@@ -67,9 +67,15 @@ impl FleetGraph {
     ///
     /// # Panics
     /// When `aoi` does not have one entry per user.
-    pub fn from_scene_within(uavs: &[Point], users: &[Point], aoi: &[f32], range: f64, max_detections: usize) -> Option<Self> {
+    pub fn from_scene_within(
+        uavs: &[Point],
+        users: &[Point],
+        aoi: &[f32],
+        ranges: impl Into<Ranges>,
+        max_detections: usize,
+    ) -> Option<Self> {
         let mut graph = Self::default();
-        graph.rebuild(uavs, users, aoi, range, max_detections).then_some(graph)
+        graph.rebuild(uavs, users, aoi, ranges.into(), max_detections).then_some(graph)
     }
 
     /// As [`FleetGraph::from_detections`], from all lists in one vector: the list of node i is
@@ -98,12 +104,12 @@ impl FleetGraph {
     ///
     /// # Panics
     /// When `aoi` does not have one entry per user.
-    pub fn set_scene(&mut self, uavs: &[Point], users: &[Point], aoi: &[f32], range: f64) {
-        self.rebuild(uavs, users, aoi, range, usize::MAX);
+    pub fn set_scene(&mut self, uavs: &[Point], users: &[Point], aoi: &[f32], ranges: impl Into<Ranges>) {
+        self.rebuild(uavs, users, aoi, ranges.into(), usize::MAX);
     }
 
     /// Returns false and leaves the graph incomplete if there are more than `max_detections` detections.
-    fn rebuild(&mut self, uavs: &[Point], users: &[Point], aoi: &[f32], range: f64, max_detections: usize) -> bool {
+    fn rebuild(&mut self, uavs: &[Point], users: &[Point], aoi: &[f32], ranges: Ranges, max_detections: usize) -> bool {
         assert_eq!(aoi.len(), users.len(), "one AoI per user");
         self.uavs = uavs.len();
         self.users = users.len();
@@ -122,9 +128,9 @@ impl FleetGraph {
         self.points.extend_from_slice(uavs);
         self.points.extend_from_slice(users);
         self.search.append_detections(
-            &self.points,
+            (&self.points, uavs.len()),
             self.points.len(),
-            range,
+            ranges,
             (&mut self.offsets, &mut self.detections),
             max_detections,
         )

@@ -7,7 +7,7 @@
 use super::fleet_graph::FleetGraph;
 use super::hop_search::HopSearch;
 use super::neighbor_search::{Detection, NeighborSearch};
-use crate::env::{Point, points};
+use crate::env::{Point, Ranges, points};
 use crate::nn::Graph;
 
 /// Marks a node without a row.
@@ -69,8 +69,8 @@ pub struct Geometry {
 /// How a geometry is built.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GeometryConfig {
-    /// d.
-    pub range: f64,
+    /// Ranges within which nodes detect each other.
+    pub ranges: Ranges,
     /// K, the slots of an episode, by which AoI is divided.
     pub episode_slots: usize,
     /// Number of graph layers; 0 without a graph.
@@ -113,7 +113,7 @@ impl Geometry {
         self.points.extend(points(uav_xy).chain(points(user_xy)));
         let observers = config.observers(uavs, users);
         let lists = (&mut self.offsets, &mut self.detections);
-        self.search.append_detections(&self.points, observers, config.range, lists, usize::MAX);
+        self.search.append_detections((&self.points, uavs), observers, config.ranges, lists, usize::MAX);
         self.offsets.resize(self.row_of.len() + 1, self.detections.len() as u32);
         self.aoi_scaled.extend(aoi.iter().map(|a| a / config.episode_slots as f32));
     }

@@ -10,7 +10,7 @@ use super::agent::{Agent, AgentCache, Dims};
 use super::config::{AgentConfig, Identity, TOKEN};
 use super::features::{Inputs, NO_ACTION};
 use super::geometry::Geometry;
-use super::{FleetStep, Policy, RequiredInput};
+use super::{EnvParams, FleetStep, Policy, RequiredInput};
 use crate::invalid::Invalid;
 use crate::nn::{HIDDEN, Weights, argmax};
 use crate::rng;
@@ -75,15 +75,15 @@ impl LearnedPolicy {
 
 impl Policy for LearnedPolicy {
     fn actions(&self) -> usize {
-        self.agent.dims().actions
+        self.agent.dims().env.actions
     }
 
     fn needs(&self) -> RequiredInput {
         if self.agent.config().self_position { RequiredInput::OwnPositions } else { RequiredInput::Detections }
     }
 
-    fn detection_range(&self) -> f64 {
-        self.agent.dims().detection_range
+    fn env(&self) -> EnvParams {
+        self.agent.dims().env
     }
 
     fn check_fleet(&self, uavs: usize, users: usize) -> Result<(), Invalid> {

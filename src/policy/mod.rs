@@ -4,17 +4,20 @@ mod agent;
 pub mod baselines;
 mod batched_agent;
 mod config;
+mod env_params;
 mod features;
 mod fleet_graph;
 mod geometry;
 mod hop_search;
 mod learned;
+pub mod memory;
 pub mod mixer;
 mod neighbor_search;
 
 pub use agent::{Agent, AgentCache, Dims};
 pub use batched_agent::{BatchedAgent, StepInput};
 pub use config::{AgentConfig, Aggregation, Gnn, Identity, ObservationKind, TOKEN};
+pub use env_params::EnvParams;
 pub use features::{Inputs, NO_ACTION, SetEncoder, flat_observation, flat_state};
 pub use fleet_graph::FleetGraph;
 pub use geometry::{FleetSpan, Geometry, GeometryConfig, NodeView};
@@ -22,6 +25,7 @@ pub use hop_search::HopSearch;
 pub use learned::LearnedPolicy;
 pub use neighbor_search::Detection;
 
+use crate::env::Ranges;
 use crate::invalid::Invalid;
 
 /// The input that a policy requires.
@@ -37,6 +41,8 @@ pub enum RequiredInput {
 
 /// One fleet in one slot, as an item of a batch: input, memory and output.
 pub struct FleetStep<'a> {
+    /// The environment that the fleet flies in.
+    pub env: EnvParams,
     /// What all nodes detect.
     pub graph: &'a FleetGraph,
     /// Index of the slot in the episode.
@@ -57,8 +63,13 @@ pub trait Policy: Send + Sync {
     /// The input that the policy requires.
     fn needs(&self) -> RequiredInput;
 
-    /// d, the detection range. It decides the detections in a scene.
-    fn detection_range(&self) -> f64;
+    /// The environment that the policy is made for.
+    fn env(&self) -> EnvParams;
+
+    /// The ranges that decide the detections in a scene.
+    fn ranges(&self) -> Ranges {
+        self.env().ranges()
+    }
 
     /// Checks whether the policy accepts this number of UAVs and of users.
     ///

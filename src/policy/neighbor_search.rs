@@ -1,9 +1,10 @@
-//! Finds what nodes detect: pairs of nodes with distance^2 <= range^2, computed in f64 (docs/model.md, "Observations").
+//! Finds what nodes detect: pairs of nodes with distance^2 <= range^2, computed in f64 (docs/model.md, "Observations"). The range
+//! between two UAVs is the communication range, otherwise it is the detection range.
 //!
 //! Up to [`ALL_PAIRS`] nodes, all pairs are compared. More nodes are sorted into square cells at least as wide as the range, so
 //! that work and memory grow with the nodes and the detections. Both ways give the same detections in the same order.
 
-use crate::env::Point;
+use crate::env::{Point, Ranges};
 
 /// Maximum number of nodes for which all pairs are compared.
 const ALL_PAIRS: usize = 48;
@@ -53,24 +54,25 @@ impl Grid {
 }
 
 impl NeighborSearch {
-    /// Appends what nodes 0..`observers` detect among all `points`, each list in ascending order of target and without the node
+    /// Appends what nodes 0..`observers` detect among all `points`, of which the first `uavs` are UAVs, each list in ascending order of target and without the node
     /// itself, and the end of each list to `offsets`. Stops and returns false when `detections` is longer than `max_detections`.
     pub(super) fn append_detections(
         &mut self,
-        points: &[Point],
+        (points, uavs): (&[Point], usize),
         observers: usize,
-        range: f64,
+        ranges: Ranges,
         (offsets, detections): (&mut Vec<u32>, &mut Vec<Detection>),
         max_detections: usize,
     ) -> bool {
         if points.len() <= ALL_PAIRS {
             for (i, &from) in points[..observers].iter().enumerate() {
-                detections.extend(points.iter().enumerate().filter_map(|(j, &to)| detect(i, from, j, to, range)));
+                detections
+                    .extend(points.iter().enumerate().filter_map(|(j, &to)| detect(i, from, j, to, ranges.between(i, j, uavs))));
                 offsets.push(detections.len() as u32);
             }
             return detections.len() <= max_detections;
         }
-        let grid = Grid::new(points, range);
+        let grid = Grid::new(points, ranges.max());
         self.sort_into_cells(points, &grid);
         for (i, &from) in points[..observers].iter().enumerate() {
             let first = detections.len();
@@ -79,7 +81,7 @@ impl NeighborSearch {
                 let (left, right) = (x.saturating_sub(1), (x + 1).min(grid.side - 1));
                 let cells = self.starts[row * grid.side + left] as usize..self.starts[row * grid.side + right + 1] as usize;
                 let near = self.nodes[cells].iter().map(|&j| j as usize);
-                detections.extend(near.filter_map(|j| detect(i, from, j, points[j], range)));
+                detections.extend(near.filter_map(|j| detect(i, from, j, points[j], ranges.between(i, j, uavs))));
             }
             detections[first..].sort_unstable_by_key(|d| d.target);
             offsets.push(detections.len() as u32);
@@ -127,10 +129,11 @@ mod tests {
 
     use super::*;
 
-    fn pairs(points: &[Point], range: f64) -> (Vec<u32>, Vec<Detection>) {
+    fn pairs(points: &[Point], uavs: usize, ranges: Ranges) -> (Vec<u32>, Vec<Detection>) {
         let (mut offsets, mut detections) = (vec![0], Vec::new());
         for (i, &from) in points.iter().enumerate() {
-            detections.extend(points.iter().enumerate().filter_map(|(j, &to)| detect(i, from, j, to, range)));
+            let detect = |(j, &to)| detect(i, from, j, to, ranges.between(i, j, uavs));
+            detections.extend(points.iter().enumerate().filter_map(detect));
             offsets.push(detections.len() as u32);
         }
         (offsets, detections)
@@ -149,14 +152,24 @@ mod tests {
             };
             let points: Vec<Point> = (0..n).map(|i| [coordinate(i), coordinate(i)]).collect();
             let (mut offsets, mut detections) = (vec![0], Vec::new());
-            assert!(NeighborSearch::default().append_detections(
-                &points,
-                points.len(),
-                range,
-                (&mut offsets, &mut detections),
-                usize::MAX
-            ));
-            assert_eq!((offsets, detections), pairs(&points, range), "{n} nodes, range {range}");
+            for communication in [range, 0.3 * range, 2.5 * range] {
+                let ranges = Ranges { detection: range, communication };
+                let uavs = points.len() / 3;
+                offsets.truncate(1);
+                detections.clear();
+                assert!(NeighborSearch::default().append_detections(
+                    (&points, uavs),
+                    points.len(),
+                    ranges,
+                    (&mut offsets, &mut detections),
+                    usize::MAX
+                ));
+                assert_eq!(
+                    (&offsets, &detections),
+                    (&pairs(&points, uavs, ranges).0, &pairs(&points, uavs, ranges).1),
+                    "{n} nodes, {ranges:?}"
+                );
+            }
         }
     }
 }

@@ -4,7 +4,7 @@
 //! policy's detection range and needs: it computes the detections of a scene, and completes a graph.
 
 use super::FleetIds;
-use crate::env::Point;
+use crate::env::{Point, Ranges};
 use crate::invalid::Invalid;
 use crate::policy::{Detection, FleetGraph, Policy, RequiredInput};
 
@@ -122,11 +122,11 @@ impl SceneOrGraph {
     /// As [`FleetInput::into_fleet_graph`].
     pub fn into_fleet_graph(self, (uavs, users): (usize, usize), policy: &dyn Policy) -> Result<FleetGraph, Invalid> {
         policy.check_fleet(uavs, users)?;
-        let range = policy.detection_range();
+        let ranges = policy.ranges();
         match self {
-            Self::Scene(Scene { uavs, users, aoi }) => FleetGraph::from_scene_within(&uavs, &users, &aoi, range, MAX_DETECTIONS)
+            Self::Scene(Scene { uavs, users, aoi }) => FleetGraph::from_scene_within(&uavs, &users, &aoi, ranges, MAX_DETECTIONS)
                 .ok_or_else(|| too_many_detections("scene")),
-            Self::Graph(graph) => graph.into_fleet_graph(policy.needs(), range),
+            Self::Graph(graph) => graph.into_fleet_graph(policy.needs(), ranges),
         }
     }
 }
@@ -141,7 +141,7 @@ fn is_within(rel: &Point, range: f64) -> bool {
 }
 
 impl ReportedGraph {
-    fn into_fleet_graph(self, needs: RequiredInput, range: f64) -> Result<FleetGraph, Invalid> {
+    fn into_fleet_graph(self, needs: RequiredInput, ranges: Ranges) -> Result<FleetGraph, Invalid> {
         if needs == RequiredInput::FullScene {
             return Err(Invalid::missing("scene", "a scene instead of a graph, because this policy needs all positions"));
         }
@@ -155,8 +155,8 @@ impl ReportedGraph {
             };
             return Err(Invalid::missing(field, "the position of the UAV, which this policy needs"));
         }
-        self.check_range(range)?;
-        let derived = self.derive_user_detections(range)?;
+        self.check_ranges(ranges)?;
+        let derived = self.derive_user_detections(ranges.detection)?;
         let mut offsets = Vec::with_capacity(self.detections.len() + 1);
         offsets.push(0);
         let mut detections = Vec::with_capacity(self.detections.iter().map(Vec::len).chain(derived.iter().map(Vec::len)).sum());
@@ -188,13 +188,15 @@ impl ReportedGraph {
     }
 
     /// Rejects detections beyond the range: the caller uses other units, or a sensor that the policy was not trained with.
-    fn check_range(&self, range: f64) -> Result<(), Invalid> {
+    fn check_ranges(&self, ranges: Ranges) -> Result<(), Invalid> {
+        let uavs = self.positions.len();
         for (node, list) in self.detections.iter().enumerate() {
             for detection in list.iter().filter(|d| !d.mirrored) {
+                let range = ranges.between(node, detection.target as usize, uavs);
                 if !is_within(&detection.rel, range * RANGE_TOLERANCE) {
                     let [x, y] = detection.rel;
                     let field = self.rel_field(node, detection.request_index, usize::from(y.abs() > x.abs()));
-                    let expected = format!("a position within the detection range of the policy ({range})");
+                    let expected = format!("a position within the range of the policy ({range})");
                     return Err(Invalid::new(field, format!("({x}, {y})"), expected));
                 }
             }

@@ -70,7 +70,7 @@ impl LoadedPolicy {
             users: None,
             actions: policy.actions(),
             needs: policy.needs(),
-            detection_range: policy.detection_range(),
+            detection_range: policy.env().detection_range,
             config: Value::Null,
             metrics: Value::Null,
             created_at,

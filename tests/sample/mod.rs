@@ -21,7 +21,8 @@ pub const AGENT: AgentConfig = AgentConfig {
 
 /// Episodes of UAVs that fly at random from the centre. Each episode has its own users.
 pub fn episodes(dims: &Dims, len: usize, seed: u64) -> Episodes {
-    let Dims { uavs, users, actions, episode_slots: slots, .. } = *dims;
+    let Dims { uavs, users, env } = *dims;
+    let (actions, slots) = (env.actions, env.slots);
     let mut stream = rng::stream(seed, "episodes", 0);
     let mut ep = Episodes { len, uavs, users, slots, ..Episodes::default() };
     for _ in 0..len {

@@ -3,8 +3,9 @@
 use std::sync::Arc;
 
 use bytes::Bytes;
+use qedgix::policy::EnvParams;
 use qedgix::policy::FleetStep;
-use qedgix::policy::baselines::{EnvParams, LIST, by_name};
+use qedgix::policy::baselines::{LIST, by_name};
 use qedgix::serving::FleetInput;
 use qedgix::wire::v1;
 use tonic::Code;
@@ -51,7 +52,14 @@ fn offline(name: &str, slots: u64, seed: u64) -> Vec<Vec<u8>> {
     let decide = |step| {
         let slot = FleetInput::try_from(scene(3, 5, step)).unwrap().into_fleet_graph(&*policy).unwrap();
         let mut headings = vec![0; 3];
-        policy.act(&mut [FleetStep { graph: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
+        policy.act(&mut [FleetStep {
+            env: policy.env(),
+            graph: &slot,
+            step,
+            memory: &mut memory,
+            headings: &mut headings,
+            q_values: None,
+        }]);
         headings
     };
     (0..slots).map(decide).collect()

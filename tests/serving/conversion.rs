@@ -1,7 +1,8 @@
 //! Observations: a graph and a scene of the same slot are the same slot, and nothing that can be sent panics.
 
 use proptest::prelude::*;
-use qedgix::policy::baselines::{EnvParams, LIST, by_name};
+use qedgix::policy::EnvParams;
+use qedgix::policy::baselines::{LIST, by_name};
 use qedgix::policy::{FleetGraph, FleetStep, Policy, RequiredInput};
 use qedgix::service::act;
 use qedgix::serving::FleetInput;
@@ -19,7 +20,14 @@ fn decide(policy: &dyn Policy, graph: &FleetGraph) -> Vec<u8> {
     policy.start(uavs, users, 3, &mut memory);
     let mut headings = vec![0; uavs];
     let mut q_values = vec![0.0; uavs * policy.actions()];
-    policy.act(&mut [FleetStep { graph, step: 0, memory: &mut memory, headings: &mut headings, q_values: Some(&mut q_values) }]);
+    policy.act(&mut [FleetStep {
+        env: policy.env(),
+        graph,
+        step: 0,
+        memory: &mut memory,
+        headings: &mut headings,
+        q_values: Some(&mut q_values),
+    }]);
     headings
 }
 
@@ -35,7 +43,7 @@ fn a_graph_and_a_scene_of_the_same_slot_are_the_same_slot() {
         let scene = scene(uavs, users, seed);
         for baseline in LIST.iter().filter(|b| b.needs != RequiredInput::FullScene) {
             let policy = by_name(baseline.name, EnvParams::default()).unwrap();
-            let range = policy.detection_range();
+            let range = policy.env().detection_range;
             let by_scene = slot_of(scene.clone().try_into().unwrap(), &*policy);
             let mut sent = graph(&scene, range, true);
             sent.nodes.reverse();
@@ -181,7 +189,7 @@ proptest! {
             let len = policy.memory_len(3, 5);
             let mut memory: Vec<f32> = values.iter().cycle().take(len).map(|&x| x as f32).collect();
             let mut headings = vec![0; 3];
-            policy.act(&mut [FleetStep { graph: &graph, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
+            policy.act(&mut [FleetStep { env: policy.env(), graph: &graph, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
             prop_assert!(headings.iter().all(|&h| usize::from(h) < policy.actions()));
         }
     }

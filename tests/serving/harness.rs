@@ -153,8 +153,8 @@ impl Policy for TestPolicy {
     fn needs(&self) -> RequiredInput {
         RequiredInput::OwnPositions
     }
-    fn detection_range(&self) -> f64 {
-        0.28
+    fn env(&self) -> qedgix::policy::EnvParams {
+        qedgix::policy::EnvParams::default()
     }
     fn check_fleet(&self, uavs: usize, _: usize) -> Result<(), Invalid> {
         if uavs <= 3 { Ok(()) } else { Err(Invalid::new("uavs", uavs, "at most 3")) }

@@ -33,8 +33,8 @@ impl Policy for IdentifyingPolicy {
     fn needs(&self) -> RequiredInput {
         RequiredInput::Detections
     }
-    fn detection_range(&self) -> f64 {
-        0.28
+    fn env(&self) -> qedgix::policy::EnvParams {
+        qedgix::policy::EnvParams::default()
     }
     fn check_fleet(&self, _: usize, _: usize) -> Result<(), Invalid> {
         Ok(())

@@ -27,8 +27,8 @@ async fn thousand_uavs_and_ten_thousand_users_are_answered() {
     let loaded = server.app.registry.resolve(&"qedgix".parse().unwrap()).unwrap();
     let policy = &loaded.implementation;
     let (uavs, users) = (1000, 10_000);
-    let scene = wide_scene(uavs, users, policy.detection_range());
-    let graph = graph(&scene, policy.detection_range(), false);
+    let scene = wide_scene(uavs, users, policy.env().detection_range);
+    let graph = graph(&scene, policy.env().detection_range, false);
     let slot = FleetInput::try_from(graph.clone()).unwrap().into_fleet_graph(&**policy).unwrap();
     let whole = FleetInput::try_from(scene.clone()).unwrap().into_fleet_graph(&**policy).unwrap();
     // UAVs have the same detections in both forms. Users detect the nodes that the detections of UAVs imply.
@@ -46,7 +46,14 @@ async fn thousand_uavs_and_ten_thousand_users_are_answered() {
     let mut memory = vec![0.0; policy.memory_len(uavs, users)];
     policy.start(uavs, users, 0, &mut memory);
     let mut expected = vec![0; uavs];
-    policy.act(&mut [FleetStep { graph: &slot, step: 0, memory: &mut memory, headings: &mut expected, q_values: None }]);
+    policy.act(&mut [FleetStep {
+        env: policy.env(),
+        graph: &slot,
+        step: 0,
+        memory: &mut memory,
+        headings: &mut expected,
+        q_values: None,
+    }]);
     let mut request = held("qedgix", Bytes::new(), v1::Scene::default());
     request.observation = Some(v1::act_request::Observation::Graph(graph));
     let answer = server.grpc().await.act(request).await.unwrap().into_inner();

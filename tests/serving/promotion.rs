@@ -132,7 +132,14 @@ fn offline() -> [Vec<Vec<u8>>; 2] {
         let flown = (0..SLOTS).map(|step| {
             let slot = FleetInput::try_from(scene(3, 5, step)).unwrap().into_fleet_graph(policy).unwrap();
             let mut headings = vec![0; 3];
-            policy.act(&mut [FleetStep { graph: &slot, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
+            policy.act(&mut [FleetStep {
+                env: policy.env(),
+                graph: &slot,
+                step,
+                memory: &mut memory,
+                headings: &mut headings,
+                q_values: None,
+            }]);
             headings
         });
         flown.collect()

@@ -100,9 +100,9 @@ async fn a_learned_policy_flies_like_all_others() {
             let slot = FleetInput::try_from(sent.clone()).unwrap().into_fleet_graph(policy).unwrap();
             let (mut expected, mut q) = (vec![0; 3], vec![0.0; 3 * policy.actions()]);
             let (memory, headings) = (&mut memory[..], &mut expected[..]);
-            policy.act(&mut [FleetStep { graph: &slot, step, memory, headings, q_values: Some(&mut q) }]);
+            policy.act(&mut [FleetStep { env: policy.env(), graph: &slot, step, memory, headings, q_values: Some(&mut q) }]);
 
-            let by_graph = v1::act_request::Observation::Graph(graph(&sent, policy.detection_range(), true));
+            let by_graph = v1::act_request::Observation::Graph(graph(&sent, policy.env().detection_range, true));
             let requests = [
                 v1::ActRequest { observation: Some(by_graph), ..in_session(name, Some(step), sent.clone()) },
                 held(name, state, sent),

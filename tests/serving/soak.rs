@@ -131,7 +131,14 @@ impl Reference {
         let actions = self.policy.actions();
         let (mut headings, mut values) = (vec![0; ids.len()], vec![0.0; ids.len() * actions]);
         let (memory, headings_out, q_values) = (&mut self.memory[..], &mut headings[..], Some(&mut values[..]));
-        self.policy.act(&mut [FleetStep { graph: &slot, step: 0, memory, headings: headings_out, q_values }]);
+        self.policy.act(&mut [FleetStep {
+            env: self.policy.env(),
+            graph: &slot,
+            step: 0,
+            memory,
+            headings: headings_out,
+            q_values,
+        }]);
         let decisions = headings.iter().zip(values.chunks_exact(actions)).map(|(&heading, q)| (u32::from(heading), q.to_vec()));
         ids.into_iter().zip(decisions).collect()
     }

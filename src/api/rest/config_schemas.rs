@@ -69,6 +69,11 @@ impl PartialSchema for EnvConfig {
             ("speed", number(0.0, 1.0), "v, distance that a UAV moves per slot, in units of the square's side."),
             ("transmission_range", number(0.0, 2.0), "t, range within which a UAV collects the data of a user."),
             ("detection_range", number(1e-6, 2.0), "d, range within which nodes detect each other; at least t."),
+            (
+                "communication_range",
+                json!({"type": ["number", "null"], "minimum": 0.0, "maximum": 10.0}),
+                "Range within which UAVs exchange messages and learn each other's positions; absent: d.",
+            ),
             ("hover", boolean(), "Adds a ninth heading, which stays in place."),
             ("boundary", string_enum::<Boundary>(), "Whether UAVs are kept in the unit square."),
             (

@@ -1,7 +1,7 @@
 //! Flight along the eight headings, v per slot. Lengths are in units of the square's side.
 
-use super::rule::EnvParams;
 use crate::env::{DIRECTIONS, EnvConfig, Point};
+use crate::policy::EnvParams;
 
 pub(super) fn distance(a: Point, b: Point) -> f64 {
     (a[0] - b[0]).hypot(a[1] - b[1])

@@ -16,11 +16,9 @@ mod tour;
 
 use std::sync::Arc;
 
-pub use rule::EnvParams;
-
 use self::rule::Rule;
 use self::search::Search;
-use super::{FleetStep, Policy, RequiredInput};
+use super::{EnvParams, FleetStep, Policy, RequiredInput};
 use crate::invalid::{Invalid, in_range};
 
 /// A baseline in the list of policies.
@@ -36,12 +34,13 @@ pub struct BaselineInfo {
 }
 
 /// All baselines, from the least to the best informed.
-pub const LIST: [BaselineInfo; 7] = [
+pub const LIST: [BaselineInfo; 8] = [
     info::<random::Random>(),
     info::<Search<persistent::Persistent>>(),
     info::<Search<max_aoi::MaxAoi>>(),
     info::<Search<nearest::Nearest>>(),
-    info::<sweep::Sweep>(),
+    info::<sweep::Sweep<false>>(),
+    info::<sweep::Sweep<true>>(),
     info::<greedy_global::GreedyGlobal>(),
     info::<tour::Tour>(),
 ];
@@ -78,8 +77,8 @@ impl<R: Rule> Policy for Baseline<R> {
         R::NEEDS
     }
 
-    fn detection_range(&self) -> f64 {
-        self.env.detection_range
+    fn env(&self) -> EnvParams {
+        self.env
     }
 
     fn check_fleet(&self, uavs: usize, users: usize) -> Result<(), Invalid> {
@@ -98,7 +97,7 @@ impl<R: Rule> Policy for Baseline<R> {
 
     fn act(&self, fleets: &mut [FleetStep<'_>]) {
         for fleet in fleets {
-            self.rule.decide(&self.env, fleet.graph, fleet.step, fleet.memory, fleet.headings);
+            self.rule.decide(&fleet.env, fleet.graph, fleet.step, fleet.memory, fleet.headings);
             if let Some(q) = &mut fleet.q_values {
                 q.fill(f32::NAN);
             }

@@ -2,8 +2,8 @@
 
 use rand::RngExt;
 
-use super::rule::{EnvParams, Rule, SEED_LEN, slot_rng, store_seed};
-use crate::policy::{FleetGraph, RequiredInput};
+use super::rule::{Rule, SEED_LEN, slot_rng, store_seed};
+use crate::policy::{EnvParams, FleetGraph, RequiredInput};
 
 #[derive(Default)]
 pub(super) struct Random;

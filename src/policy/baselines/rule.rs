@@ -1,43 +1,10 @@
-//! What all baselines share: the parameters of the environment, the trait of a rule, and seeds in a fleet's memory.
+//! What all baselines share: the trait of a rule, and seeds in a fleet's memory.
 
 use rand_chacha::ChaCha8Rng;
 
-use crate::env::{EnvConfig, Point};
-use crate::policy::{FleetGraph, RequiredInput};
+use crate::env::Point;
+use crate::policy::{EnvParams, FleetGraph, RequiredInput};
 use crate::rng;
-
-/// The parameters of the environment that a baseline flies in. Lengths are in units of the square's side.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct EnvParams {
-    /// v, distance per slot.
-    pub speed: f64,
-    /// t, range within which data is collected.
-    pub transmission_range: f64,
-    /// d, range within which nodes detect each other.
-    pub detection_range: f64,
-    /// A, the number of actions.
-    pub actions: usize,
-    /// K, slots per episode: how far baselines that plan look ahead.
-    pub slots: usize,
-}
-
-impl From<&EnvConfig> for EnvParams {
-    fn from(env: &EnvConfig) -> Self {
-        Self {
-            speed: env.speed,
-            transmission_range: env.transmission_range,
-            detection_range: env.detection_range,
-            actions: env.actions(),
-            slots: env.slots,
-        }
-    }
-}
-
-impl Default for EnvParams {
-    fn default() -> Self {
-        Self::from(&EnvConfig::default())
-    }
-}
 
 /// How one fleet acts in one slot. No rule but `random` hovers.
 pub(super) trait Rule: Default + Send + Sync {

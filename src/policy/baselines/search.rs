@@ -7,9 +7,9 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
 use super::geometry::{heading_toward, in_square, next_position};
-use super::rule::{EnvParams, Rule, SEED_LEN, slot_rng, store_seed, uav_positions};
+use super::rule::{Rule, SEED_LEN, slot_rng, store_seed, uav_positions};
 use crate::env::{EnvConfig, Point};
-use crate::policy::{FleetGraph, RequiredInput};
+use crate::policy::{EnvParams, FleetGraph, RequiredInput};
 
 /// A user that a UAV detects.
 #[derive(Clone, Copy, Debug)]

@@ -8,7 +8,7 @@ use sha2::{Digest, Sha256};
 use super::publish::{StoredVersion, publish_bytes};
 use super::{PolicyStores, one_at_a_time};
 use crate::invalid::Invalid;
-use crate::policy::baselines::{self, EnvParams};
+use crate::policy::{EnvParams, baselines};
 use crate::service::{App, Error};
 use crate::serving::bundled::BUNDLED;
 use crate::serving::{LoadedPolicy, PolicyInfo, PolicyKind, PolicyRef, PolicySpec, Registry, VersionSelector};

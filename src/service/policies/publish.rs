@@ -214,7 +214,7 @@ impl ParsedCheckpoint {
             users: flat.then_some(users as u32),
             actions: self.policy.actions(),
             needs: self.policy.needs(),
-            detection_range: self.policy.detection_range(),
+            detection_range: self.policy.env().detection_range,
             config: object(serde_json::to_value(config)),
             metrics,
             created_at: Timestamp::from_millisecond(created_at).unwrap_or_default(),

@@ -80,7 +80,8 @@ impl Task {
     pub(super) fn as_fleet_step(&mut self) -> FleetStep<'_> {
         let TaskOutput { memory, decision } = &mut self.output;
         let Decision { step, headings, q_values, .. } = decision;
-        FleetStep { graph: &self.graph, step: *step, memory, headings, q_values: Some(q_values) }
+        let env = self.policy.implementation.env();
+        FleetStep { env, graph: &self.graph, step: *step, memory, headings, q_values: Some(q_values) }
     }
 
     pub(super) fn finish(self, timings: Timings) -> TaskOutput {

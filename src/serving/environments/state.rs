@@ -59,11 +59,11 @@ impl CopyObservation {
         aoi: &[f32],
         graph: bool,
     ) -> impl Iterator<Item = Self> {
-        let (m, n, range) = (config.uavs, config.users, config.detection_range);
+        let (m, n, ranges) = (config.uavs, config.users, config.ranges());
         let copies = uav_xy.chunks_exact(2 * m).zip(user_xy.chunks_exact(2 * n)).zip(aoi.chunks_exact(n));
         copies.map(move |((uavs, users), aoi)| {
             let scene = Scene { uavs: points(uavs).collect(), users: points(users).collect(), aoi: aoi.to_vec() };
-            let graph = graph.then(|| FleetGraph::from_scene(&scene.uavs, &scene.users, &scene.aoi, range));
+            let graph = graph.then(|| FleetGraph::from_scene(&scene.uavs, &scene.users, &scene.aoi, ranges));
             Self { scene, graph }
         })
     }

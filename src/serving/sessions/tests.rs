@@ -5,7 +5,7 @@ use jiff::Timestamp;
 use super::*;
 use crate::clock::ManualClock;
 use crate::invalid::Invalid;
-use crate::policy::{Policy, RequiredInput};
+use crate::policy::{EnvParams, Policy, RequiredInput};
 use crate::serving::{Decision, FleetIds, Limits, PolicyRef, TaskOutput};
 
 /// Its memory is the seed at first; it decides nothing.
@@ -18,8 +18,8 @@ impl Policy for SeedPolicy {
     fn needs(&self) -> RequiredInput {
         RequiredInput::Detections
     }
-    fn detection_range(&self) -> f64 {
-        0.28
+    fn env(&self) -> EnvParams {
+        EnvParams::default()
     }
     fn check_fleet(&self, _: usize, _: usize) -> Result<(), Invalid> {
         Ok(())

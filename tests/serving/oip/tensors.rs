@@ -4,7 +4,8 @@ use std::sync::Arc;
 
 use proptest::prelude::*;
 use qedgix::api::convert::tensors::{Data, Tensor, fleet_input};
-use qedgix::policy::baselines::{EnvParams, LIST, by_name};
+use qedgix::policy::EnvParams;
+use qedgix::policy::baselines::{LIST, by_name};
 use qedgix::policy::{FleetStep, RequiredInput};
 
 use super::*;
@@ -366,7 +367,7 @@ proptest! {
             let mut memory = vec![0.0; policy.memory_len(uavs, users)];
             policy.start(uavs, users, 3, &mut memory);
             let mut headings = vec![0; uavs];
-            policy.act(&mut [FleetStep { graph: &slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: None }]);
+            policy.act(&mut [FleetStep { env: policy.env(), graph: &slot, step: 0, memory: &mut memory, headings: &mut headings, q_values: None }]);
         }
     }
 }

@@ -11,9 +11,9 @@ mod plan;
 
 use self::pilot::{Pilot, Problem, TourState};
 use super::geometry::distance;
-use super::rule::{EnvParams, Rule, uav_positions, user_positions};
+use super::rule::{Rule, uav_positions, user_positions};
 use crate::env::Point;
-use crate::policy::{FleetGraph, RequiredInput};
+use crate::policy::{EnvParams, FleetGraph, RequiredInput};
 
 /// Memory: for each UAV, 1 + the index in its tour, and the length of the tour; the positions of users at the time of planning;
 /// then all tours, one after another. All zeros before the first plan.

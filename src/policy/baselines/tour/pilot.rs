@@ -4,8 +4,8 @@
 //! the one that ends nearest to the user after the next. A user is reached as soon as it is in range.
 
 use super::super::geometry::{distance, in_square, next_position};
-use super::super::rule::EnvParams;
 use crate::env::{EnvConfig, Point};
+use crate::policy::EnvParams;
 
 /// A fleet, its users, and the number of slots to plan for.
 #[derive(Clone, Copy)]

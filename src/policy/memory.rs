@@ -1,0 +1,255 @@
+//! What UAVs remember of an episode (docs/model.md, "Memory"): the users that each UAV knows of, and the ground that it has searched.
+//!
+//! A UAV's memory follows from what it detected itself, and, if memories are shared, from the memories of the UAVs in communication
+//! range: in every slot, all UAVs detect first and then exchange their memories once. Of two entries for a user, the newer one wins.
+//! The memory has a fixed size, whatever the number of slots, and its content does not fade.
+//!
+//! Encoding of one UAV: [`GRID`] rows of the ground, each an integer with one bit per cell; then per user [`USER`] numbers. All are
+//! integers or f32 positions, which f32 holds exactly.
+
+use super::FleetGraph;
+use crate::env::Point;
+
+/// Cells along each side of the unit square. A row of cells is an integer below 2^GRID, which f32 holds exactly.
+pub const GRID: usize = 20;
+/// Numbers per user: state, x, y, slot of the last known collection, slot of the observation.
+const USER: usize = 5;
+
+/// Values of a user's state.
+const UNKNOWN: f32 = 0.0;
+const KNOWN: f32 = 1.0;
+
+/// Length of the memory of one UAV that may know `users` users.
+pub const fn uav_memory_len(users: usize) -> usize {
+    GRID + USER * users
+}
+
+/// A user that a UAV remembers.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RememberedUser {
+    /// Position when it was last observed.
+    pub position: Point,
+    /// Slot in which its data was last collected, as far as known.
+    pub collected: f32,
+    /// Slot in which it was last observed, by this UAV or by one whose memory it received.
+    pub observed: f32,
+}
+
+/// The memory of one UAV.
+#[derive(Clone, Copy, Debug)]
+pub struct UavMemory<'a> {
+    ground: &'a [f32],
+    users: &'a [f32],
+}
+
+impl<'a> UavMemory<'a> {
+    /// The memory in `numbers`, of length [`uav_memory_len`].
+    pub fn new(numbers: &'a [f32]) -> Self {
+        let (ground, users) = numbers.split_at(GRID);
+        Self { ground, users }
+    }
+
+    /// The cells of row `row` that were searched: bit c stands for the cell in column c.
+    pub fn searched(&self, row: usize) -> u32 {
+        self.ground[row] as u32 & ALL
+    }
+
+    /// The users, with `None` for those that are not known.
+    pub fn users(&self) -> impl ExactSizeIterator<Item = Option<RememberedUser>> + 'a {
+        self.users.chunks_exact(USER).map(|user| {
+            (user[0] == KNOWN).then(|| RememberedUser {
+                position: [user[1].into(), user[2].into()],
+                collected: user[3],
+                observed: user[4],
+            })
+        })
+    }
+}
+
+/// All cells of a row.
+const ALL: u32 = (1 << GRID) - 1;
+
+/// Whether UAVs exchange memories.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Sharing {
+    /// Every UAV has only what it detected itself.
+    Own,
+    /// UAVs in communication range exchange their memories in every slot.
+    Shared,
+}
+
+/// Advances the memories of a fleet, one after another in `memories`, to slot `slot`. `graph` needs the positions of the UAVs.
+/// `received` is a buffer.
+pub fn remember(graph: &FleetGraph, range: f64, slot: u64, sharing: Sharing, memories: &mut [f32], received: &mut Vec<f32>) {
+    let len = uav_memory_len(graph.users());
+    for (i, memory) in memories.chunks_exact_mut(len).enumerate() {
+        observe(graph, i, range, slot as f32, memory);
+    }
+    if sharing == Sharing::Shared && graph.uavs() > 1 {
+        received.clear();
+        received.extend_from_slice(memories);
+        for (i, memory) in memories.chunks_exact_mut(len).enumerate() {
+            let senders = graph.detections(i).iter().map(|d| d.target as usize).take_while(|&j| j < graph.uavs());
+            for j in senders {
+                merge(&received[j * len..][..len], memory);
+            }
+        }
+    }
+}
+
+/// Writes what UAV `i` detects into its memory.
+fn observe(graph: &FleetGraph, i: usize, range: f64, slot: f32, memory: &mut [f32]) {
+    let at = graph.uav_positions().expect("the caller provides what `needs` requires")[i];
+    let (ground, users) = memory.split_at_mut(GRID);
+    search(at, range, ground);
+    // A user that should be detected and is not has moved away. The margin allows for rounding.
+    let near = (0.99 * range).powi(2);
+    for user in users.chunks_exact_mut(USER).filter(|user| user[0] == KNOWN) {
+        if (f64::from(user[1]) - at[0]).powi(2) + (f64::from(user[2]) - at[1]).powi(2) < near {
+            (user[0], user[4]) = (UNKNOWN, slot);
+        }
+    }
+    let first_user = graph.detections(i).partition_point(|d| (d.target as usize) < graph.uavs());
+    for detection in &graph.detections(i)[first_user..] {
+        let j = detection.target as usize - graph.uavs();
+        let [x, y] = [0, 1].map(|axis| (at[axis] + f64::from(detection.rel[axis])) as f32);
+        users[j * USER..][..USER].copy_from_slice(&[KNOWN, x, y, slot - graph.aoi()[j], slot]);
+    }
+}
+
+/// Marks the cells whose centres are within `range` of `at` as searched.
+fn search(at: Point, range: f64, ground: &mut [f32]) {
+    let cells = GRID as f64;
+    let first = ((at[1] - range) * cells - 0.5).ceil().max(0.0) as usize;
+    let end = ((at[1] + range) * cells + 0.5).floor().clamp(0.0, cells) as usize;
+    for (row, bits) in ground.iter_mut().enumerate().take(end).skip(first) {
+        let dy = (row as f64 + 0.5) / cells - at[1];
+        let half = (range * range - dy * dy).max(0.0).sqrt();
+        let left = ((at[0] - half) * cells - 0.5).ceil().clamp(0.0, cells) as u32;
+        let right = ((at[0] + half) * cells + 0.5).floor().clamp(0.0, cells) as u32;
+        if left < right {
+            let seen = (ALL >> (GRID as u32 - (right - left))) << left;
+            *bits = ((*bits as u32 & ALL) | seen) as f32;
+        }
+    }
+}
+
+/// Adds what the memory `received` knows to `memory`.
+fn merge(received: &[f32], memory: &mut [f32]) {
+    let (ground, users) = memory.split_at_mut(GRID);
+    for (bits, &other) in ground.iter_mut().zip(received) {
+        *bits = ((*bits as u32 | other as u32) & ALL) as f32;
+    }
+    for (user, other) in users.chunks_exact_mut(USER).zip(received[GRID..].chunks_exact(USER)) {
+        if other[4] > user[4] || (user[0] == UNKNOWN && user[4] == 0.0) {
+            user.copy_from_slice(other);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::env::Ranges;
+
+    const RANGES: Ranges = Ranges { detection: 0.28, communication: 0.28 };
+
+    struct Fleet {
+        memory: Vec<f32>,
+        buffer: Vec<f32>,
+        users: usize,
+    }
+
+    impl Fleet {
+        fn new(uavs: usize, users: usize) -> Self {
+            Self { memory: vec![0.0; uavs * uav_memory_len(users)], buffer: Vec::new(), users }
+        }
+
+        fn see(&mut self, slot: u64, uavs: &[Point], users: &[Point], aoi: &[f32], sharing: Sharing, ranges: Ranges) {
+            let graph = FleetGraph::from_scene(uavs, users, aoi, ranges);
+            remember(&graph, ranges.detection, slot, sharing, &mut self.memory, &mut self.buffer);
+        }
+
+        fn of(&self, uav: usize) -> UavMemory<'_> {
+            let len = uav_memory_len(self.users);
+            UavMemory::new(&self.memory[uav * len..][..len])
+        }
+
+        fn user(&self, uav: usize, j: usize) -> Option<RememberedUser> {
+            self.of(uav).users().nth(j).unwrap()
+        }
+    }
+
+    #[test]
+    fn cells_are_searched_when_their_centres_are_in_range() {
+        for (at, range) in [
+            ([0.5, 0.5], 0.28),
+            ([0.0, 1.0], 0.28),
+            ([0.013, 0.77], 0.05),
+            ([0.3, 0.3], 0.01),
+            ([0.4, 0.9], 2.0),
+            ([-0.5, 0.5], 0.2),
+        ] {
+            let mut ground = [0.0; GRID];
+            search(at, range, &mut ground);
+            for (row, &bits) in ground.iter().enumerate() {
+                for column in 0..GRID {
+                    let center = [column, row].map(|c| (c as f64 + 0.5) / GRID as f64);
+                    let inside = (center[0] - at[0]).powi(2) + (center[1] - at[1]).powi(2) <= range * range;
+                    assert_eq!(bits as u32 >> column & 1 == 1, inside, "{at:?}, {range}, cell {column}, {row}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_user_is_remembered_where_it_was_seen_and_forgotten_when_it_is_gone() {
+        let mut fleet = Fleet::new(1, 2);
+        let users = [[0.6, 0.5], [0.9, 0.9]];
+        fleet.see(3, &[[0.5, 0.5]], &users, &[2.0, 3.0], Sharing::Own, RANGES);
+        let seen = fleet.user(0, 0).unwrap();
+        assert_eq!((seen.collected, seen.observed), (1.0, 3.0));
+        assert!((seen.position[0] - 0.6).abs() < 1e-6);
+        assert_eq!(fleet.user(0, 1), None);
+        // Out of range it is remembered; in range and not detected it has gone.
+        fleet.see(4, &[[0.1, 0.1]], &users, &[3.0, 4.0], Sharing::Own, RANGES);
+        assert_eq!(fleet.user(0, 0), Some(seen));
+        fleet.see(5, &[[0.5, 0.5]], &[[0.1, 0.9], [0.9, 0.9]], &[4.0, 5.0], Sharing::Own, RANGES);
+        assert_eq!(fleet.user(0, 0), None);
+    }
+
+    #[test]
+    fn memories_pass_one_link_per_slot_and_the_newest_entry_wins() {
+        let users = [[0.05, 0.1], [0.1, 0.95]];
+        let uavs = [[0.1, 0.2], [0.35, 0.2], [0.6, 0.2]];
+        let mut fleet = Fleet::new(3, 2);
+        fleet.see(1, &uavs, &users, &[1.0, 1.0], Sharing::Shared, RANGES);
+        assert!(fleet.user(1, 0).is_some(), "received over one link");
+        assert_eq!(fleet.user(2, 0), None);
+        fleet.see(2, &uavs, &users, &[2.0, 2.0], Sharing::Shared, RANGES);
+        let old = fleet.user(2, 0).unwrap();
+        assert_eq!((old.collected, old.observed), (0.0, 1.0), "what was known one slot ago");
+        assert_eq!(fleet.of(2).searched(0) & 1, 1, "searched by UAV 0");
+        // UAV 0 collects; the news replaces what the others knew.
+        fleet.see(3, &uavs, &users, &[0.0, 3.0], Sharing::Shared, RANGES);
+        assert_eq!(fleet.user(1, 0).unwrap().collected, 3.0);
+        // That a user has gone is news, too.
+        fleet.see(4, &uavs, &[[0.1, 0.95]; 2], &[1.0, 4.0], Sharing::Shared, RANGES);
+        assert_eq!((fleet.user(0, 0), fleet.user(1, 0)), (None, None));
+        assert!(fleet.user(2, 0).is_some());
+    }
+
+    #[test]
+    fn communication_range_decides_who_receives() {
+        let users = [[0.1, 0.1]];
+        let uavs = [[0.1, 0.2], [0.9, 0.9]];
+        for (communication, received) in [(0.0, false), (0.28, false), (1.2, true)] {
+            let mut fleet = Fleet::new(2, 1);
+            fleet.see(1, &uavs, &users, &[1.0], Sharing::Shared, Ranges { communication, ..RANGES });
+            assert_eq!(fleet.user(1, 0).is_some(), received, "{communication}");
+        }
+        let mut fleet = Fleet::new(2, 1);
+        fleet.see(1, &uavs, &users, &[1.0], Sharing::Own, Ranges { communication: 2.0, ..RANGES });
+        assert_eq!(fleet.user(1, 0), None);
+    }
+}
