@@ -1,6 +1,5 @@
 //! A server in this process, on free ports. The test plays its workers.
 
-use std::future::Future;
 use std::net::SocketAddr;
 use std::ops::Deref;
 use std::path::Path;
@@ -21,15 +20,14 @@ use qedgix::serving::{Engine, EngineConfig, Environments, EnvironmentsConfig, Li
 use qedgix::store::Store;
 use qedgix::wire::v1::job_service_client::JobServiceClient;
 use qedgix::wire::v1::worker_service_client::WorkerServiceClient;
-use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tonic::metadata::MetadataValue;
 use tonic::transport::Channel;
 
-/// Longest time that anything in these tests may take. Only failures wait that long.
-pub const TIMEOUT: Duration = Duration::from_secs(30);
+pub use super::process::rest::{Rest, expect};
+pub use super::process::{TIMEOUT, within};
 
 /// Most watches of a server in these tests.
 pub const MAX_WATCHERS: usize = 4;
@@ -81,56 +79,6 @@ impl Deref for Server {
 
     fn deref(&self) -> &Rest {
         &self.rest
-    }
-}
-
-/// A client of the REST API.
-pub struct Rest {
-    http: String,
-    client: reqwest::Client,
-}
-
-impl Rest {
-    pub fn new(http: String) -> Self {
-        // The client requires a TLS provider even for plain HTTP; a later call finds the first one installed.
-        let _ = rustls::crypto::ring::default_provider().install_default();
-        Self { http, client: reqwest::Client::new() }
-    }
-
-    pub fn request(&self, method: Method, path: &str) -> reqwest::RequestBuilder {
-        self.client.request(method, format!("{}{path}", self.http))
-    }
-
-    pub async fn get(&self, path: &str) -> Value {
-        expect(self.request(Method::GET, path), StatusCode::OK).await
-    }
-
-    pub async fn post(&self, path: &str) -> Value {
-        expect(self.request(Method::POST, path), StatusCode::OK).await
-    }
-
-    /// Submits a job and returns its id.
-    pub async fn submit(&self, spec: &Value) -> String {
-        let job = expect(self.request(Method::POST, "/v1/jobs").json(spec), StatusCode::CREATED).await;
-        job["id"].as_str().unwrap().to_owned()
-    }
-
-    pub async fn state(&self, id: &str) -> String {
-        self.get(&format!("/v1/jobs/{id}")).await["state"].as_str().unwrap().to_owned()
-    }
-
-    /// Waits until the job is in this state, and returns it.
-    pub async fn reaches(&self, id: &str, state: &str) -> Value {
-        within(async {
-            loop {
-                let job = self.get(&format!("/v1/jobs/{id}")).await;
-                if job["state"] == state {
-                    return job;
-                }
-                tokio::time::sleep(Duration::from_millis(5)).await;
-            }
-        })
-        .await
     }
 }
 
@@ -240,15 +188,4 @@ pub fn signed<T>(launch: &Launch, token: &str, message: T) -> tonic::Request<T> 
     metadata.insert("qedgix-attempt", text(launch.lease.attempt.to_string()));
     metadata.insert("authorization", text(format!("Bearer {token}")));
     request
-}
-
-pub async fn expect(request: reqwest::RequestBuilder, status: StatusCode) -> Value {
-    let response = request.send().await.unwrap();
-    let (got, text) = (response.status(), response.text().await.unwrap());
-    assert_eq!(got, status, "{text}");
-    serde_json::from_str(&text).unwrap_or(Value::Null)
-}
-
-pub async fn within<T>(future: impl Future<Output = T>) -> T {
-    tokio::time::timeout(TIMEOUT, future).await.expect("nothing takes longer than the timeout")
 }

@@ -2,6 +2,8 @@
 
 mod events;
 mod harness;
+#[path = "../process/mod.rs"]
+mod process;
 mod processes;
 mod protocol;
 mod publishing;

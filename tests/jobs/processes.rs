@@ -1,10 +1,8 @@
 //! A real server process with real worker processes, and what happens when either of them dies.
 
-use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::path::Path;
+use std::process::Command;
 use std::sync::Arc;
-use std::time::Duration;
 
 use qedgix::checkpoint::Checkpoint;
 use qedgix::env::EpisodeMetrics;
@@ -15,94 +13,31 @@ use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
 use super::harness::{Rest, Server, tiny, within};
+use super::process::rest::{Rows, bits};
+use super::process::{self, POLL, PROGRAM, no_worker, signal, workers};
 
-const POLL: Duration = Duration::from_millis(5);
-
-/// A `qedgix serve` on free ports; killed when dropped.
+/// A `qedgix serve` that snapshots often, and its client.
 pub struct Process {
-    child: Child,
+    process: process::Process,
     pub rest: Rest,
 }
 
 impl Process {
     pub async fn start(data_dir: &Path) -> Self {
-        Self::start_program(Path::new(env!("CARGO_BIN_EXE_qedgix")), data_dir).await
+        Self::start_program(Path::new(PROGRAM), data_dir).await
     }
 
     async fn start_program(program: &Path, data_dir: &Path) -> Self {
-        let endpoints = data_dir.join("endpoints.json");
-        // Left by a killed server.
-        let _ = std::fs::remove_file(&endpoints);
-        let child = Command::new(program)
-            .args(["serve", "--grpc-addr", "127.0.0.1:0", "--http-addr", "127.0.0.1:0", "--cpu-budget", "1"])
-            .args(["--snapshot-every", "0.05", "--data-dir"])
-            .arg(data_dir)
-            .stdout(Stdio::null())
-            .spawn()
-            .unwrap();
-        let text = within(async {
-            loop {
-                match std::fs::read_to_string(&endpoints) {
-                    Ok(text) => break text,
-                    Err(_) => tokio::time::sleep(POLL).await,
-                }
-            }
-        })
-        .await;
-        let endpoints: Value = serde_json::from_str(&text).unwrap();
-        Self { child, rest: Rest::new(format!("http://{}", endpoints["http"].as_str().unwrap())) }
+        let mut command = process::serve_by(program, data_dir);
+        command.args(["--cpu-budget", "1", "--snapshot-every", "0.05"]);
+        let process = process::Process::start(command).await;
+        let rest = Rest::new(format!("http://{}", process.http));
+        Self { process, rest }
     }
 
     pub fn kill(&mut self) {
-        self.child.kill().unwrap();
-        self.child.wait().unwrap();
+        self.process.kill();
     }
-
-    /// Sends SIGTERM and returns the exit status.
-    async fn terminate(&mut self) -> std::process::ExitStatus {
-        signal("TERM", self.child.id());
-        within(async {
-            loop {
-                match self.child.try_wait().unwrap() {
-                    Some(status) => break status,
-                    None => tokio::time::sleep(POLL).await,
-                }
-            }
-        })
-        .await
-    }
-}
-
-impl Drop for Process {
-    fn drop(&mut self) {
-        // It may have ended already.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
-fn signal(name: &str, pid: u32) {
-    assert!(Command::new("kill").args([format!("-{name}"), pid.to_string()]).status().unwrap().success());
-}
-
-/// The processes of this job's workers.
-fn workers(job: &str) -> Vec<u32> {
-    let needle = format!("QEDGIX_JOB={job}");
-    let of = |entry: PathBuf| {
-        let pid = entry.file_name()?.to_str()?.parse().ok()?;
-        let environment = std::fs::read(entry.join("environ")).ok()?;
-        environment.split(|&b| b == 0).any(|variable| variable == needle.as_bytes()).then_some(pid)
-    };
-    std::fs::read_dir("/proc").unwrap().filter_map(|entry| of(entry.unwrap().path())).collect()
-}
-
-async fn no_worker(job: &str) {
-    within(async {
-        while !workers(job).is_empty() {
-            tokio::time::sleep(POLL).await;
-        }
-    })
-    .await;
 }
 
 /// A job of a few seconds.
@@ -113,25 +48,6 @@ fn job() -> Value {
         "environment": {"slots": 20, "uavs": 2, "users": 3},
         "training": {"steps": 24_000, "envs": 4, "batch": 16, "buffer": 200, "eval_every": 2_000, "eval_episodes": 8},
     })
-}
-
-/// Bits of the metrics by name and step. The speed is not deterministic, so only its presence is compared.
-type Rows = BTreeMap<(String, u64), Option<u64>>;
-
-fn bits(name: &str, value: f64) -> Option<u64> {
-    (name != "env_steps_per_s").then_some(value.to_bits())
-}
-
-/// All metrics of a job, from CSV, which is exact.
-async fn rows(rest: &Rest, id: &str) -> Rows {
-    let table = rest.request(Method::GET, &format!("/v1/jobs/{id}/metrics?format=csv")).send().await.unwrap();
-    let mut rows = Rows::new();
-    for line in table.text().await.unwrap().lines().skip(1) {
-        let [name, step, value, _] = line.split(',').collect::<Vec<_>>()[..] else { panic!("{line}") };
-        let row = bits(name, value.parse().unwrap());
-        assert!(rows.insert((name.to_owned(), step.parse().unwrap()), row).is_none(), "{name} at {step} is duplicated");
-    }
-    rows
 }
 
 /// The metrics and the best policy of the same training, uninterrupted, in this process.
@@ -205,7 +121,7 @@ async fn worker_runs_a_job_to_its_end() {
     let done = rest.reaches(&id, "succeeded").await;
     assert_eq!((&done["attempts"], &done["failures"], &done["progress"]["step"]), (&json!(1), &json!(0), &json!(24_000)));
     let (expected, best) = uninterrupted(&job());
-    assert_same(&rows(rest, &id).await, &expected);
+    assert_same(&rest.rows(&id).await, &expected);
 
     let list = rest.get(&format!("/v1/jobs/{id}/checkpoints")).await["checkpoints"].as_array().unwrap().clone();
     let found = list.iter().find(|c| c["kind"] == "best").unwrap();
@@ -229,7 +145,7 @@ async fn killed_worker_is_replaced_without_lost_or_duplicate_metrics() {
     let id = server.rest.submit(&job()).await;
     passes(&server.rest, &id, 6_000).await;
     for worker in workers(&id) {
-        signal("KILL", worker);
+        assert!(signal("KILL", worker));
     }
     let done = server.rest.reaches(&id, "succeeded").await;
     assert_eq!((&done["attempts"], &done["failures"]), (&json!(2), &json!(1)));
@@ -237,7 +153,7 @@ async fn killed_worker_is_replaced_without_lost_or_duplicate_metrics() {
     assert_eq!(attempts[0]["outcome"], "failed");
     assert!(attempts[0]["reason"].as_str().unwrap().contains("killed by signal 9"), "{}", attempts[0]["reason"]);
     assert!(attempts[0]["log"].as_str().unwrap().contains("training"), "{}", attempts[0]["log"]);
-    assert_same(&rows(&server.rest, &id).await, &uninterrupted(&job()).0);
+    assert_same(&server.rest.rows(&id).await, &uninterrupted(&job()).0);
 }
 
 #[tokio::test]
@@ -257,7 +173,7 @@ async fn killed_server_resumes_its_jobs() {
     let attempts = attempts(&server.rest, &id).await;
     assert_eq!(attempts[0]["outcome"], "interrupted");
     assert!(attempts[0]["log"].as_str().unwrap().contains("training"), "{}", attempts[0]["log"]);
-    assert_same(&rows(&server.rest, &id).await, &uninterrupted(&job()).0);
+    assert_same(&server.rest.rows(&id).await, &uninterrupted(&job()).0);
     server.rest.reaches(&waiting, "succeeded").await;
 }
 
@@ -267,14 +183,14 @@ async fn terminated_server_snapshots_its_jobs() {
     let mut server = Process::start(dir.path()).await;
     let id = server.rest.submit(&job()).await;
     passes(&server.rest, &id, 4_000).await;
-    assert!(server.terminate().await.success());
+    assert!(server.process.terminate().await.success());
     assert!(workers(&id).is_empty());
 
     let server = Process::start(dir.path()).await;
     let done = server.rest.reaches(&id, "succeeded").await;
     assert_eq!((&done["attempts"], &done["failures"]), (&json!(2), &json!(0)));
     assert_eq!(attempts(&server.rest, &id).await[0]["outcome"], "interrupted");
-    assert_same(&rows(&server.rest, &id).await, &uninterrupted(&job()).0);
+    assert_same(&server.rest.rows(&id).await, &uninterrupted(&job()).0);
 }
 
 #[tokio::test]
@@ -290,7 +206,7 @@ async fn paused_job_resumes_exactly_and_cancelled_job_stops() {
     rest.post(&format!("/v1/jobs/{id}/resume")).await;
     rest.reaches(&id, "succeeded").await;
     assert_eq!(attempts(rest, &id).await[0]["outcome"], "paused");
-    assert_same(&rows(rest, &id).await, &uninterrupted(&job()).0);
+    assert_same(&rest.rows(&id).await, &uninterrupted(&job()).0);
 
     let mut long = job();
     long["training"]["steps"] = json!(1_000_000_000);
@@ -361,14 +277,14 @@ async fn a_server_whose_program_was_replaced_starts_workers() {
 
 #[tokio::test]
 async fn worker_without_assignment_or_valid_token_fails() {
-    let output = Command::new(env!("CARGO_BIN_EXE_qedgix")).arg("worker").env_remove("QEDGIX_SERVER").output().unwrap();
+    let output = Command::new(PROGRAM).arg("worker").env_remove("QEDGIX_SERVER").output().unwrap();
     assert!(!output.status.success());
     assert!(String::from_utf8_lossy(&output.stderr).contains("QEDGIX_SERVER"));
 
     let dir = tempfile::tempdir().unwrap();
     let server = Process::start(dir.path()).await;
     let endpoints: Value = serde_json::from_slice(&std::fs::read(dir.path().join("endpoints.json")).unwrap()).unwrap();
-    let output = Command::new(env!("CARGO_BIN_EXE_qedgix"))
+    let output = Command::new(PROGRAM)
         .arg("worker")
         .env("QEDGIX_SERVER", format!("http://{}", endpoints["grpc"].as_str().unwrap()))
         .env("QEDGIX_JOB", uuid::Uuid::nil().to_string())

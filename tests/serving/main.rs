@@ -3,6 +3,8 @@
 mod act;
 mod batch;
 mod binary;
+#[path = "../certificates/mod.rs"]
+mod certificates;
 mod conversion;
 mod environments;
 mod harness;
@@ -16,6 +18,8 @@ mod openapi;
 mod operations;
 mod output;
 mod policies;
+#[path = "../process/mod.rs"]
+mod process;
 mod promotion;
 mod published;
 mod rest;

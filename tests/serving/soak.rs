@@ -1,6 +1,7 @@
 //! Mixed load on the real binary: cancelled calls, missed deadlines, repeated steps, abandoned, expired and restarted sessions,
 //! while checkpoints are published, aliases move and policies are unloaded. Every response is compared, bit for bit, with the
-//! policy computed in this process. The test takes a few seconds by default; for longer:
+//! policy computed in this process. Once without API keys and TLS, and once with both. Each takes a few seconds by default; for
+//! longer:
 //!
 //!     QEDGIX_SOAK_SECONDS=600 cargo test --release --test serving -- soak --nocapture
 
@@ -22,62 +23,87 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use serde_json::{Value, json};
 use tokio_stream::wrappers::ReceiverStream;
+use tonic::metadata::{Ascii, MetadataValue};
+use tonic::service::Interceptor;
+use tonic::service::interceptor::InterceptedService;
 use tonic::transport::Channel;
 use tonic::{Code, Status};
 
-use super::harness::{graph, held, in_session, open, scene};
+use super::certificates::{self, Authority};
+use super::harness::{graph, held, in_session, install_tls_provider, open, scene};
+use super::process::{self, Process};
 
 /// Idle time after which sessions expire.
 const TTL: Duration = Duration::from_secs(3);
 /// Concurrent callers.
 const CALLERS: u64 = 24;
+/// Connections that the callers share.
+const CONNECTIONS: usize = 4;
 /// Different checkpoints to publish, repeatedly.
 const CHECKPOINTS: u64 = 12;
 
-/// The server's process; killed when dropped.
-struct Process {
-    child: std::process::Child,
-    grpc: String,
+/// How callers reach the server.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Access {
+    /// Without API keys and TLS.
+    Open,
+    /// Each caller with an API key, over TLS.
+    KeysAndTls,
+}
+
+/// Adds the API key to every call, if there is one.
+#[derive(Clone)]
+struct Signed(Option<MetadataValue<Ascii>>);
+
+impl Interceptor for Signed {
+    fn call(&mut self, mut request: tonic::Request<()>) -> Result<tonic::Request<()>, Status> {
+        if let Some(key) = &self.0 {
+            request.metadata_mut().insert("authorization", key.clone());
+        }
+        Ok(request)
+    }
+}
+
+type Client = PolicyServiceClient<InterceptedService<Channel, Signed>>;
+
+/// The server, and how it is reached.
+struct Subject {
+    process: Process,
     rest: String,
+    http: reqwest::Client,
+    /// One client per connection.
+    clients: Vec<Client>,
 }
 
-impl Process {
-    async fn start(dir: &Path) -> Self {
-        let child = std::process::Command::new(env!("CARGO_BIN_EXE_qedgix"))
-            .args(["serve", "--grpc-addr", "127.0.0.1:0", "--http-addr", "127.0.0.1:0", "--max-sessions", "2000"])
-            .args(["--session-ttl", &format!("{}s", TTL.as_secs())])
-            .arg("--data-dir")
-            .arg(dir)
-            .env("QEDGIX_LOG", "error")
-            .stdout(std::process::Stdio::null())
-            .spawn()
-            .unwrap();
-        let mut process = Self { child, grpc: String::new(), rest: String::new() };
-        let started = Instant::now();
-        let endpoints: Value = loop {
-            assert!(started.elapsed() < Duration::from_secs(60), "the server writes endpoints.json");
-            if let Ok(text) = std::fs::read(dir.join("endpoints.json")) {
-                break serde_json::from_slice(&text).unwrap();
+impl Subject {
+    async fn start(dir: &Path, access: Access) -> Self {
+        install_tls_provider();
+        let mut command = process::serve(dir);
+        command.args(["--max-sessions", "2000", "--session-ttl", &format!("{}s", TTL.as_secs())]).env("QEDGIX_LOG", "error");
+        if access == Access::Open {
+            let process = Process::start(command).await;
+            let mut clients = Vec::new();
+            for _ in 0..CONNECTIONS {
+                let channel = Channel::from_shared(format!("http://{}", process.grpc)).unwrap().connect().await.unwrap();
+                clients.push(PolicyServiceClient::with_interceptor(channel, Signed(None)));
             }
-            tokio::time::sleep(Duration::from_millis(20)).await;
-        };
-        process.grpc = format!("http://{}", endpoints["grpc"].as_str().unwrap());
-        process.rest = format!("http://{}", endpoints["http"].as_str().unwrap());
-        process
-    }
-
-    /// Resident memory in MiB.
-    fn memory(&self) -> f64 {
-        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
-        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap();
-        line.trim().trim_end_matches(" kB").parse::<f64>().unwrap() / 1024.0
-    }
-}
-
-impl Drop for Process {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
+            return Self { rest: format!("http://{}", process.http), process, http: reqwest::Client::new(), clients };
+        }
+        let authority = Authority::new("soak");
+        let files = certificates::write(dir, &authority.issue(), None);
+        command.arg("--tls-cert").arg(files.cert).arg("--tls-key").arg(files.key);
+        let bearer = |scopes| format!("Bearer {}", process::create_key(dir, scopes));
+        let (admin, keys) = (bearer("admin"), [(); CONNECTIONS].map(|()| bearer("act")));
+        let process = Process::start(command).await;
+        let mut clients = Vec::new();
+        for key in keys {
+            let channel = certificates::channel(&certificates::caller(&authority, None), &process.grpc).await.unwrap();
+            clients.push(PolicyServiceClient::with_interceptor(channel, Signed(Some(key.parse().unwrap()))));
+        }
+        let headers = [(reqwest::header::AUTHORIZATION, admin.parse().unwrap())].into_iter().collect();
+        let trusted = reqwest::Certificate::from_pem(authority.pem().as_bytes()).unwrap();
+        let http = reqwest::Client::builder().default_headers(headers).tls_certs_only([trusted]).build().unwrap();
+        Self { rest: format!("https://{}", process.http), process, http, clients }
     }
 }
 
@@ -163,7 +189,7 @@ type CheckResult = Result<(), String>;
 
 /// One caller, which runs episodes one after another.
 struct SoakCaller {
-    client: PolicyServiceClient<Channel>,
+    client: Client,
     policies: Arc<Policies>,
     counts: Counts,
     rng: ChaCha8Rng,
@@ -386,8 +412,7 @@ impl SoakCaller {
 }
 
 /// Publishes, moves aliases, unloads and loads, until `end`.
-async fn administer(rest: String, policies: Arc<Policies>, counts: Counts, end: Instant) -> CheckResult {
-    let http = reqwest::Client::new();
+async fn administer(http: reqwest::Client, rest: String, policies: Arc<Policies>, counts: Counts, end: Instant) -> CheckResult {
     let send = async |request: reqwest::RequestBuilder, what: &str| -> Result<Value, String> {
         let response = request.send().await.map_err(|e| format!("{what}: {e}"))?;
         let (status, text) = (response.status(), response.text().await.map_err(|e| format!("{what}: {e}"))?);
@@ -424,13 +449,21 @@ async fn administer(rest: String, policies: Arc<Policies>, counts: Counts, end: 
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn all_responses_match_the_policy_under_mixed_load() {
+    soak(Access::Open).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn all_responses_match_the_policy_under_mixed_load_with_keys_and_tls() {
+    soak(Access::KeysAndTls).await;
+}
+
+async fn soak(access: Access) {
     let seconds = std::env::var("QEDGIX_SOAK_SECONDS").map_or(5, |text| text.parse().expect("QEDGIX_SOAK_SECONDS: seconds"));
     let dir = tempfile::tempdir().unwrap();
-    let process = Process::start(dir.path()).await;
+    let Subject { process, rest, http, clients } = Subject::start(dir.path(), access).await;
     let (policies, counts) = (Arc::new(Policies::new()), Counts::default());
-    let http = reqwest::Client::new();
     for name in ["soak", "spare"] {
-        let upload = http.post(format!("{}/v1/policies/{name}/versions?alias=live", process.rest));
+        let upload = http.post(format!("{rest}/v1/policies/{name}/versions?alias=live"));
         let upload = upload.header("content-type", "application/octet-stream").body(policies.files[0].clone());
         let response = upload.send().await.unwrap();
         assert!(response.status().is_success(), "{}", response.text().await.unwrap());
@@ -438,14 +471,10 @@ async fn all_responses_match_the_policy_under_mixed_load() {
     let started = Instant::now();
     let end = started + Duration::from_secs(seconds);
     let mut work = tokio::task::JoinSet::new();
-    work.spawn(administer(process.rest.clone(), policies.clone(), counts.clone(), end));
-    let mut channels = Vec::new();
-    for _ in 0..4 {
-        channels.push(Channel::from_shared(process.grpc.clone()).unwrap().connect().await.unwrap());
-    }
+    work.spawn(administer(http, rest, policies.clone(), counts.clone(), end));
     for number in 0..CALLERS {
         let mut caller = SoakCaller {
-            client: PolicyServiceClient::new(channels[number as usize % channels.len()].clone()),
+            client: clients[number as usize % clients.len()].clone(),
             policies: policies.clone(),
             counts: counts.clone(),
             rng: qedgix::rng::stream(number, "soak-caller", 0),

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use axum::body::Body;
-use axum::http::{Request, Uri, Version};
+use axum::http::{Request, Version};
 use hyper_rustls::HttpsConnectorBuilder;
 use hyper_util::client::legacy::Client;
 use hyper_util::rt::TokioExecutor;
@@ -12,70 +12,16 @@ use qedgix::config::{Config, TlsFiles};
 use qedgix::server::Listeners;
 use qedgix::wire::v1;
 use qedgix::wire::v1::policy_service_client::PolicyServiceClient;
-use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, DnType, IsCa, KeyPair};
+use rustls::pki_types::CertificateDer;
 use rustls::pki_types::pem::PemObject;
-use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::{ClientConfig, RootCertStore};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
-use tonic::transport::{Channel, Endpoint};
+use tonic::transport::Channel;
 
+pub use super::super::certificates::{Authority, caller, channel, write};
 use super::super::harness::*;
 use super::{key, signed};
-
-/// A certificate authority.
-pub struct Authority(CertifiedIssuer<'static, KeyPair>);
-
-/// A certificate and its key, in PEM.
-pub struct Identity {
-    pub cert: String,
-    pub key: String,
-}
-
-impl Authority {
-    pub fn new(name: &str) -> Self {
-        let mut params = CertificateParams::new(Vec::new()).unwrap();
-        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
-        params.distinguished_name.push(DnType::CommonName, name);
-        Self(CertifiedIssuer::self_signed(params, KeyPair::generate().unwrap()).unwrap())
-    }
-
-    pub fn pem(&self) -> String {
-        self.0.pem()
-    }
-
-    /// Issues a certificate for this machine or for a client.
-    pub fn issue(&self) -> Identity {
-        let key = KeyPair::generate().unwrap();
-        let params = CertificateParams::new(vec!["127.0.0.1".into(), "localhost".into()]).unwrap();
-        Identity { cert: params.signed_by(&key, &self.0).unwrap().pem(), key: key.serialize_pem() }
-    }
-}
-
-/// Writes the TLS files of a server.
-pub fn write(dir: &Path, identity: &Identity, client_ca: Option<&Authority>) -> TlsFiles {
-    let file = |name: &str, text: &str| -> PathBuf {
-        std::fs::write(dir.join(name), text).unwrap();
-        dir.join(name)
-    };
-    TlsFiles {
-        cert: file("cert.pem", &identity.cert),
-        key: file("key.pem", &identity.key),
-        client_ca: client_ca.map(|authority| file("clients.pem", &authority.pem())),
-    }
-}
-
-/// TLS configuration of a client that trusts `trusted`, with an optional client certificate.
-pub fn caller(trusted: &Authority, identity: Option<&Identity>) -> ClientConfig {
-    let mut roots = RootCertStore::empty();
-    roots.add(CertificateDer::from_pem_slice(trusted.pem().as_bytes()).unwrap()).unwrap();
-    let provider = Arc::new(rustls::crypto::ring::default_provider());
-    let builder = ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions().unwrap();
-    let builder = builder.with_root_certificates(roots);
-    let Some(identity) = identity else { return builder.with_no_client_auth() };
-    let certs = vec![CertificateDer::from_pem_slice(identity.cert.as_bytes()).unwrap()];
-    builder.with_client_auth_cert(certs, PrivateKeyDer::from_pem_slice(identity.key.as_bytes()).unwrap()).unwrap()
-}
 
 /// `GET` over TLS: the status and the negotiated HTTP version.
 pub async fn get(caller: &ClientConfig, http2: bool, url: &str) -> Result<(u16, Version), String> {
@@ -85,13 +31,6 @@ pub async fn get(caller: &ClientConfig, http2: bool, url: &str) -> Result<(u16, 
     let request = Request::get(url).body(Body::empty()).unwrap();
     let answer = with_timeout(client.request(request)).await.map_err(|e| format!("{e:?}"))?;
     Ok((answer.status().as_u16(), answer.version()))
-}
-
-pub async fn channel(caller: &ClientConfig, address: impl std::fmt::Display) -> Result<Channel, String> {
-    let connector = HttpsConnectorBuilder::new().with_tls_config(caller.clone()).https_only().enable_http2().build();
-    let uri: Uri = format!("https://{address}").parse().unwrap();
-    let connected = with_timeout(Endpoint::from(uri).connect_with_connector(connector)).await;
-    connected.map_err(|e| format!("{e:?}"))
 }
 
 /// Lists policies. A handshake that the server aborts fails here at the latest.
