@@ -67,6 +67,10 @@ error_codes! {
     SequenceNotStarted = "sequence_not_started",
     /// The session expired because it was idle.
     SessionExpired = "session_expired",
+    /// The database cannot be written: its file is read-only, locked, deleted, or its disk fails.
+    StorageFailed = "storage_failed",
+    /// The database cannot be written: its disk is full.
+    StorageFull = "storage_full",
     /// The request is larger than the limit.
     TooLarge = "too_large",
     /// The API key is missing, unknown, revoked or expired.

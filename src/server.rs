@@ -227,7 +227,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
 /// Serves until `shutdown` resolves, then drains.
 ///
 /// # Errors
-/// [`Error::Listener`] when the address of a listener cannot be read, [`Error::File`] when `endpoints.json` cannot be written.
+/// [`Error::Listener`] when the address of a listener cannot be read.
 pub async fn run(
     config: &Config,
     data: &DataDir,
@@ -266,11 +266,15 @@ pub async fn run(
     let serve_grpc = connections.clone().serve(listeners.grpc, Protocol::Grpc, grpc(services));
     let serve_rest = connections.serve(listeners.http, Protocol::Http, router);
 
+    let upkeep = tokio::spawn(app.store.clone().upkeep());
     let scheduler = tokio::spawn(app.scheduler.clone().run(format!("http://{workers}")));
     let housekeeper = tokio::spawn(housekeeping(app.clone(), config.session_ttl.min(config.environment_ttl)));
     let health_reporter = tokio::spawn(health.clone().follow(app.clone()));
     let key_follower = tokio::spawn(keys::follow(app.clone()));
-    data.write_endpoints(endpoints)?;
+    // The server works without the file, for instance while the disk is full.
+    if let Err(error) = data.write_endpoints(endpoints) {
+        tracing::error!(%error, "the addresses of the server cannot be written to the data directory");
+    }
     tracing::info!(grpc = %endpoints.grpc, http = %endpoints.http, policies = app.registry.len(), "serving");
 
     let drain = async {
@@ -288,10 +292,11 @@ pub async fn run(
         _ = serve => {}
         () = drain => {}
     }
-    for task in [scheduler, housekeeper, health_reporter, key_follower] {
+    for task in [upkeep, scheduler, housekeeper, health_reporter, key_follower] {
         task.abort();
     }
     keys::save_last_used(&app).await;
+    app.store.close().await;
     data.remove_endpoints();
     tracing::info!("stopped");
     Ok(())

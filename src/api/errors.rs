@@ -15,6 +15,7 @@ use utoipa::openapi::schema::{Object, ObjectBuilder, Type};
 
 use crate::error_code::ErrorCode;
 use crate::service::Error;
+use crate::store::WriteFailure;
 
 /// Trailer with the error code as clients compare it, the same text as `code` of REST.
 pub(super) const CODE_METADATA: &str = "qedgix-code";
@@ -35,6 +36,8 @@ fn statuses(error: &Error) -> (Code, StatusCode) {
         Error::MediaType(_) => (Code::InvalidArgument, StatusCode::UNSUPPORTED_MEDIA_TYPE),
         Error::Deadline(_) => (Code::DeadlineExceeded, StatusCode::GATEWAY_TIMEOUT),
         Error::Draining | Error::Unavailable(_) => (Code::Unavailable, StatusCode::SERVICE_UNAVAILABLE),
+        Error::Storage(WriteFailure::Full) => (Code::ResourceExhausted, StatusCode::INSUFFICIENT_STORAGE),
+        Error::Storage(_) => (Code::Unavailable, StatusCode::INSUFFICIENT_STORAGE),
         Error::Unauthenticated(_) => (Code::Unauthenticated, StatusCode::UNAUTHORIZED),
         Error::PermissionDenied { .. } => (Code::PermissionDenied, StatusCode::FORBIDDEN),
         Error::Internal(_) => (Code::Internal, StatusCode::INTERNAL_SERVER_ERROR),
@@ -45,7 +48,7 @@ fn statuses(error: &Error) -> (Code, StatusCode) {
 pub fn retry_after_seconds(error: &Error) -> Option<u64> {
     match error {
         Error::Busy { retry_after, .. } => Some(retry_after.as_secs_f64().ceil().max(1.0) as u64),
-        Error::Draining | Error::Unavailable(_) => Some(1),
+        Error::Draining | Error::Unavailable(_) | Error::Storage(_) => Some(1),
         _ => None,
     }
 }

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
+use crate::store::WriteFailure;
 
 /// An error of a use case. [`Error::code`] has the code that clients see.
 #[derive(Debug, thiserror::Error)]
@@ -63,6 +64,9 @@ pub enum Error {
     /// The server is not ready: the database does not respond, or there is no policy.
     #[error("{0}")]
     Unavailable(&'static str),
+    /// The database cannot be written. Nothing was stored; the caller may retry later.
+    #[error("{}; nothing was stored", .0.reason())]
+    Storage(WriteFailure),
     /// The API key is missing, unknown, revoked or expired.
     #[error("{0}")]
     Unauthenticated(&'static str),
@@ -93,6 +97,8 @@ impl Error {
             Self::Deadline(_) => ErrorCode::DeadlineExceeded,
             Self::Draining => ErrorCode::Draining,
             Self::Unavailable(_) => ErrorCode::Unavailable,
+            Self::Storage(WriteFailure::Full) => ErrorCode::StorageFull,
+            Self::Storage(_) => ErrorCode::StorageFailed,
             Self::Unauthenticated(_) => ErrorCode::Unauthenticated,
             Self::PermissionDenied { .. } => ErrorCode::PermissionDenied,
             Self::Internal(_) => ErrorCode::Internal,
@@ -125,6 +131,9 @@ impl Error {
 
 impl From<crate::store::Error> for Error {
     fn from(error: crate::store::Error) -> Self {
-        Self::internal(error)
+        match error.write_failure() {
+            Some(failure) => Self::Storage(failure),
+            None => Self::internal(error),
+        }
     }
 }

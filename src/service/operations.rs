@@ -13,6 +13,8 @@ const DATABASE_TIMEOUT: Duration = Duration::from_secs(2);
 pub struct ServerHealth {
     /// The database responds.
     pub database: bool,
+    /// The database can be written.
+    pub writes: bool,
     /// At least one policy version exists, loaded or not.
     pub policies: bool,
     /// The queue of jobs is readable, so jobs are started.
@@ -23,6 +25,7 @@ pub struct ServerHealth {
 pub async fn server_health(app: &App) -> ServerHealth {
     ServerHealth {
         database: ping_database(app).await.is_ok(),
+        writes: app.store.write_failure().is_none(),
         policies: !app.registry.is_empty(),
         scheduler: *app.scheduler.queue_readable().borrow(),
     }
@@ -30,10 +33,11 @@ pub async fn server_health(app: &App) -> ServerHealth {
 
 /// Waits until [`server_health`] may have changed.
 pub async fn server_health_changed(app: &App) {
-    let mut readable = app.scheduler.queue_readable();
+    let (mut readable, mut writes) = (app.scheduler.queue_readable(), app.store.write_failures());
     tokio::select! {
-        // Never an error: `app` owns the sender.
+        // Never an error: `app` owns the senders.
         _ = readable.changed() => {}
+        _ = writes.changed() => {}
         () = tokio::time::sleep(DATABASE_TIMEOUT) => {}
     }
 }
@@ -47,7 +51,7 @@ async fn ping_database(app: &App) -> Result<(), String> {
 }
 
 impl App {
-    /// Checks that the server is ready: it is not draining, a policy exists, and the database responds.
+    /// Checks that the server is ready: it is not draining, a policy exists, and the database responds and can be written.
     ///
     /// # Errors
     /// [`Error::Draining`], or [`Error::Unavailable`] with what is missing.
@@ -59,7 +63,8 @@ impl App {
         ping_database(self).await.map_err(|reason| {
             tracing::warn!(reason, "the database does not answer");
             Error::Unavailable("the database does not answer")
-        })
+        })?;
+        self.store.write_failure().map_or(Ok(()), |failure| Err(Error::Unavailable(failure.reason())))
     }
 }
 

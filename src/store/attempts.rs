@@ -175,7 +175,10 @@ impl Store {
     /// [`Error`](super::Error) when the database fails.
     pub async fn begin_attempt(&self, id: JobId, token: [u8; 32], now: Timestamp) -> Result<Option<Lease>> {
         let mut tx = self.begin().await?;
-        let Some(job) = find(&mut tx, id).await?.filter(|job| job.state == JobState::Queued) else { return Ok(None) };
+        let Some(job) = find(&mut tx, id).await?.filter(|job| job.state == JobState::Queued) else {
+            tx.abandon().await?;
+            return Ok(None);
+        };
         let lease = Lease { job_id: id, job_row: job.row_id, attempt: job.attempts + 1 };
         let sql = "INSERT INTO attempts (job, number, token, started_at) VALUES (?, ?, ?, ?)";
         sqlx::query(sql)
@@ -216,8 +219,9 @@ impl Store {
     /// [`Error`](super::Error) when the database fails.
     pub async fn store_log(&self, lease: Lease, log: &str) -> Result<()> {
         let sql = "UPDATE attempts SET log = ?3 WHERE job = ?1 AND number = ?2";
-        sqlx::query(sql).bind(lease.job_row).bind(lease.attempt).bind(log).execute(&self.write).await?;
-        Ok(())
+        let mut tx = self.begin().await?;
+        sqlx::query(sql).bind(lease.job_row).bind(lease.attempt).bind(log).execute(&mut *tx).await?;
+        tx.commit().await
     }
 
     /// Ends the attempts that were running when the server last stopped, and queues their jobs again. Returns these jobs.

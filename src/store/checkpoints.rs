@@ -108,6 +108,7 @@ impl Store {
         let metrics = serde_json::to_string(&new.metrics).map_err(|e| corrupt("checkpoint", new.kind, e))?;
         let mut tx = self.begin().await?;
         if !is_active(&mut tx, lease).await? {
+            tx.abandon().await?;
             return Ok(None);
         }
         let sql = "SELECT id FROM checkpoints WHERE job = ? AND kind = ? AND sha256 = ? AND step = ?";
@@ -119,6 +120,7 @@ impl Store {
             .fetch_optional(&mut *tx)
             .await?;
         if let Some(id) = same {
+            tx.abandon().await?;
             return Ok(Some(Uuid::try_parse(&id).map_err(|e| corrupt("checkpoint", &id, e))?));
         }
         let id = Uuid::now_v7();

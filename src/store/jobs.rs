@@ -7,7 +7,7 @@ use futures::TryStreamExt;
 use jiff::Timestamp;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use sqlx::{Sqlite, SqliteConnection, Transaction};
+use sqlx::SqliteConnection;
 use uuid::Uuid;
 
 use super::named_enum::named_enum;
@@ -349,11 +349,10 @@ impl Store {
             let sql = "SELECT k.body, j.id FROM idempotency_keys k JOIN jobs j ON j.number = k.job WHERE k.key = ?";
             let first: Option<(Vec<u8>, String)> = sqlx::query_as(sql).bind(key).fetch_optional(&mut *tx).await?;
             if let Some((first, id)) = first {
-                if first != body {
-                    return Ok(SubmitResult::Conflict);
-                }
                 let id = JobId::parse(&id).ok_or_else(|| corrupt("job", &id, "not an id"))?;
-                return Ok(SubmitResult::Existing(get_existing(&mut tx, id).await?));
+                let job = get_existing(&mut tx, id).await?;
+                tx.abandon().await?;
+                return Ok(if first == body { SubmitResult::Existing(job) } else { SubmitResult::Conflict });
             }
         }
         let job = insert(&mut tx, &new).await?;
@@ -430,14 +429,20 @@ impl Store {
     pub async fn change_job(&self, id: JobId, action: JobAction, now: Timestamp) -> Result<ActionResult> {
         use JobState::{Cancelled, Failed, Paused, Queued, Running};
         let mut tx = self.begin().await?;
-        let Some(job) = find(&mut tx, id).await? else { return Ok(ActionResult::NotFound) };
+        let Some(job) = find(&mut tx, id).await? else {
+            tx.abandon().await?;
+            return Ok(ActionResult::NotFound);
+        };
         match (action, job.state, job.pending_action) {
             (JobAction::Cancel, Cancelled, _)
             | (JobAction::Cancel, Running, Some(PendingAction::Cancel))
             | (JobAction::Pause, Paused, _)
             | (JobAction::Pause, Running, Some(PendingAction::Pause))
             | (JobAction::Resume | JobAction::Retry, Queued, _)
-            | (JobAction::Resume | JobAction::Retry, Running, None) => return Ok(ActionResult::Accepted(Box::new(job))),
+            | (JobAction::Resume | JobAction::Retry, Running, None) => {
+                tx.abandon().await?;
+                return Ok(ActionResult::Accepted(Box::new(job)));
+            }
             (JobAction::Cancel, Queued | Paused, _) => transition_now(&mut tx, &job, Cancelled, now).await?,
             (JobAction::Pause, Queued, _) => transition_now(&mut tx, &job, Paused, now).await?,
             (JobAction::Resume, Paused, _) => transition_now(&mut tx, &job, Queued, now).await?,
@@ -454,7 +459,10 @@ impl Store {
                 self.notify(job.row_id);
                 return Ok(ActionResult::Accepted(Box::new(job)));
             }
-            _ => return Ok(ActionResult::WrongState(Box::new(job))),
+            _ => {
+                tx.abandon().await?;
+                return Ok(ActionResult::WrongState(Box::new(job)));
+            }
         }
         let job = get_existing(&mut tx, id).await?;
         tx.commit().await?;
@@ -463,7 +471,7 @@ impl Store {
     }
 }
 
-async fn insert(tx: &mut Transaction<'_, Sqlite>, new: &NewJob) -> Result<Job> {
+async fn insert(tx: &mut SqliteConnection, new: &NewJob) -> Result<Job> {
     let spec = serde_json::to_string(&new.spec).map_err(|e| corrupt("job", new.id, e))?;
     let now = new.now.as_millisecond();
     let sql = "INSERT INTO jobs (id, state, spec, threads, priority, created_at) VALUES (?, 'queued', ?, ?, ?, ?)";
@@ -473,23 +481,23 @@ async fn insert(tx: &mut Transaction<'_, Sqlite>, new: &NewJob) -> Result<Job> {
         .bind(new.spec.threads as i64)
         .bind(new.spec.priority)
         .bind(now)
-        .execute(&mut **tx)
+        .execute(&mut *tx)
         .await?
         .last_insert_rowid();
     transition(tx, Transition { job: row_id, to: JobState::Queued, attempt: 0, reason: None, now: new.now }).await?;
     if let Some((key, body)) = &new.idempotency {
         let sql = "INSERT INTO idempotency_keys (key, body, job, created_at) VALUES (?, ?, ?, ?)";
-        sqlx::query(sql).bind(key).bind(body.as_slice()).bind(row_id).bind(now).execute(&mut **tx).await?;
+        sqlx::query(sql).bind(key).bind(body.as_slice()).bind(row_id).bind(now).execute(&mut *tx).await?;
     }
     get_existing(tx, new.id).await
 }
 
-async fn transition_now(tx: &mut Transaction<'_, Sqlite>, job: &Job, to: JobState, now: Timestamp) -> Result<()> {
+async fn transition_now(tx: &mut SqliteConnection, job: &Job, to: JobState, now: Timestamp) -> Result<()> {
     transition(tx, Transition { job: job.row_id, to, attempt: job.attempts, reason: None, now }).await
 }
 
-async fn set_pending_action(tx: &mut Transaction<'_, Sqlite>, job: &Job, action: PendingAction) -> Result<()> {
+async fn set_pending_action(tx: &mut SqliteConnection, job: &Job, action: PendingAction) -> Result<()> {
     let sql = "UPDATE jobs SET wanted = ? WHERE number = ?";
-    sqlx::query(sql).bind(action.as_str()).bind(job.row_id).execute(&mut **tx).await?;
+    sqlx::query(sql).bind(action.as_str()).bind(job.row_id).execute(&mut *tx).await?;
     Ok(())
 }

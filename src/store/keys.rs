@@ -67,6 +67,8 @@ impl Store {
         let rotated = expires && insert(&mut tx, new).await?;
         if rotated {
             tx.commit().await?;
+        } else {
+            tx.abandon().await?;
         }
         Ok(rotated)
     }
@@ -97,7 +99,9 @@ impl Store {
     pub async fn revoke_key(&self, id: &str, now: Timestamp) -> Result<bool> {
         let sql =
             concat!("UPDATE api_keys SET revoked_at = COALESCE(revoked_at, ?), revision = ", next_revision!(), " WHERE id = ?");
-        let done = sqlx::query(sql).bind(now.as_millisecond()).bind(id).execute(&self.write).await?;
+        let mut tx = self.begin().await?;
+        let done = sqlx::query(sql).bind(now.as_millisecond()).bind(id).execute(&mut *tx).await?;
+        tx.commit().await?;
         Ok(done.rows_affected() == 1)
     }
 
@@ -111,7 +115,7 @@ impl Store {
             let sql = "UPDATE api_keys SET last_used_at = MAX(COALESCE(last_used_at, ?1), ?1) WHERE id = ?2";
             sqlx::query(sql).bind(at.as_millisecond()).bind(id).execute(&mut *tx).await?;
         }
-        Ok(tx.commit().await?)
+        tx.commit().await
     }
 }
 

@@ -53,6 +53,7 @@ impl Store {
     pub async fn report(&self, lease: Lease, metrics: &[Metric], step: u64, now: Timestamp) -> Result<bool> {
         let mut tx = self.begin().await?;
         if !is_active(&mut tx, lease).await? {
+            tx.abandon().await?;
             return Ok(false);
         }
         let sql = "UPDATE jobs SET step = ?, seq = seq + 1 WHERE number = ? RETURNING seq";

@@ -27,6 +27,8 @@ mod metrics;
 mod named_enum;
 mod policies;
 mod snapshots;
+mod upkeep;
+mod writes;
 
 pub use aliases::{AliasHistoryEntry, AliasHistoryFilter, AliasMove, PolicyAlias};
 pub use attempts::{Attempt, AttemptOutcome, EndedAttempt, Lease, LeaseRecord, WorkerResult};
@@ -39,15 +41,16 @@ pub use keys::KeyRecord;
 pub use metrics::{Metric, MetricCursor, MetricRow, is_metric_name};
 pub use policies::{NewPolicyVersion, PolicyVersion, PublishedPolicy};
 pub use snapshots::{PartialSnapshot, Snapshot};
+pub use writes::WriteFailure;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
 use sqlx::migrate::{Migration, MigrationType, Migrator};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
-use sqlx::{SqlSafeStr, Sqlite, SqlitePool, Transaction};
+use sqlx::{Connection, SqlSafeStr, SqliteConnection, SqlitePool};
 
 macro_rules! migrations {
     ($($file:literal),+ $(,)?) => {
@@ -68,12 +71,20 @@ const MIGRATIONS: [(&str, &str); 6] = migrations![
 /// Name of the database file inside the data directory.
 pub const FILE: &str = "qedgix.sqlite";
 
+/// Longest time that a write waits for another process that writes.
+const BUSY_TIMEOUT: Duration = Duration::from_secs(2);
+/// Longest time that an operation waits for a connection.
+const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(10);
+
 /// Why an operation on the database failed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// SQLite or the disk failed.
     #[error("database: {0}")]
     Sqlx(#[from] sqlx::Error),
+    /// The database cannot be written at present, so nothing was tried.
+    #[error("{}; nothing was stored", .0.reason())]
+    Write(WriteFailure),
     /// The file cannot be migrated, for example because a newer version has written it.
     #[error("database migration: {0}")]
     Migrate(#[from] sqlx::migrate::MigrateError),
@@ -87,6 +98,17 @@ pub enum Error {
     },
 }
 
+impl Error {
+    /// Why the database cannot be written, if that is the cause.
+    pub fn write_failure(&self) -> Option<WriteFailure> {
+        match self {
+            Self::Write(failure) => Some(*failure),
+            Self::Sqlx(error) => WriteFailure::of(error),
+            Self::Migrate(_) | Self::Corrupt { .. } => None,
+        }
+    }
+}
+
 /// Handle to the database; cheap to clone.
 #[derive(Clone, Debug)]
 pub struct Store {
@@ -94,6 +116,7 @@ pub struct Store {
     read: SqlitePool,
     /// A single connection for writing: writers queue for it instead of failing with `SQLITE_BUSY`.
     write: SqlitePool,
+    condition: Arc<writes::Condition>,
     notifier: Arc<events::Notifier>,
 }
 
@@ -103,25 +126,33 @@ impl Store {
     /// # Errors
     /// [`Error::Sqlx`] when the file cannot be opened; [`Error::Migrate`] when a newer version has migrated it.
     pub async fn open(data_dir: &Path) -> Result<Self, Error> {
+        let path = data_dir.join(FILE);
         let options = SqliteConnectOptions::new()
-            .filename(data_dir.join(FILE))
-            .create_if_missing(true)
+            .filename(&path)
             .journal_mode(SqliteJournalMode::Wal)
+            .pragma("journal_size_limit", upkeep::LOG_LIMIT.to_string())
             // FULL: a commit is on the disk when it returns.
             .synchronous(SqliteSynchronous::Full)
             .foreign_keys(true)
-            .busy_timeout(Duration::from_secs(10));
-        let write = SqlitePoolOptions::new().max_connections(1).connect_with(options.clone()).await?;
+            .busy_timeout(BUSY_TIMEOUT);
+        SqliteConnection::connect_with(&options.clone().create_if_missing(true)).await?.close().await?;
+        // From here on a missing file is an error: a new, empty one would hide that the data is lost. Connections do not age,
+        // because the last one to be closed would delete the write-ahead log.
+        let pool = SqlitePoolOptions::new().acquire_timeout(ACQUIRE_TIMEOUT).idle_timeout(None).max_lifetime(None);
+        let write = pool.clone().max_connections(1).after_release(|connection, _| Box::pin(writes::is_reusable(connection)));
+        let write = write.connect_with(options.clone()).await?;
         migrator().run(&write).await?;
-        let read = SqlitePoolOptions::new().max_connections(4).connect_with(options.read_only(true)).await?;
-        Ok(Self { read, write, notifier: Arc::new(events::Notifier::new()) })
+        let read = pool.max_connections(4).min_connections(1).connect_with(options.read_only(true)).await?;
+        let condition = Arc::new(writes::Condition::of(&path));
+        Ok(Self { read, write, condition, notifier: Arc::new(events::Notifier::new()) })
     }
+}
 
-    /// Begins a transaction that writes. It takes the lock at once: a transaction that first reads fails at its first write
-    /// if another process (`qedgix keys`) has written meanwhile.
-    async fn begin(&self) -> Result<Transaction<'static, Sqlite>> {
-        Ok(self.write.begin_with("BEGIN IMMEDIATE").await?)
-    }
+/// The path of a file beside the database: its write-ahead log (`-wal`) or its shared memory (`-shm`).
+fn with_suffix(database: &Path, suffix: &str) -> PathBuf {
+    let mut name = database.as_os_str().to_owned();
+    name.push(suffix);
+    name.into()
 }
 
 fn migrator() -> Migrator {
@@ -147,7 +178,7 @@ fn timestamp(milliseconds: i64) -> Result<Timestamp> {
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
+    use std::path::{Path, PathBuf};
 
     use sqlx::migrate::Migrator;
 

@@ -50,6 +50,7 @@ impl Store {
     pub async fn begin_snapshot(&self, lease: Lease, step: u64, now: Timestamp) -> Result<Option<PartialSnapshot>> {
         let mut tx = self.begin().await?;
         if !is_active(&mut tx, lease).await? {
+            tx.abandon().await?;
             return Ok(None);
         }
         discard_incomplete(&mut tx, lease.job_row).await?;
@@ -73,6 +74,7 @@ impl Store {
     pub async fn append_snapshot(&self, partial: &mut PartialSnapshot, bytes: &[u8]) -> Result<bool> {
         let mut tx = self.begin().await?;
         if !is_active(&mut tx, partial.lease).await? {
+            tx.abandon().await?;
             return Ok(false);
         }
         let sql = "INSERT INTO snapshot_chunks (snapshot, number, bytes) VALUES (?, ?, ?)";
@@ -91,6 +93,7 @@ impl Store {
     pub async fn complete_snapshot(&self, partial: PartialSnapshot, sha256: &str) -> Result<bool> {
         let mut tx = self.begin().await?;
         if !is_active(&mut tx, partial.lease).await? {
+            tx.abandon().await?;
             return Ok(false);
         }
         let sql = "UPDATE jobs SET consecutive_failures = 0 WHERE number = ?1 AND consecutive_failures > 0

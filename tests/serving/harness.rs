@@ -96,6 +96,11 @@ impl Server {
         self.stop.take().unwrap().send(()).unwrap();
     }
 
+    /// Waits until the server has stopped, and keeps its data directory.
+    pub async fn running(&mut self) {
+        (&mut self.running).await.unwrap().unwrap();
+    }
+
     pub async fn stopped(self) {
         self.running.await.unwrap().unwrap();
     }

@@ -1,9 +1,10 @@
-//! Operations: metrics, logs, traces, draining, and socket options.
+//! Operations: metrics, logs, traces, draining, a database that cannot be written, and socket options.
 
 mod collector;
 mod exposition;
 mod logs;
 mod stopping;
+mod storage;
 
 use qedgix::wire::v1;
 

@@ -53,12 +53,12 @@ impl Health {
 
     /// Derives the status of each service from the state of the server.
     pub fn report(&self, health: ServerHealth) {
-        let ServerHealth { database, policies, scheduler } = health;
-        self.set("", database && policies);
+        let ServerHealth { database, writes, policies, scheduler } = health;
+        self.set("", database && writes && policies);
         for &service in SERVICES {
             let serving = match service {
                 v1::environment_service_server::SERVICE_NAME => true,
-                v1::job_service_server::SERVICE_NAME => database && scheduler,
+                v1::job_service_server::SERVICE_NAME => database && writes && scheduler,
                 v1::worker_service_server::SERVICE_NAME => database,
                 // Services that run policies.
                 _ => policies,
@@ -178,10 +178,12 @@ mod tests {
     fn the_status_of_a_service_depends_on_its_dependencies() {
         let health = Health::new(Draining::default(), CancellationToken::new());
         let is_serving = |service: &str| health.status(service).map(|status| status == ServingStatus::Serving);
-        let all = ServerHealth { database: true, policies: true, scheduler: true };
+        let all = ServerHealth { database: true, writes: true, policies: true, scheduler: true };
         let cases = [
             (all, [true; 5]),
             (ServerHealth { scheduler: false, ..all }, [true, true, true, false, true]),
+            // Workers keep calling: they wait for the database.
+            (ServerHealth { writes: false, ..all }, [false, true, true, false, true]),
             (ServerHealth { policies: false, ..all }, [false, false, true, true, true]),
             (ServerHealth { database: false, ..all }, [false, true, true, false, false]),
         ];

@@ -86,7 +86,8 @@ fn severity(status: StatusCode) -> Severity {
         | StatusCode::FORBIDDEN
         | StatusCode::PAYLOAD_TOO_LARGE
         | StatusCode::TOO_MANY_REQUESTS
-        | StatusCode::GATEWAY_TIMEOUT => Severity::Refused,
+        | StatusCode::GATEWAY_TIMEOUT
+        | StatusCode::INSUFFICIENT_STORAGE => Severity::Refused,
         // Sent during shutdown, which is logged on its own.
         StatusCode::SERVICE_UNAVAILABLE => Severity::Normal,
         status if status.is_server_error() => Severity::Failed,

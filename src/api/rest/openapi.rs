@@ -77,7 +77,13 @@ impl Description {
 /// The document with the responses and links of every operation, and the limits of this server.
 fn finished(document: &OpenApi, cpu_budget: usize) -> Value {
     let mut document = serde_json::to_value(document).expect("the document is plain data");
-    let everywhere = [Unauthorized::responses(), Forbidden::responses(), TooMany::responses(), Fault::responses()];
+    let everywhere = [
+        Unauthorized::responses(),
+        Forbidden::responses(),
+        TooMany::responses(),
+        Fault::responses(),
+        InsufficientStorage::responses(),
+    ];
     let everywhere: BTreeMap<_, _> = everywhere.into_iter().flatten().collect();
     let paths = document["paths"].as_object_mut().into_iter().flatten().filter(|(path, _)| path.starts_with("/v1"));
     for operation in paths.filter_map(|(_, item)| item.as_object_mut()).flat_map(Map::values_mut) {
@@ -218,6 +224,7 @@ problems! {
     TooMany = 429 with "retry-after": "A limit is reached; retry later.";
     Fault = 500: "An internal error of the server.";
     Draining = 503 with "retry-after": "The server is shutting down or not ready; retry later.";
+    InsufficientStorage = 507 with "retry-after": "The database cannot be written, and nothing was stored; retry later.";
 }
 
 /// The problems of a JSON body.

@@ -12,6 +12,7 @@ use tonic::transport::{Channel, Endpoint};
 use tonic::{Code, Request, Status};
 
 use super::Assignment;
+use crate::error_code::ErrorCode;
 use crate::jobs::Directive;
 use crate::wire::v1;
 use crate::wire::v1::worker_service_client::WorkerServiceClient;
@@ -149,7 +150,14 @@ fn parts<P, M>(
     futures::stream::iter(messages)
 }
 
-/// Retries a call until it succeeds, is rejected, or has failed for [`RETRY_TIMEOUT`].
+/// Whether the server answers that it cannot write its database.
+fn is_storage_failure(status: &Status) -> bool {
+    let code = status.metadata().get("qedgix-code").and_then(|code| code.to_str().ok());
+    code.is_some_and(|code| [ErrorCode::StorageFull, ErrorCode::StorageFailed].iter().any(|failure| failure.as_str() == code))
+}
+
+/// Retries a call until it succeeds, is rejected, or has failed for [`RETRY_TIMEOUT`]. While the server cannot write its
+/// database, another attempt would fail in the same way, so this one waits: training goes on, and no attempt is lost.
 async fn retry<T, F>(limit: Duration, call: impl Fn() -> F) -> Result<T, ClientError>
 where
     F: Future<Output = Result<T, Status>>,
@@ -162,6 +170,13 @@ where
             Ok(Err(status)) => status,
             Err(_) => Status::deadline_exceeded(format!("no response within {} s", limit.as_secs())),
         };
+        if is_storage_failure(&status) {
+            tracing::debug!(message = status.message(), "the server cannot write its database; trying again");
+            failing_since = None;
+            tokio::time::sleep(delay).await;
+            delay = (delay * 2).min(longest);
+            continue;
+        }
         let text = format!("{:?}: {}", status.code(), status.message());
         match status.code() {
             Code::Unauthenticated | Code::PermissionDenied | Code::FailedPrecondition | Code::NotFound => {
