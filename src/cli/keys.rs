@@ -25,6 +25,7 @@ Examples:
   qedgix keys create --name fleet --scopes read,act --expires 90d
   export QEDGIX_API_KEY=$(qedgix keys create --name me --scopes admin)
   qedgix keys create --name simulator --scopes act --rate 500 --burst 2000
+  qedgix keys create --name dashboard --scopes read --owner ID   # sees what the key ID made
   qedgix keys list
   qedgix keys rotate ID --grace 1h       # a new key; the old one expires in an hour
   qedgix keys revoke ID"
@@ -50,6 +51,9 @@ enum What {
         /// What the key allows: one or more of read, act, jobs and admin, separated by commas
         #[arg(long)]
         scopes: Scopes,
+        /// Id of an existing key: the two share sessions, environments, jobs and policy names [default: the key has its own]
+        #[arg(long, value_name = "ID")]
+        owner: Option<String>,
         /// Time until the key expires, such as 12h, 90d or 52w [default: never]
         #[arg(long, value_parser = time, value_name = "TIME")]
         expires: Option<Duration>,
@@ -85,8 +89,8 @@ pub async fn run(args: KeysArgs) -> anyhow::Result<()> {
     let store = keys::open_store(&args.data_dir, matches!(args.what, What::Create { .. })).await?;
     let now = Timestamp::now();
     match args.what {
-        What::Create { name, scopes, expires, rate, burst } => {
-            let new = NewKey { name, scopes, lifetime: expires, rate, burst };
+        What::Create { name, scopes, owner, expires, rate, burst } => {
+            let new = NewKey { name, scopes, owner, lifetime: expires, rate, burst };
             print_created(&keys::create(&store, new, now).await?, args.json)?;
         }
         What::Rotate { id, grace } => print_created(&keys::rotate(&store, &id, grace, now).await?, args.json)?,
@@ -107,7 +111,10 @@ pub async fn run(args: KeysArgs) -> anyhow::Result<()> {
 fn print_created(created: &CreatedKey, json: bool) -> anyhow::Result<()> {
     let CreatedKey { info, key } = created;
     let printed = if json {
-        outln!("{}", json!({"key": key, "id": info.id, "name": info.name, "scopes": info.scopes, "expires_at": info.expires_at}))
+        outln!(
+            "{}",
+            json!({"key": key, "id": info.id, "name": info.name, "scopes": info.scopes, "owner": info.owner, "expires_at": info.expires_at})
+        )
     } else {
         let expiry = info.expires_at.map_or_else(|| "never expires".to_owned(), |at| format!("expires {}", minute(at)));
         errln!("API key {} ({}), scopes {}, {expiry}. It is shown only now:", info.id, info.name, info.scopes);
@@ -119,13 +126,13 @@ fn print_created(created: &CreatedKey, json: bool) -> anyhow::Result<()> {
 fn table(list: &[KeyInfo]) -> Table {
     let mut table = Table::new();
     table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
-    table.set_header(["id", "name", "scopes", "state", "rate", "created", "expires", "last used"]);
+    table.set_header(["id", "name", "scopes", "owner", "state", "rate", "created", "expires", "last used"]);
     let time = |at: Option<Timestamp>| at.map_or_else(|| "-".to_owned(), minute);
     for key in list {
         let rate = key.rate.map_or_else(|| "-".to_owned(), |rate| format!("{rate}/s"));
         let scopes = key.scopes.to_string();
         let (created, expires, used) = (time(Some(key.created_at)), time(key.expires_at), time(key.last_used_at));
-        table.add_row([&key.id, &key.name, &scopes, key.state, &rate, &created, &expires, &used]);
+        table.add_row([&key.id, &key.name, &scopes, &key.owner, key.state, &rate, &created, &expires, &used]);
     }
     table
 }

@@ -4,12 +4,14 @@ use uuid::Uuid;
 
 use super::keys::Caller;
 use super::paging::{self, parse_number};
-use super::{App, Error, Page, PageRequest, policies};
+use super::policies::{self, Publisher};
+use super::{App, Error, Page, PageRequest};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::jobs::spec::JobRequest;
+use crate::serving::Owner;
 use crate::store::{
-    ActionResult, Attempt, Checkpoint, Job, JobAction, JobId, JobState, JobSummary, MetricCursor, MetricRow, NewJob,
+    ActionResult, Attempt, Checkpoint, Job, JobAction, JobFilter, JobId, JobState, JobSummary, MetricCursor, MetricRow, NewJob,
     PendingAction, SubmitResult, is_metric_name,
 };
 
@@ -19,7 +21,7 @@ use crate::store::{
 /// # Errors
 /// [`Error::Invalid`]: a field of the request, or the idempotency key. [`Error::Conflict`]: the key was used with another
 /// request.
-/// [`Error::Draining`].
+/// [`Error::PermissionDenied`]: another owner made the policy with the job's name. [`Error::Draining`].
 pub async fn submit(
     app: &App,
     caller: &Caller,
@@ -37,11 +39,13 @@ pub async fn submit(
     if let Some(name) = &spec.name {
         // Reported now instead of after training.
         policies::check_publishable(name)?;
+        policies::check_owner(app, &Publisher::from(caller), name).await?;
     }
     app.admit()?;
     let id = JobId(Uuid::now_v7());
     let idempotency = idempotency_key.map(|key| (key, digest));
-    let new = NewJob { id, spec, now: app.clock.now(), idempotency };
+    let Publisher { owner, any_name, .. } = caller.into();
+    let new = NewJob { id, owner, any_name, spec, now: app.clock.now(), idempotency };
     match app.store.submit_job(new).await? {
         SubmitResult::Created(job) => {
             tracing::info!(job = %job.id, algorithm = ?job.spec.config.algorithm, threads = job.spec.threads, "job submitted");
@@ -61,21 +65,23 @@ fn parse_id(id: &str) -> Result<JobId, Error> {
     JobId::parse(id).ok_or_else(|| Error::not_found("job", id))
 }
 
-/// The job `id`.
+/// The job `id`, if the caller sees it.
 ///
 /// # Errors
 /// [`Error::NotFound`].
 pub async fn get(app: &App, caller: &Caller, id: &str) -> Result<Job, Error> {
-    app.store.job(parse_id(id)?).await?.ok_or_else(|| Error::not_found("job", id))
+    let job = app.store.job(parse_id(id)?).await?.filter(|job| caller.sees_id(job.owner.as_deref()));
+    job.ok_or_else(|| Error::not_found("job", id))
 }
 
-/// Summaries of jobs, newest first.
+/// Summaries of the jobs that the caller sees, newest first.
 ///
 /// # Errors
 /// [`Error::Invalid`]: the page size is over 1000, or the token is invalid.
 pub async fn list(app: &App, caller: &Caller, state: Option<JobState>, page: &PageRequest) -> Result<Page<JobSummary>, Error> {
     let (limit, before) = (page.usual_limit()?, page.parse_token(parse_number)?);
-    let (jobs, more) = app.store.job_summaries(state, before, limit, paging::MAX_BYTES).await?;
+    let filter = JobFilter { owner: caller.sees().and_then(Owner::id), state, before };
+    let (jobs, more) = app.store.job_summaries(filter, limit, paging::MAX_BYTES).await?;
     Ok(Page::new(jobs, more, |job| job.row_id.to_string()))
 }
 
@@ -87,7 +93,7 @@ pub async fn change(app: &App, caller: &Caller, id: &str, action: JobAction) -> 
     if matches!(action, JobAction::Resume | JobAction::Retry) {
         app.admit()?;
     }
-    match app.store.change_job(parse_id(id)?, action, app.clock.now()).await? {
+    match app.store.change_job(get(app, caller, id).await?.id, action, app.clock.now()).await? {
         ActionResult::Accepted(job) => {
             tracing::info!(job = %job.id, state = %job.state, ?action, "job changed");
             app.scheduler.job_changed(job.row_id);

@@ -4,7 +4,8 @@
 use sha2::{Digest, Sha256};
 use uuid::Uuid;
 
-use super::{App, Error, policies};
+use super::policies::{self, Publisher};
+use super::{App, Error};
 use crate::error_code::ErrorCode;
 use crate::invalid::{Invalid, in_range};
 use crate::jobs::{Directive, equal_secrets, token_digest};
@@ -175,7 +176,9 @@ async fn new_version(app: &App, lease: Lease) -> Result<Option<policies::NewVers
     // The end of an id is random. Its beginning is the time, which jobs submitted together share.
     let id = lease.job_id.to_string();
     let name = job.spec.name.unwrap_or_else(|| format!("job-{}", &id[id.len() - 8..]));
-    policies::NewVersion::from_bytes(&name, checkpoint).await.map(Some)
+    // The name was checked at submission. Another owner may have made it since, so it is checked again when it is published.
+    let publisher = Publisher { owner: job.owner, any_name: job.any_name, key: None };
+    policies::NewVersion::from_bytes(publisher, &name, checkpoint).await.map(Some)
 }
 
 /// Size and digest that an upload declares.

@@ -6,7 +6,7 @@ use sqlx::SqliteConnection;
 
 use super::jobs::{Transition, find, transition};
 use super::named_enum::named_enum;
-use super::policies::{NewPolicyVersion, PublishedPolicy, publish};
+use super::policies::{NewPolicyVersion, PublishedPolicy, may_publish, publish};
 use super::{Job, JobId, JobState, PendingAction, Result, Store, corrupt, timestamp};
 
 named_enum! {
@@ -125,6 +125,16 @@ async fn end(db: &mut SqliteConnection, ended: EndedAttempt<'_>) -> Result<Optio
         return Ok(None);
     }
     let job = find(db, lease.job_id).await?.ok_or_else(|| corrupt("job", lease.job_id, "deleted within a transaction"))?;
+    // Another owner may have made the name since the job was submitted. Another attempt would fail in the same way.
+    let name_taken;
+    let result = match policy {
+        Some(new) if !may_publish(db, new).await? => {
+            let reason = format!("another owner made the policy {}; the checkpoints of the job remain", new.name);
+            name_taken = WorkerResult::Failed { reason, permanent: true };
+            &name_taken
+        }
+        _ => result,
+    };
     // An acknowledged cancel wins, even over a worker that succeeded before it noticed.
     let (outcome, state) = match (result, job.pending_action) {
         (WorkerResult::Succeeded | WorkerResult::Stopped, Some(PendingAction::Cancel)) => {

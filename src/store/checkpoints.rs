@@ -93,10 +93,10 @@ impl TryFrom<CheckpointRow> for Checkpoint {
     }
 }
 
-/// Checkpoints of job `?1`, or checkpoint `?2`.
+/// Checkpoints of job `?1`, or checkpoint `?2`; of jobs of owner `?3`, or of all.
 const SELECT: &str = "SELECT c.id, j.id AS job, c.kind, c.attempt, c.step, c.sha256, c.size, c.metrics, c.config, c.created_at
     FROM checkpoints c JOIN jobs j ON j.number = c.job
-    WHERE (?1 IS NULL OR j.id = ?1) AND (?2 IS NULL OR c.id = ?2) ORDER BY c.created_at, c.id";
+    WHERE (?1 IS NULL OR j.id = ?1) AND (?2 IS NULL OR c.id = ?2) AND (?3 IS NULL OR j.owner = ?3) ORDER BY c.created_at, c.id";
 
 impl Store {
     /// Stores a checkpoint in place of the previous one of its kind. Returns its id, which is the previous one's if the two
@@ -149,7 +149,7 @@ impl Store {
     /// [`Error`](super::Error) when the database fails.
     pub async fn checkpoints(&self, job: JobId) -> Result<Vec<Checkpoint>> {
         let rows: Vec<CheckpointRow> =
-            sqlx::query_as(SELECT).bind(job.to_string()).bind(None::<String>).fetch_all(&self.read).await?;
+            sqlx::query_as(SELECT).bind(job.to_string()).bind(None::<String>).bind(None::<String>).fetch_all(&self.read).await?;
         rows.into_iter().map(Checkpoint::try_from).collect()
     }
 
@@ -163,14 +163,14 @@ impl Store {
         Ok(sqlx::query_scalar(sql).bind(job.to_string()).fetch_optional(&self.read).await?)
     }
 
-    /// The checkpoint `id` and its bytes.
+    /// The checkpoint `id` and its bytes, if its job has this owner; `None`: any owner.
     ///
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
-    pub async fn checkpoint(&self, id: Uuid) -> Result<Option<(Checkpoint, Vec<u8>)>> {
+    pub async fn checkpoint(&self, id: Uuid, owner: Option<&str>) -> Result<Option<(Checkpoint, Vec<u8>)>> {
         let mut tx = self.read.begin().await?;
         let row: Option<CheckpointRow> =
-            sqlx::query_as(SELECT).bind(None::<String>).bind(id.to_string()).fetch_optional(&mut *tx).await?;
+            sqlx::query_as(SELECT).bind(None::<String>).bind(id.to_string()).bind(owner).fetch_optional(&mut *tx).await?;
         let Some(row) = row else { return Ok(None) };
         let sql = "SELECT bytes FROM checkpoints WHERE id = ?";
         let bytes = sqlx::query_scalar(sql).bind(id.to_string()).fetch_one(&mut *tx).await?;

@@ -149,6 +149,10 @@ pub struct Job<S = JobSpec> {
     pub id: JobId,
     /// Key of the row. Jobs submitted later have larger keys.
     pub row_id: i64,
+    /// Who submitted the job; `None`: nobody, on a server without keys.
+    pub owner: Option<String>,
+    /// Whether the job may publish under a name that another owner made.
+    pub any_name: bool,
     /// The state.
     pub state: JobState,
     /// Action that the worker has not carried out yet.
@@ -181,11 +185,14 @@ impl Job {
     /// The job as returned by lists, and the configuration that lists omit.
     pub fn split(self) -> (JobSummary, TrainConfig) {
         let spec = SpecSummary::from(&self.spec);
-        let Self { spec: JobSpec { config, .. }, id, row_id, state, pending_action, reason, attempts, failures, .. } = self;
-        let Self { consecutive_failures, step, policy, last_event, created_at, started_at, ended_at, .. } = self;
+        let Self { spec: JobSpec { config, .. }, id, row_id, owner, any_name, state, pending_action, reason, .. } = self;
+        let Self { attempts, failures, consecutive_failures, step, policy, .. } = self;
+        let Self { last_event, created_at, started_at, ended_at, .. } = self;
         let summary = Job {
             id,
             row_id,
+            owner,
+            any_name,
             state,
             pending_action,
             reason,
@@ -208,6 +215,8 @@ from_row! {
     struct JobRow {
         number: i64,
         id: String,
+        owner: Option<String>,
+        any_name: bool,
         state: String,
         /// The pending action.
         wanted: Option<String>,
@@ -232,6 +241,8 @@ impl<S: DeserializeOwned> TryFrom<JobRow> for Job<S> {
         Ok(Self {
             id: JobId::parse(&row.id).ok_or_else(|| corrupt("job", &row.id, "not an id"))?,
             row_id: row.number,
+            owner: row.owner,
+            any_name: row.any_name,
             state: JobState::from_column(&row.state)?,
             pending_action: row.wanted.as_deref().map(PendingAction::from_column).transpose()?,
             reason: row.reason,
@@ -254,12 +265,34 @@ impl<S: DeserializeOwned> TryFrom<JobRow> for Job<S> {
 pub struct NewJob {
     /// The id.
     pub id: JobId,
+    /// Who submits the job; `None`: nobody, on a server without keys.
+    pub owner: Option<String>,
+    /// Whether the job may publish under a name that another owner made.
+    pub any_name: bool,
     /// The specification.
     pub spec: JobSpec,
     /// The current time.
     pub now: Timestamp,
-    /// The idempotency key of the request, and the SHA-256 of its body.
+    /// The idempotency key of the request, which belongs to the owner, and the SHA-256 of its body.
     pub idempotency: Option<(String, [u8; 32])>,
+}
+
+impl NewJob {
+    /// The owner of the idempotency key.
+    fn owner(&self) -> &str {
+        self.owner.as_deref().unwrap_or_default()
+    }
+}
+
+/// The jobs that a list contains.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct JobFilter<'a> {
+    /// Only those of this owner.
+    pub owner: Option<&'a str>,
+    /// Only those in this state.
+    pub state: Option<JobState>,
+    /// Only those with smaller row ids.
+    pub before: Option<i64>,
 }
 
 /// The result of a submission.
@@ -346,8 +379,10 @@ impl Store {
     pub async fn submit_job(&self, new: NewJob) -> Result<SubmitResult> {
         let mut tx = self.begin().await?;
         if let Some((key, body)) = &new.idempotency {
-            let sql = "SELECT k.body, j.id FROM idempotency_keys k JOIN jobs j ON j.number = k.job WHERE k.key = ?";
-            let first: Option<(Vec<u8>, String)> = sqlx::query_as(sql).bind(key).fetch_optional(&mut *tx).await?;
+            let sql =
+                "SELECT k.body, j.id FROM idempotency_keys k JOIN jobs j ON j.number = k.job WHERE k.owner = ? AND k.key = ?";
+            let first: Option<(Vec<u8>, String)> =
+                sqlx::query_as(sql).bind(new.owner()).bind(key).fetch_optional(&mut *tx).await?;
             if let Some((first, id)) = first {
                 let id = JobId::parse(&id).ok_or_else(|| corrupt("job", &id, "not an id"))?;
                 let job = get_existing(&mut tx, id).await?;
@@ -368,26 +403,31 @@ impl Store {
         find(&mut *self.read.acquire().await?, id).await
     }
 
-    /// Summaries of jobs, newest first: those in `state`, with row ids below `before`; and whether there are more. At most
-    /// `limit` summaries of together about `max_bytes` bytes, but at least one.
+    /// Summaries of jobs, newest first, and whether there are more. At most `limit` summaries of together about `max_bytes`
+    /// bytes, but at least one.
     ///
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
-    pub async fn job_summaries(
-        &self,
-        state: Option<JobState>,
-        before: Option<i64>,
-        limit: usize,
-        max_bytes: usize,
-    ) -> Result<(Vec<JobSummary>, bool)> {
+    pub async fn job_summaries(&self, filter: JobFilter<'_>, limit: usize, max_bytes: usize) -> Result<(Vec<JobSummary>, bool)> {
         /// Bytes of a summary besides its texts.
         const FIXED: usize = 512;
-        let sql = "SELECT number, id, state, wanted, reason, attempts, failures, consecutive_failures, step, policy, seq,
-                   created_at, started_at, ended_at,
-                   json_extract(spec, '$.kind', '$.name', '$.labels', '$.threads', '$.priority', '$.config.algorithm',
-                   '$.config.preset', '$.config.seed', '$.config.training.steps') AS spec
-                   FROM jobs WHERE (?1 IS NULL OR state = ?1) AND (?2 IS NULL OR number < ?2) ORDER BY number DESC";
-        let query = sqlx::query_as(sql).bind(state.map(JobState::as_str)).bind(before);
+        /// SQL of the jobs with a condition on the owner.
+        macro_rules! summaries {
+            ($owner:literal) => {
+                concat!(
+                    "SELECT number, id, owner, any_name, state, wanted, reason, attempts, failures, consecutive_failures, step, policy,
+                     seq, created_at, started_at, ended_at,
+                     json_extract(spec, '$.kind', '$.name', '$.labels', '$.threads', '$.priority', '$.config.algorithm',
+                     '$.config.preset', '$.config.seed', '$.config.training.steps') AS spec
+                     FROM jobs WHERE (?1 IS NULL OR state = ?1) AND (?2 IS NULL OR number < ?2)",
+                    $owner,
+                    " ORDER BY number DESC"
+                )
+            };
+        }
+        let JobFilter { owner, state, before } = filter;
+        let sql = if owner.is_some() { summaries!(" AND owner = ?3") } else { summaries!("") };
+        let query = sqlx::query_as(sql).bind(state.map(JobState::as_str)).bind(before).bind(owner);
         let (mut rows, mut jobs, mut bytes) = (query.fetch(&self.read), Vec::new(), 0);
         while let Some(row) = rows.try_next().await? {
             let row: JobRow = row;
@@ -474,9 +514,12 @@ impl Store {
 async fn insert(tx: &mut SqliteConnection, new: &NewJob) -> Result<Job> {
     let spec = serde_json::to_string(&new.spec).map_err(|e| corrupt("job", new.id, e))?;
     let now = new.now.as_millisecond();
-    let sql = "INSERT INTO jobs (id, state, spec, threads, priority, created_at) VALUES (?, 'queued', ?, ?, ?, ?)";
+    let sql = "INSERT INTO jobs (id, owner, any_name, state, spec, threads, priority, created_at)
+               VALUES (?, ?, ?, 'queued', ?, ?, ?, ?)";
     let row_id = sqlx::query(sql)
         .bind(new.id.to_string())
+        .bind(&new.owner)
+        .bind(new.any_name)
         .bind(spec)
         .bind(new.spec.threads as i64)
         .bind(new.spec.priority)
@@ -486,8 +529,8 @@ async fn insert(tx: &mut SqliteConnection, new: &NewJob) -> Result<Job> {
         .last_insert_rowid();
     transition(tx, Transition { job: row_id, to: JobState::Queued, attempt: 0, reason: None, now: new.now }).await?;
     if let Some((key, body)) = &new.idempotency {
-        let sql = "INSERT INTO idempotency_keys (key, body, job, created_at) VALUES (?, ?, ?, ?)";
-        sqlx::query(sql).bind(key).bind(body.as_slice()).bind(row_id).bind(now).execute(&mut *tx).await?;
+        let sql = "INSERT INTO idempotency_keys (owner, key, body, job, created_at) VALUES (?, ?, ?, ?, ?)";
+        sqlx::query(sql).bind(new.owner()).bind(key).bind(body.as_slice()).bind(row_id).bind(now).execute(&mut *tx).await?;
     }
     get_existing(tx, new.id).await
 }

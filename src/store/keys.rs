@@ -11,6 +11,8 @@ use super::{Result, Store, corrupt, timestamp};
 pub struct KeyRecord {
     /// Public id.
     pub id: String,
+    /// Owner of what the key makes: its own id, or the id of a key that it replaces or accompanies.
+    pub owner: String,
     /// Display name.
     pub name: String,
     /// SHA-256 of the secret.
@@ -78,7 +80,7 @@ impl Store {
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
     pub async fn keys(&self) -> Result<Vec<KeyRecord>> {
-        let sql = "SELECT id, name, digest, scopes, rate, burst, created_at, expires_at, revoked_at, last_used_at
+        let sql = "SELECT id, COALESCE(owner, id) AS owner, name, digest, scopes, rate, burst, created_at, expires_at, revoked_at, last_used_at
                    FROM api_keys ORDER BY created_at, id";
         sqlx::query(sql).fetch_all(&self.read).await?.iter().map(read).collect()
     }
@@ -121,13 +123,14 @@ impl Store {
 
 async fn insert(db: &mut SqliteConnection, key: &KeyRecord) -> Result<bool> {
     let sql = concat!(
-        "INSERT INTO api_keys (id, name, digest, scopes, rate, burst, created_at, expires_at, revision)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ",
+        "INSERT INTO api_keys (id, owner, name, digest, scopes, rate, burst, created_at, expires_at, revision)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ",
         next_revision!(),
         ") ON CONFLICT (id) DO NOTHING"
     );
     let done = sqlx::query(sql)
         .bind(&key.id)
+        .bind(&key.owner)
         .bind(&key.name)
         .bind(key.digest.as_slice())
         .bind(&key.scopes)
@@ -147,6 +150,7 @@ fn read(row: &SqliteRow) -> Result<KeyRecord> {
     let time = |column| row.try_get::<Option<i64>, _>(column)?.map(timestamp).transpose();
     Ok(KeyRecord {
         digest,
+        owner: row.try_get("owner")?,
         name: row.try_get("name")?,
         scopes: row.try_get("scopes")?,
         rate: row.try_get("rate")?,

@@ -35,7 +35,8 @@ pub use attempts::{Attempt, AttemptOutcome, EndedAttempt, Lease, LeaseRecord, Wo
 pub use checkpoints::{Checkpoint, CheckpointKind, NewCheckpoint};
 pub use events::{JobEvent, JobEventKind};
 pub use jobs::{
-    ActionResult, Job, JobAction, JobId, JobKind, JobSpec, JobState, JobSummary, NewJob, PendingAction, SpecSummary, SubmitResult,
+    ActionResult, Job, JobAction, JobFilter, JobId, JobKind, JobSpec, JobState, JobSummary, NewJob, PendingAction, SpecSummary,
+    SubmitResult,
 };
 pub use keys::KeyRecord;
 pub use metrics::{Metric, MetricCursor, MetricRow, is_metric_name};
@@ -59,12 +60,13 @@ macro_rules! migrations {
 }
 
 /// Name and content of every file in `migrations/`.
-const MIGRATIONS: [(&str, &str); 6] = migrations![
+const MIGRATIONS: &[(&str, &str)] = &migrations![
     "0001_jobs.sql",
     "0002_policies.sql",
     "0003_promotions.sql",
     "0004_events.sql",
     "0005_api_keys.sql",
+    "0008_owners.sql",
     "0009_consecutive_failures.sql",
 ];
 
@@ -156,13 +158,13 @@ fn with_suffix(database: &Path, suffix: &str) -> PathBuf {
 }
 
 fn migrator() -> Migrator {
-    let migration = |(file, sql): (&'static str, &'static str)| {
+    let migration = |&(file, sql): &(&'static str, &'static str)| {
         let parts = file.strip_suffix(".sql").and_then(|name| name.split_once('_'));
         let (number, name) = parts.expect("files are named NUMBER_NAME.sql");
         let number = number.parse().expect("files are named NUMBER_NAME.sql");
         Migration::new(number, name.replace('_', " ").into(), MigrationType::Simple, sql.into_sql_str(), false)
     };
-    Migrator::with_migrations(MIGRATIONS.into_iter().map(migration).collect())
+    Migrator::with_migrations(MIGRATIONS.iter().map(migration).collect())
 }
 
 /// A result of the store.

@@ -37,6 +37,10 @@ pub struct NewPolicyVersion<'a> {
     pub alias: Option<&'a str>,
     /// Id of the caller's API key.
     pub by: Option<&'a str>,
+    /// Who publishes it; `None`: nobody, on a server without keys. A new name belongs to this owner.
+    pub owner: Option<&'a str>,
+    /// Whether the name may be one that another owner made.
+    pub any_name: bool,
 }
 
 /// The result of a publication.
@@ -61,15 +65,27 @@ impl Store {
     }
 
     /// Publishes a checkpoint as a new version, or finds the version of the policy with this digest, and moves the alias to
-    /// it, in one transaction.
+    /// it, in one transaction. Returns `None`, and changes nothing, if another owner made the name.
     ///
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
-    pub async fn publish_policy(&self, new: NewPolicyVersion<'_>) -> Result<PublishedPolicy, Error> {
+    pub async fn publish_policy(&self, new: NewPolicyVersion<'_>) -> Result<Option<PublishedPolicy>, Error> {
         let mut tx = self.begin().await?;
+        if !may_publish(&mut tx, new).await? {
+            tx.abandon().await?;
+            return Ok(None);
+        }
         let published = publish(&mut tx, new).await?;
         tx.commit().await?;
-        Ok(published)
+        Ok(Some(published))
+    }
+
+    /// Who made the name of a policy; the inner `None`: nobody. `None` if there is no such policy.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn policy_owner(&self, name: &str) -> Result<Option<Option<String>>, Error> {
+        owner_of(&mut *self.read.acquire().await?, name).await
     }
 
     /// Names and numbers of all versions.
@@ -127,6 +143,15 @@ impl Store {
     }
 }
 
+/// Whether the name is new, belongs to the publisher, or the publisher may use any name.
+pub(super) async fn may_publish(db: &mut SqliteConnection, new: NewPolicyVersion<'_>) -> Result<bool, Error> {
+    Ok(new.any_name || owner_of(db, new.name).await?.is_none_or(|owner| owner.as_deref() == new.owner))
+}
+
+async fn owner_of(db: &mut SqliteConnection, name: &str) -> Result<Option<Option<String>>, Error> {
+    Ok(sqlx::query_scalar("SELECT owner FROM policies WHERE name = ?").bind(name).fetch_optional(db).await?)
+}
+
 /// Publishes a checkpoint as a new version, or finds the version of the policy with this digest, and moves the alias to it.
 pub(super) async fn publish(db: &mut SqliteConnection, new: NewPolicyVersion<'_>) -> Result<PublishedPolicy, Error> {
     let sql = "SELECT version, created_at FROM policy_versions WHERE name = ? AND digest = ?";
@@ -144,8 +169,8 @@ pub(super) async fn publish(db: &mut SqliteConnection, new: NewPolicyVersion<'_>
 
 async fn insert(db: &mut SqliteConnection, new: NewPolicyVersion<'_>) -> Result<PublishedPolicy, Error> {
     let created_at = new.now.as_millisecond();
-    let sql = "INSERT INTO policies (name, created_at) VALUES (?, ?) ON CONFLICT (name) DO NOTHING";
-    sqlx::query(sql).bind(new.name).bind(created_at).execute(&mut *db).await?;
+    let sql = "INSERT INTO policies (name, created_at, owner) VALUES (?, ?, ?) ON CONFLICT (name) DO NOTHING";
+    sqlx::query(sql).bind(new.name).bind(created_at).bind(new.owner).execute(&mut *db).await?;
     let sql = "INSERT INTO policy_versions (name, version, digest, checkpoint, created_at)
                SELECT ?1, COALESCE(MAX(version), 0) + 1, ?2, ?3, ?4 FROM policy_versions WHERE name = ?1
                RETURNING version";

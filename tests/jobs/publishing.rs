@@ -30,7 +30,7 @@ async fn running_job(dir: &Path) -> (Store, Lease) {
     let store = Store::open(dir).await.unwrap();
     let (config, now) = (TrainConfig::preset(Algorithm::Qmix, Preset::Practical), Timestamp::UNIX_EPOCH);
     let spec = JobSpec { kind: JobKind::Train, name: None, labels: BTreeMap::new(), threads: 1, priority: 0, config };
-    let new = NewJob { id: JobId(uuid::Uuid::from_u128(7)), spec, now, idempotency: None };
+    let new = NewJob { id: JobId(uuid::Uuid::from_u128(7)), owner: None, any_name: false, spec, now, idempotency: None };
     let SubmitResult::Created(job) = store.submit_job(new).await.unwrap() else { panic!("a new job") };
     let lease = store.begin_attempt(job.id, [0; 32], now).await.unwrap().unwrap();
     (store, lease)
@@ -38,7 +38,16 @@ async fn running_job(dir: &Path) -> (Store, Lease) {
 
 fn success(lease: Lease, digest: &str) -> EndedAttempt<'_> {
     let now = Timestamp::UNIX_EPOCH;
-    let new = NewPolicyVersion { name: "mine", digest, checkpoint: b"weights", now, alias: None, by: None };
+    let new = NewPolicyVersion {
+        name: "mine",
+        digest,
+        checkpoint: b"weights",
+        now,
+        alias: None,
+        by: None,
+        owner: None,
+        any_name: false,
+    };
     EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: Some(new), max_attempts: 3, now }
 }
 

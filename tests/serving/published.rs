@@ -3,7 +3,8 @@
 use bytes::Bytes;
 use qedgix::checkpoint::{Checkpoint, parameter_layout};
 use qedgix::policy::FleetStep;
-use qedgix::service::{Error, policies};
+use qedgix::service::Error;
+use qedgix::service::policies::{self, Publisher};
 use qedgix::serving::{FleetInput, PolicyRef};
 use qedgix::train_config::{Algorithm, Preset, TrainConfig};
 use qedgix::wire::v1;
@@ -21,7 +22,7 @@ pub fn checkpoint(algorithm: Algorithm, preset: Preset, seed: u64) -> Checkpoint
 }
 
 pub async fn publish(server: &Server, name: &str, checkpoint: &Checkpoint) -> PolicyRef {
-    policies::publish_bytes(&server.app, name, checkpoint.to_bytes()).await.unwrap()
+    policies::publish_bytes(&server.app, Publisher::default(), name, checkpoint.to_bytes()).await.unwrap()
 }
 
 #[tokio::test]
@@ -77,7 +78,7 @@ async fn what_is_no_checkpoint_is_refused() {
         ("sweep", good, "name"),
     ];
     for (name, bytes, field) in cases {
-        let refused = policies::publish_bytes(&server.app, name, bytes).await.unwrap_err();
+        let refused = policies::publish_bytes(&server.app, Publisher::default(), name, bytes).await.unwrap_err();
         assert!(matches!(&refused, Error::Invalid(e) if e.field == field), "{refused}");
     }
     assert_eq!(server.app.store.policy_versions().await.unwrap().iter().filter(|(name, _)| name == "mine").count(), 0);

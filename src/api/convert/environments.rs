@@ -53,7 +53,7 @@ impl From<v1::StepRequest> for EnvironmentStep {
 
 impl From<EnvironmentInfo> for v1::Environment {
     fn from(info: EnvironmentInfo) -> Self {
-        let EnvironmentInfo { owner: _, id, spec, cursor, created_at, ttl } = info;
+        let EnvironmentInfo { owner, id, spec, cursor, created_at, ttl } = info;
         let config = serde_json::to_value(&spec.config).expect("a configuration is plain data");
         Self {
             environment_id: id,
@@ -67,6 +67,7 @@ impl From<EnvironmentInfo> for v1::Environment {
             step: cursor.step,
             created_at: Some(timestamp(created_at)),
             ttl: Some(duration(ttl)),
+            owner: owner.id().unwrap_or_default().to_owned(),
         }
     }
 }

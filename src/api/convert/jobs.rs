@@ -60,6 +60,7 @@ impl From<JobSummary> for v1::Job {
             started_at: job.started_at.map(timestamp),
             ended_at: job.ended_at.map(timestamp),
             last_event_id: job.last_event,
+            owner: job.owner.unwrap_or_default(),
         }
     }
 }

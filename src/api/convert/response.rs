@@ -81,6 +81,7 @@ impl From<SessionInfo> for v1::Session {
             steps: session.steps,
             opened_at: Some(timestamp(session.opened_at)),
             ttl: Some(duration(session.ttl)),
+            owner: session.owner.id().unwrap_or_default().to_owned(),
         }
     }
 }

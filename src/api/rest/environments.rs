@@ -134,11 +134,14 @@ struct HostedEnvironment {
     created_at: Timestamp,
     /// The environment expires after this time without a request.
     ttl: Seconds,
+    /// Id of the API key that made it, or of the first of the keys that replaced each other; null: no key was required.
+    #[schema(required = true)]
+    owner: Option<String>,
 }
 
 impl From<EnvironmentInfo> for HostedEnvironment {
     fn from(info: EnvironmentInfo) -> Self {
-        let EnvironmentInfo { owner: _, id, spec, cursor, created_at, ttl } = info;
+        let EnvironmentInfo { owner, id, spec, cursor, created_at, ttl } = info;
         Self {
             environment_id: id,
             headings: spec.config.actions(),
@@ -151,6 +154,7 @@ impl From<EnvironmentInfo> for HostedEnvironment {
             step: cursor.step,
             created_at,
             ttl: Seconds(ttl),
+            owner: owner.id().map(str::to_owned),
         }
     }
 }

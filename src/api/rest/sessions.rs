@@ -66,6 +66,9 @@ struct Session {
     opened_at: Timestamp,
     /// The session expires after this time without a request.
     ttl: Seconds,
+    /// Id of the API key that made it, or of the first of the keys that replaced each other; null: no key was required.
+    #[schema(required = true)]
+    owner: Option<String>,
 }
 
 impl From<SessionInfo> for Session {
@@ -76,6 +79,7 @@ impl From<SessionInfo> for Session {
             steps: session.steps,
             opened_at: session.opened_at,
             ttl: Seconds(session.ttl),
+            owner: session.owner.id().map(str::to_owned),
         }
     }
 }

@@ -144,7 +144,7 @@ impl Key {
             expires_at: AtomicI64::new(i64::MAX),
             last_used_at: AtomicI64::new(used_at),
             stored_last_used_at: AtomicI64::new(used_at),
-            owner: Owner::new(&record.id),
+            owner: Owner::new(&record.owner),
             id: record.id.clone(),
         };
         key.update(&record);
@@ -189,6 +189,11 @@ impl Caller {
     /// The owner whose things the caller sees; `None`: it sees those of all.
     pub fn sees(&self) -> Option<&Owner> {
         (!self.is_admin()).then(|| self.owner())
+    }
+
+    /// Whether the caller sees what the owner with this id has.
+    pub fn sees_id(&self, owner: Option<&str>) -> bool {
+        self.sees().is_none_or(|own| own.id() == owner)
     }
 
     /// The owner whose entry `id` the caller means: its own, or with `admin` that of another owner if its own has none.

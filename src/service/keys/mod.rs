@@ -30,6 +30,8 @@ pub struct NewKey {
     pub name: String,
     /// What the key allows.
     pub scopes: Scopes,
+    /// Id of a key whose sessions, environments, jobs and policy names it shares; `None`: it has its own.
+    pub owner: Option<String>,
     /// Time until the key expires; `None`: it never expires.
     pub lifetime: Option<Duration>,
     /// Requests per second; `None`: the default of the server.
@@ -47,6 +49,8 @@ pub struct KeyInfo {
     pub name: String,
     /// What the key allows.
     pub scopes: Scopes,
+    /// Owner of what the key makes: its id, or that of a key that it replaces or accompanies.
+    pub owner: String,
     /// `active`, `expired` or `revoked`.
     pub state: &'static str,
     /// Requests per second; `None`: the default of the server.
@@ -88,8 +92,13 @@ pub async fn open_store(data_dir: &Path, create: bool) -> Result<Store, Error> {
 /// Creates a key.
 ///
 /// # Errors
-/// [`Error::Invalid`] when the name, rate, burst or lifetime is out of range.
-pub async fn create(store: &Store, new: NewKey, now: Timestamp) -> Result<CreatedKey, Error> {
+/// [`Error::Invalid`] when the name, rate, burst or lifetime is out of range; [`Error::NotFound`] when there is no key `owner`.
+pub async fn create(store: &Store, mut new: NewKey, now: Timestamp) -> Result<CreatedKey, Error> {
+    if let Some(owner) = &mut new.owner {
+        let id = secret::id_of(owner);
+        let key = store.keys().await?.into_iter().find(|key| key.id == id);
+        *owner = key.ok_or_else(|| Error::not_found("API key", id))?.owner;
+    }
     let (record, key) = generate(new, now)?;
     if !store.insert_key(&record).await? {
         return Err(Error::internal("two API keys have the same id"));
@@ -112,6 +121,7 @@ fn generate(new: NewKey, now: Timestamp) -> Result<(KeyRecord, String), Error> {
     let expires_at = new.lifetime.map(|lifetime| after(now, lifetime, "expires")).transpose()?;
     let plain = secret::PlainKey::generate().map_err(|e| Error::internal(e.to_string()))?;
     let record = KeyRecord {
+        owner: new.owner.unwrap_or_else(|| plain.id().to_owned()),
         id: plain.id().to_owned(),
         name: new.name,
         digest: plain.digest(),
@@ -143,8 +153,8 @@ pub async fn revoke(store: &Store, id: &str, now: Timestamp) -> Result<(), Error
     if store.revoke_key(id, now).await? { Ok(()) } else { Err(Error::not_found("API key", id)) }
 }
 
-/// Replaces a key, given as its id or in full: in one transaction, creates a key with the same properties and lifetime, and lets the
-/// old key expire after `grace`.
+/// Replaces a key, given as its id or in full: in one transaction, creates a key with the same properties, owner and lifetime, and
+/// lets the old key expire after `grace`.
 ///
 /// # Errors
 /// [`Error::NotFound`] when there is no such key, [`Error::Precondition`] when it is revoked or expired.
@@ -162,7 +172,7 @@ pub async fn rotate(store: &Store, id: &str, grace: Duration, now: Timestamp) ->
     let end = after(now, grace, "grace")?;
     let lifetime = old.expires_at.and_then(|at| Duration::try_from(at.duration_since(old.created_at)).ok());
     let scopes = Scopes::from_stored(&old.scopes);
-    let new = NewKey { name: old.name, scopes, lifetime, rate: old.rate, burst: old.burst };
+    let new = NewKey { name: old.name, scopes, owner: Some(old.owner), lifetime, rate: old.rate, burst: old.burst };
     let (record, key) = generate(new, now)?;
     if !store.rotate_key(id, &record, end).await? {
         // The key was active when it was read.
@@ -189,6 +199,7 @@ fn info(record: KeyRecord, now: Timestamp) -> KeyInfo {
         state: state(&record, now),
         scopes: Scopes::from_stored(&record.scopes),
         id: record.id,
+        owner: record.owner,
         name: record.name,
         rate: record.rate,
         burst: record.burst,

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use sha2::{Digest, Sha256};
 
-use super::publish::{StoredVersion, publish_bytes};
+use super::publish::{Publisher, StoredVersion, publish_bytes};
 use super::{PolicyStores, one_at_a_time};
 use crate::invalid::Invalid;
 use crate::policy::{EnvParams, baselines};
@@ -132,7 +132,7 @@ pub async fn fill_registry(app: &App) -> Result<(), Error> {
         }
     }
     for (name, bytes) in BUNDLED {
-        publish_bytes(app, name, bytes.to_vec()).await?;
+        publish_bytes(app, Publisher::PROGRAM, name, bytes.to_vec()).await?;
     }
     for alias in app.store.policy_aliases().await? {
         app.registry.set_alias(&alias.name, &alias.alias, alias.version);

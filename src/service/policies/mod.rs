@@ -12,7 +12,7 @@ use std::sync::Arc;
 
 pub use aliases::{AliasChange, aliases, delete_alias, history, set_alias};
 pub use loading::{IndexEntry, fill_registry, index, load_policy, unload_policy};
-pub use publish::{CheckpointSource, PublishRequest, check_publishable, publish, publish_bytes};
+pub use publish::{CheckpointSource, PublishRequest, Publisher, check_owner, check_publishable, publish, publish_bytes};
 pub(super) use publish::{NewVersion, publish_and_end};
 pub use upload_limit::{UploadLimit, UploadPermit};
 

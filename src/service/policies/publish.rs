@@ -13,8 +13,9 @@ use crate::checkpoint::Checkpoint;
 use crate::invalid::Invalid;
 use crate::policy::baselines;
 use crate::policy::{Identity, ObservationKind, Policy};
-use crate::service::keys::Caller;
+use crate::service::keys::{Caller, Scope};
 use crate::service::{App, Error, checkpoints};
+use crate::serving::bundled::BUNDLED;
 use crate::serving::{
     LoadedPolicy, PolicyDetails, PolicyInfo, PolicyKind, PolicyRef, PolicySpec, Registry, VersionSelector, check_name,
 };
@@ -40,6 +41,46 @@ pub struct PublishRequest {
     pub alias: Option<String>,
 }
 
+/// On whose behalf a checkpoint is published.
+#[derive(Clone, Debug, Default)]
+pub struct Publisher {
+    /// The owner; `None`: nobody, on a server without keys.
+    pub owner: Option<String>,
+    /// Whether the name may be one that another owner made.
+    pub any_name: bool,
+    /// Id of the API key.
+    pub key: Option<String>,
+}
+
+impl Publisher {
+    /// The program itself, which publishes the bundled policies.
+    pub(super) const PROGRAM: Self = Self { owner: None, any_name: true, key: None };
+}
+
+impl From<&Caller> for Publisher {
+    fn from(caller: &Caller) -> Self {
+        let owner = caller.owner().id().map(str::to_owned);
+        Self { owner, any_name: caller.is_admin(), key: caller.key_id().map(str::to_owned) }
+    }
+}
+
+/// Checks that `publisher` may publish under `name`: nobody else made that name, or the publisher may use any.
+///
+/// # Errors
+/// [`Error::PermissionDenied`].
+pub async fn check_owner(app: &App, publisher: &Publisher, name: &str) -> Result<(), Error> {
+    let made_by = if publisher.any_name { None } else { app.store.policy_owner(name).await? };
+    let taken = made_by.is_some_and(|owner| owner != publisher.owner);
+    let bundled = !publisher.any_name && publisher.owner.is_some() && BUNDLED.iter().any(|(bundled, _)| *bundled == name);
+    if taken || bundled { Err(name_taken(name)) } else { Ok(()) }
+}
+
+fn name_taken(name: &str) -> Error {
+    let scope = Scope::Admin.name();
+    let message = format!("another owner made the policy {name}; choose another name, or use a key with the scope {scope}");
+    Error::PermissionDenied { message, scope }
+}
+
 /// Checks that a policy may be published as `name`.
 ///
 /// # Errors
@@ -56,10 +97,11 @@ pub fn check_publishable(name: &str) -> Result<(), Invalid> {
 /// the existing version, loaded or not.
 ///
 /// # Errors
-/// [`Error::Invalid`] for a name or bytes that cannot be published, [`Error::Internal`] when the database fails.
-pub async fn publish_bytes(app: &App, name: &str, bytes: Vec<u8>) -> Result<PolicyRef, Error> {
-    let version = NewVersion::parse(name, CheckpointBytes { bytes, _permit: None }).await?;
-    let (reference, _) = version.publish(app, None, None).await?;
+/// [`Error::Invalid`] for a name or bytes that cannot be published, [`Error::PermissionDenied`] when another owner made the name,
+/// [`Error::Internal`] when the database fails.
+pub async fn publish_bytes(app: &App, publisher: Publisher, name: &str, bytes: Vec<u8>) -> Result<PolicyRef, Error> {
+    let version = NewVersion::parse(publisher, name, CheckpointBytes { bytes, _permit: None }).await?;
+    let (reference, _) = version.publish(app, None).await?;
     Ok(reference)
 }
 
@@ -72,6 +114,7 @@ pub async fn publish(app: &App, caller: &Caller, request: PublishRequest) -> Res
     app.admit()?;
     let PublishRequest { name, source, alias } = request;
     check_publishable(&name)?;
+    check_owner(app, &caller.into(), &name).await?;
     if let Some(alias) = &alias {
         check_name("alias", alias)?;
     }
@@ -79,8 +122,7 @@ pub async fn publish(app: &App, caller: &Caller, request: PublishRequest) -> Res
         CheckpointSource::Bytes(bytes, permit) => CheckpointBytes { bytes, _permit: Some(permit) },
         CheckpointSource::Job(id) => CheckpointBytes { bytes: checkpoints::get(app, caller, &id).await?.1, _permit: None },
     };
-    let by = caller.key_id().map(str::to_owned);
-    let (reference, new) = NewVersion::parse(&name, checkpoint).await?.publish(app, alias, by).await?;
+    let (reference, new) = NewVersion::parse(caller.into(), &name, checkpoint).await?.publish(app, alias).await?;
     let spec = PolicySpec { name, version: VersionSelector::Version(reference.version) };
     Ok((app.registry.describe(&spec)?, new))
 }
@@ -93,7 +135,7 @@ pub async fn publish(app: &App, caller: &Caller, request: PublishRequest) -> Res
 pub(in crate::service) async fn publish_and_end(app: &App, version: NewVersion, lease: Lease) -> Result<Option<Job>, Error> {
     let (max_attempts, now) = (app.scheduler.config().max_attempts, app.clock.now());
     one_at_a_time(app, async move |PolicyStores { store, registry }| {
-        let new = version.row(now, None, None);
+        let new = version.row(now, None);
         let ended = EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: Some(new), max_attempts, now };
         let Some((job, published)) = store.end_attempt(ended).await? else { return Ok(None) };
         if let Some(published) = published {
@@ -106,6 +148,7 @@ pub(in crate::service) async fn publish_and_end(app: &App, version: NewVersion, 
 
 /// A parsed checkpoint that is to become a version of policy `name`.
 pub(in crate::service) struct NewVersion {
+    publisher: Publisher,
     name: String,
     digest_hex: String,
     parsed: ParsedCheckpoint,
@@ -116,23 +159,25 @@ impl NewVersion {
     ///
     /// # Errors
     /// [`Error::Invalid`] for a name or bytes that cannot be published.
-    pub(in crate::service) async fn from_bytes(name: &str, bytes: Vec<u8>) -> Result<Self, Error> {
-        Self::parse(name, CheckpointBytes { bytes, _permit: None }).await
+    pub(in crate::service) async fn from_bytes(publisher: Publisher, name: &str, bytes: Vec<u8>) -> Result<Self, Error> {
+        Self::parse(publisher, name, CheckpointBytes { bytes, _permit: None }).await
     }
 
-    async fn parse(name: &str, source: CheckpointBytes) -> Result<Self, Error> {
+    async fn parse(publisher: Publisher, name: &str, source: CheckpointBytes) -> Result<Self, Error> {
         check_publishable(name)?;
         let parsed = ParsedCheckpoint::parse(source).await?;
-        Ok(Self { name: name.to_owned(), digest_hex: hex::encode(parsed.digest), parsed })
+        Ok(Self { publisher, name: name.to_owned(), digest_hex: hex::encode(parsed.digest), parsed })
     }
 
-    fn row<'a>(&'a self, now: Timestamp, alias: Option<&'a str>, by: Option<&'a str>) -> NewPolicyVersion<'a> {
+    fn row<'a>(&'a self, now: Timestamp, alias: Option<&'a str>) -> NewPolicyVersion<'a> {
         let (name, digest, checkpoint) = (&self.name, &self.digest_hex, &self.parsed.source.bytes);
-        NewPolicyVersion { name, digest, checkpoint, now, alias, by }
+        let Publisher { owner, any_name, key } = &self.publisher;
+        let (owner, by) = (owner.as_deref(), key.as_deref());
+        NewPolicyVersion { name, digest, checkpoint, now, alias, by, owner, any_name: *any_name }
     }
 
     /// Publishes the version. Returns it, and whether it is new.
-    async fn publish(self, app: &App, alias: Option<String>, by: Option<String>) -> Result<(PolicyRef, bool), Error> {
+    async fn publish(self, app: &App, alias: Option<String>) -> Result<(PolicyRef, bool), Error> {
         let now = app.clock.now();
         one_at_a_time(app, async move |PolicyStores { store, registry }| {
             if let Some(alias) = &alias {
@@ -143,7 +188,8 @@ impl NewVersion {
                     return Err(unloaded(&info.reference));
                 }
             }
-            let published = store.publish_policy(self.row(now, alias.as_deref(), by.as_deref())).await?;
+            let published = store.publish_policy(self.row(now, alias.as_deref())).await?;
+            let published = published.ok_or_else(|| name_taken(&self.name))?;
             Ok((self.register(&registry, published, alias.as_deref()), published.new))
         })
         .await

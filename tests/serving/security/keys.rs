@@ -75,7 +75,8 @@ async fn a_running_server_notices_new_and_revoked_keys() {
     assert_eq!(ask(&server, "").await.0, 200, "no key is required while none exists");
     // A second connection to the database, as another process has it.
     let store = keys::open_store(server.dir.path(), false).await.unwrap();
-    let new = keys::NewKey { name: "k".into(), scopes: "read".parse().unwrap(), lifetime: None, rate: None, burst: None };
+    let new =
+        keys::NewKey { name: "k".into(), scopes: "read".parse().unwrap(), owner: None, lifetime: None, rate: None, burst: None };
     let created = keys::create(&store, new, server.app.clock.now()).await.unwrap();
     let until = async |status| {
         while ask(&server, &created.key).await.0 != status || ask(&server, "").await.0 != 401 {
@@ -158,7 +159,14 @@ async fn a_rotation_that_fails_leaves_no_new_key() {
 async fn properties_of_new_keys_are_validated() {
     let server = Server::start().await;
     let refused = async |change: fn(&mut keys::NewKey)| {
-        let mut new = keys::NewKey { name: "k".into(), scopes: "read".parse().unwrap(), lifetime: None, rate: None, burst: None };
+        let mut new = keys::NewKey {
+            name: "k".into(),
+            scopes: "read".parse().unwrap(),
+            owner: None,
+            lifetime: None,
+            rate: None,
+            burst: None,
+        };
         change(&mut new);
         match keys::create(&server.app.store, new, server.app.clock.now()).await {
             Err(qedgix::service::Error::Invalid(error)) => error.field,

@@ -5,6 +5,7 @@ mod binary;
 mod clocks;
 mod connections;
 mod keys;
+mod owners;
 mod rates;
 mod tls;
 
@@ -15,7 +16,14 @@ use super::harness::Server;
 
 /// Creates a key that the server already knows when this returns.
 async fn make(server: &Server, scopes: &str, change: impl FnOnce(&mut NewKey)) -> CreatedKey {
-    let mut new = NewKey { name: "of a test".into(), scopes: scopes.parse().unwrap(), lifetime: None, rate: None, burst: None };
+    let mut new = NewKey {
+        name: "of a test".into(),
+        scopes: scopes.parse().unwrap(),
+        owner: None,
+        lifetime: None,
+        rate: None,
+        burst: None,
+    };
     change(&mut new);
     let created = create(&server.app.store, new, server.app.clock.now()).await.unwrap();
     refresh(server).await;

@@ -82,6 +82,9 @@ fn labels() -> RefOr<Schema> {
 pub(super) struct JobSummary {
     #[schema(value_type = Uuid)]
     id: JobId,
+    /// Id of the API key that made it, or of the first of the keys that replaced each other; null: no key was required.
+    #[schema(required = true)]
+    owner: Option<String>,
     state: JobState,
     /// Pending action of a running job; null if there is none.
     #[schema(required = true)]
@@ -137,6 +140,7 @@ impl From<store::JobSummary> for JobSummary {
         let SpecSummary { kind, name, labels, threads, priority, algorithm, preset, seed, steps } = job.spec;
         Self {
             id: job.id,
+            owner: job.owner,
             state: job.state,
             wanted: job.pending_action,
             reason: job.reason,
