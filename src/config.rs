@@ -5,6 +5,7 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use crate::inflight::Budget;
 use crate::invalid::{Invalid, in_range};
 use crate::service::keys::Rate;
 use crate::serving::EngineConfig;
@@ -54,10 +55,23 @@ pub struct Config {
     pub tls: Option<TlsFiles>,
     /// Maximum connections of both addresses together.
     pub max_connections: usize,
+    /// Maximum connections of one peer: an IPv4 address or an IPv6 network (64 bits).
+    pub max_connections_per_peer: usize,
     /// Maximum open streams per HTTP/2 connection.
     pub max_streams: u32,
-    /// Read timeout of a TLS handshake, of the head of an HTTP/1 request and of each part of a REST body.
+    /// Maximum bytes of requests that have arrived and of responses that are not sent, of both addresses together.
+    pub max_inflight_bytes: usize,
+    /// Time for a TLS handshake, the head of an HTTP/1 request, a body and a gRPC message to arrive. Large bodies and messages
+    /// have the time in addition that their bytes take at 4 KiB per second.
     pub read_timeout: Duration,
+    /// Time in which a caller must take some bytes of a response.
+    pub write_timeout: Duration,
+    /// Time after which a connection without requests is closed.
+    pub connection_idle: Duration,
+    /// Age after which a connection is closed; up to 10 % more or less, so that not all callers leave at once.
+    pub connection_age: Duration,
+    /// Time for requests in flight on a connection that is closed.
+    pub connection_grace: Duration,
     /// Requests per second of API keys without a rate of their own; `None`: unlimited.
     pub key_rate: Option<f64>,
     /// Requests at once of such keys; `None`: the requests of one second.
@@ -101,8 +115,14 @@ impl Config {
             insecure: false,
             tls: None,
             max_connections: 10_000,
+            max_connections_per_peer: 1000,
             max_streams: 1024,
+            max_inflight_bytes: 256 << 20,
             read_timeout: Duration::from_secs(30),
+            write_timeout: Duration::from_secs(60),
+            connection_idle: Duration::from_secs(300),
+            connection_age: Duration::from_secs(3600),
+            connection_grace: Duration::from_secs(300),
             key_rate: None,
             key_burst: None,
         }
@@ -133,7 +153,13 @@ impl Config {
         in_seconds("--drain-timeout", self.drain_timeout, 0.0..=86_400.0)?;
         in_range("--max-connections", self.max_connections, 1..=1_000_000)?;
         in_range("--max-streams", self.max_streams, 1..=1_000_000)?;
+        in_range("--max-connections-per-peer", self.max_connections_per_peer, 1..=1_000_000)?;
+        in_range("--max-inflight-bytes", self.max_inflight_bytes, Budget::MIN..=1 << 40)?;
         in_seconds("--read-timeout", self.read_timeout, 0.001..=3600.0)?;
+        in_seconds("--write-timeout", self.write_timeout, 0.001..=3600.0)?;
+        in_seconds("--connection-idle", self.connection_idle, 0.001..=1e9)?;
+        in_seconds("--connection-age", self.connection_age, 0.001..=1e9)?;
+        in_seconds("--connection-grace", self.connection_grace, 0.001..=1e9)?;
         if let Some(rate) = self.key_rate {
             in_range("--key-rate", rate, Rate::PER_SECOND)?;
         }

@@ -55,6 +55,8 @@ error_codes! {
     NoCheckpoint = "no_checkpoint",
     /// The resource does not exist.
     NotFound = "not_found",
+    /// The server holds as many bytes of requests and responses as it may; the caller may retry later.
+    Overloaded = "overloaded",
     /// The API key lacks the required scope.
     PermissionDenied = "permission_denied",
     /// The policy is not loaded.

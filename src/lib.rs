@@ -17,7 +17,7 @@
 //! | [`policy`] | observations, agents, mixers, baselines |
 //! | [`plot`] | numbers to SVG |
 //! | [`nn`], [`env`] | neural network layers; the simulated environment |
-//! | [`clock`], [`draining`] | wall and monotonic time; the shutdown flag |
+//! | [`clock`], [`draining`], [`inflight`] | wall and monotonic time; the shutdown flag; the budget of bytes in flight |
 //! | [`invalid`], [`error_code`], [`rng`], [`files`] | errors of invalid input; error codes; seeded random streams; atomic writes of files |
 //!
 //! Reading order: `env`, `policy`, `learner`; then `service` and the layers that it calls.
@@ -32,6 +32,7 @@ pub mod env;
 pub mod error_code;
 pub mod experiment;
 pub mod files;
+pub mod inflight;
 pub mod invalid;
 pub mod jobs;
 pub mod learner;

@@ -4,9 +4,12 @@
 //! queue; streams end and requests in flight are answered; the listeners close and the data directory is unlocked.
 
 mod connections;
+mod http2;
 mod keys;
-mod read_timeout;
+mod lifetime;
+mod places;
 mod tls;
+mod write_timeout;
 
 use std::fs::{File, TryLockError};
 use std::future::Future;
@@ -15,22 +18,23 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use hyper::Request;
-use hyper::body::Incoming;
+use axum::http::Request;
 use tokio::net::TcpListener;
-use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 use tower::ServiceExt;
-use tower_http::timeout::TimeoutBody;
 
 use self::connections::{Connections, Protocol};
-pub use self::connections::{HTTP2_WINDOW, KEEPALIVE_INTERVAL};
+pub use self::http2::{CONNECTION_WINDOW, KEEPALIVE_INTERVAL, STREAM_WINDOW};
+use self::lifetime::LifeLimits;
+use self::places::Places;
 pub use self::tls::Tls;
+use crate::api::body::{IncomingBody, TimeLimits};
 use crate::api::{grpc, rest};
 use crate::clock::Clock;
 use crate::config::Config;
 use crate::draining::Draining;
 use crate::files;
+use crate::inflight::Budget;
 use crate::invalid::Invalid;
 use crate::jobs::{LocalProcess, Scheduler, SchedulerConfig};
 use crate::service::keys::{Keyring, Rate};
@@ -242,33 +246,34 @@ pub async fn run(
     let health = grpc::Health::new(app.draining.clone(), stop.clone());
     health.report(operations::server_health(&app).await);
 
-    let connections = Connections {
-        permits: Arc::new(Semaphore::new(config.max_connections)),
-        tls: listeners.tls,
-        read_timeout: config.read_timeout,
-        max_streams: config.max_streams,
-        stop: stop.clone(),
+    let connections = connections(config, &listeners, &app, &stop);
+    // Workers share nothing with other callers: no caller can keep them out.
+    let worker_connections = Connections {
+        places: Places::new(MAX_WORKER_CONNECTIONS, MAX_WORKER_CONNECTIONS),
+        tls: None,
+        budget: Budget::new(WORKER_INFLIGHT_BYTES),
+        life: LifeLimits { idle: Duration::MAX / 4, age: Duration::MAX / 4, ..connections.life },
+        ..connections.clone()
     };
-    let worker_connections =
-        Connections { permits: Arc::new(Semaphore::new(MAX_WORKER_CONNECTIONS)), tls: None, ..connections.clone() };
-    // A gRPC stream may be silent as long as its connection answers pings. A REST body has a read timeout.
-    let grpc = |services: grpc::Services| services.map_request(|r: Request<Incoming>| r.map(tonic::body::Body::new));
     let services = grpc::services(&app, &health, config.max_message_size, stop.clone());
-    let timeout = config.read_timeout;
     let router = rest::router(app.clone(), telemetry::render_metrics, config.max_message_size);
-    let router =
-        router.map_request(move |r: Request<Incoming>| r.map(|body| axum::body::Body::new(TimeoutBody::new(timeout, body))));
+    let router = router.map_request(|mut request: Request<IncomingBody>| {
+        let exchange = request.body().exchange().clone();
+        request.extensions_mut().insert(exchange);
+        request.map(axum::body::Body::new)
+    });
     let serve_workers = worker_connections.serve(
         listeners.workers,
         Protocol::Grpc,
-        grpc(grpc::worker_services(&app, config.max_message_size, stop.clone())),
+        grpc::worker_services(&app, config.max_message_size, stop.clone()),
     );
-    let serve_grpc = connections.clone().serve(listeners.grpc, Protocol::Grpc, grpc(services));
+    let budget = connections.budget.clone();
+    let serve_grpc = connections.clone().serve(listeners.grpc, Protocol::Grpc, services);
     let serve_rest = connections.serve(listeners.http, Protocol::Http, router);
 
     let upkeep = tokio::spawn(app.store.clone().upkeep());
     let scheduler = tokio::spawn(app.scheduler.clone().run(format!("http://{workers}")));
-    let housekeeper = tokio::spawn(housekeeping(app.clone(), config.session_ttl.min(config.environment_ttl)));
+    let housekeeper = tokio::spawn(housekeeping(app.clone(), config.session_ttl.min(config.environment_ttl), budget));
     let health_reporter = tokio::spawn(health.clone().follow(app.clone()));
     let key_follower = tokio::spawn(keys::follow(app.clone()));
     // The server works without the file, for instance while the disk is full.
@@ -302,11 +307,36 @@ pub async fn run(
     Ok(())
 }
 
+/// What the connections of both public listeners share.
+fn connections(config: &Config, listeners: &Listeners, app: &App, stop: &CancellationToken) -> Connections {
+    let limits = TimeLimits { read: config.read_timeout, write: config.write_timeout };
+    let shortest = limits.read.min(limits.write).min(config.connection_idle).min(config.connection_grace);
+    let life = LifeLimits {
+        idle: config.connection_idle,
+        age: config.connection_age,
+        grace: config.connection_grace,
+        tick: (shortest / 4).clamp(Duration::from_millis(20), Duration::from_secs(5)),
+    };
+    Connections {
+        places: Places::new(config.max_connections, config.max_connections_per_peer),
+        tls: listeners.tls.clone(),
+        limits,
+        life,
+        budget: Budget::new(config.max_inflight_bytes),
+        max_streams: config.max_streams,
+        clock: app.clock.clone(),
+        stop: stop.clone(),
+    }
+}
+
 /// Maximum connections of workers: far more than jobs can run at once.
 const MAX_WORKER_CONNECTIONS: usize = 4096;
+/// Budget of bytes in flight of workers: chunks of all jobs.
+const WORKER_INFLIGHT_BYTES: usize = 1 << 30;
 
 /// Expires idle sessions and environments, and maintains metrics.
-async fn housekeeping(app: Arc<App>, ttl: Duration) {
+async fn housekeeping(app: Arc<App>, ttl: Duration, budget: Arc<Budget>) {
+    let inflight = metrics::gauge!("qedgix_inflight_bytes");
     let mut sweep = tokio::time::interval((ttl / 4).clamp(Duration::from_secs(1), Duration::from_secs(30)));
     // Recorded durations stay in memory until this moves them into their histogram buckets.
     let mut upkeep = tokio::time::interval(Duration::from_secs(5));
@@ -316,7 +346,10 @@ async fn housekeeping(app: Arc<App>, ttl: Duration) {
                 app.sessions.remove_expired();
                 app.environments.table().remove_expired();
             }
-            _ = upkeep.tick() => telemetry::install_metrics().run_upkeep(),
+            _ = upkeep.tick() => {
+                telemetry::install_metrics().run_upkeep();
+                inflight.set(budget.used() as f64);
+            }
         }
     }
 }

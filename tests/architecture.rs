@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 const LAYERS: &[(&str, &[&str])] = &[
     ("clock", &[]),
     ("draining", &[]),
+    ("inflight", &[]),
     ("invalid", &[]),
     ("error_code", &[]),
     ("rng", &[]),
@@ -46,6 +47,7 @@ const LAYERS: &[(&str, &[&str])] = &[
         &[
             "clock",
             "draining",
+            "inflight",
             "jobs",
             "serving",
             "store",
@@ -64,6 +66,7 @@ const LAYERS: &[(&str, &[&str])] = &[
         &[
             "clock",
             "draining",
+            "inflight",
             "service",
             "jobs",
             "serving",
@@ -79,10 +82,10 @@ const LAYERS: &[(&str, &[&str])] = &[
         ],
     ),
     ("telemetry", &[]),
-    ("config", &["service", "jobs", "serving", "invalid"]),
+    ("config", &["service", "jobs", "serving", "inflight", "invalid"]),
     (
         "server",
-        &["clock", "draining", "api", "service", "jobs", "serving", "store", "config", "telemetry", "wire", "invalid", "files"],
+        &["clock", "draining", "inflight", "api", "service", "jobs", "serving", "store", "config", "telemetry", "wire", "invalid", "files"],
     ),
     (
         "cli",

@@ -33,7 +33,8 @@ fn statuses(error: &Error) -> (Code, StatusCode) {
         Error::Conflict { .. } => (Code::AlreadyExists, StatusCode::CONFLICT),
         Error::Busy { .. } => (Code::ResourceExhausted, StatusCode::TOO_MANY_REQUESTS),
         Error::TooLarge { .. } => (Code::ResourceExhausted, StatusCode::PAYLOAD_TOO_LARGE),
-        Error::MediaType(_) => (Code::InvalidArgument, StatusCode::UNSUPPORTED_MEDIA_TYPE),
+        Error::Overloaded => (Code::ResourceExhausted, StatusCode::SERVICE_UNAVAILABLE),
+        Error::MediaType(_) => (Code::Unimplemented, StatusCode::UNSUPPORTED_MEDIA_TYPE),
         Error::Deadline(_) => (Code::DeadlineExceeded, StatusCode::GATEWAY_TIMEOUT),
         Error::Draining | Error::Unavailable(_) => (Code::Unavailable, StatusCode::SERVICE_UNAVAILABLE),
         Error::Storage(WriteFailure::Full) => (Code::ResourceExhausted, StatusCode::INSUFFICIENT_STORAGE),
@@ -48,7 +49,7 @@ fn statuses(error: &Error) -> (Code, StatusCode) {
 pub fn retry_after_seconds(error: &Error) -> Option<u64> {
     match error {
         Error::Busy { retry_after, .. } => Some(retry_after.as_secs_f64().ceil().max(1.0) as u64),
-        Error::Draining | Error::Unavailable(_) | Error::Storage(_) => Some(1),
+        Error::Draining | Error::Unavailable(_) | Error::Storage(_) | Error::Overloaded => Some(1),
         _ => None,
     }
 }
@@ -82,20 +83,38 @@ pub(super) fn stream_status(error: Error) -> Status {
     error.into()
 }
 
+/// Maximum bytes of the texts in a status. A status is sent in headers, of which clients accept 8 KiB; the message is in it
+/// twice, once with up to 3 bytes per byte.
+const MAX_MESSAGE: usize = 768;
+const MAX_FIELD: usize = 256;
+const MAX_VALUE: usize = 256;
+const MAX_EXPECTED: usize = 512;
+
+/// The text, cut if it is longer than `bytes`.
+fn cut(text: &str, bytes: usize) -> String {
+    if text.len() <= bytes {
+        return text.to_owned();
+    }
+    let end = (0..=bytes - 3).rev().find(|&at| text.is_char_boundary(at)).unwrap_or(0);
+    format!("{}...", &text[..end])
+}
+
 /// `google.rpc` details: ErrorInfo always, BadRequest for a field, RetryInfo where the caller may retry.
 fn details(error: &Error) -> ErrorDetails {
     let mut details = ErrorDetails::new();
     let reason = error.code().as_str().to_ascii_uppercase();
     let mut metadata = HashMap::new();
     if let Some(invalid) = error.invalid() {
-        let description = match &invalid.value {
-            Some(value) => format!("got {value}, expected {}", invalid.expected),
-            None => format!("expected {}", invalid.expected),
+        let value = invalid.value.as_deref().map(|value| cut(value, MAX_VALUE));
+        let expected = cut(&invalid.expected, MAX_EXPECTED);
+        let description = match &value {
+            Some(value) => format!("got {value}, expected {expected}"),
+            None => format!("expected {expected}"),
         };
-        let (field, reason) = (invalid.field.clone(), reason.clone());
+        let (field, reason) = (cut(&invalid.field, MAX_FIELD), reason.clone());
         details.set_bad_request([FieldViolation { field, description, reason, localized_message: None }]);
-        metadata.extend(invalid.value.clone().map(|value| ("value".to_owned(), value)));
-        metadata.insert("expected".to_owned(), invalid.expected.clone());
+        metadata.extend(value.map(|value| ("value".to_owned(), value)));
+        metadata.insert("expected".to_owned(), expected);
     }
     metadata.extend(limit(error).map(|limit| ("limit".to_owned(), limit.to_string())));
     metadata.extend(required_scope(error).map(|scope| ("required_scope".to_owned(), scope.to_owned())));
@@ -116,7 +135,7 @@ impl From<Error> for Status {
         if let Some(seconds) = retry_after_seconds(&error) {
             metadata.insert("retry-after", seconds.into());
         }
-        let (code, message) = (statuses(&error).0, error.to_string());
+        let (code, message) = (statuses(&error).0, cut(&error.to_string(), MAX_MESSAGE));
         let mut status = Self::with_error_details_and_metadata(code, message, details(&error), metadata);
         if let Error::Internal(cause) = error {
             status.set_source(cause.into());
@@ -304,6 +323,23 @@ mod tests {
         let status = Status::from(Error::busy("full"));
         assert_eq!(status.get_error_details().retry_info().unwrap().retry_delay, Some(Duration::from_secs(1)));
         assert_eq!(status.metadata().get("retry-after").unwrap(), "1");
+    }
+
+    #[test]
+    fn statuses_fit_into_the_headers_that_clients_accept() {
+        for text in ["x", "é", "\u{1f681}", "\n"] {
+            let long = text.repeat(20_000);
+            for error in [
+                Error::from(Invalid::new(long.clone(), long.clone(), long.clone())),
+                Error::not_found("policy", long.clone()),
+                Error::TooLarge { message: long.clone(), limit: Some(1) },
+            ] {
+                let headers = Status::from(error).into_http::<()>().headers().clone();
+                // HTTP/2 counts 32 bytes more for every header.
+                let size: usize = headers.iter().map(|(name, value)| name.as_str().len() + value.len() + 32).sum();
+                assert!(size < 8 << 10, "{size} bytes for {text:?}");
+            }
+        }
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 pub mod access;
 mod auth;
+pub mod body;
 pub mod convert;
 mod errors;
 pub mod grpc;
@@ -12,6 +13,20 @@ pub mod rest;
 pub use errors::{Problem, retry_after_seconds};
 
 use crate::service::Error;
+
+/// Whether a path is a probe, by which supervisors and balancers decide whether the server is alive or ready.
+fn is_probe(path: &str) -> bool {
+    const PROBES: &[&str] = &[
+        "/livez",
+        "/readyz",
+        "/v2/health/live",
+        "/v2/health/ready",
+        "/grpc.health.v1.Health/Check",
+        "/inference.GRPCInferenceService/ServerLive",
+        "/inference.GRPCInferenceService/ServerReady",
+    ];
+    PROBES.contains(&path)
+}
 
 /// Runs `work` here, or, if it is `large`, on a thread of its own: threads of connections serve many callers.
 async fn offload<T: Send + 'static>(large: bool, work: impl FnOnce() -> T + Send + 'static) -> Result<T, Error> {

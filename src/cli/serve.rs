@@ -120,15 +120,35 @@ struct SecurityArgs {
     /// Require client certificates that these authorities issued (PEM) [default: no client certificates]
     #[arg(long, help_heading = SECURITY, env = "QEDGIX_TLS_CLIENT_CA", value_name = "FILE", requires = "tls_cert")]
     tls_client_ca: Option<PathBuf>,
-    /// Maximum connections of both addresses together; further connections are closed at once
+    /// Maximum connections of both addresses together; beyond, only probes get in
     #[arg(long, help_heading = SECURITY, env = "QEDGIX_MAX_CONNECTIONS", default_value_t = 10_000, value_name = "CONNECTIONS")]
     max_connections: usize,
+    /// Maximum connections of one IPv4 address or IPv6 network (/64); beyond, only probes get in
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_MAX_CONNECTIONS_PER_PEER", default_value_t = 1000, value_name = "CONNECTIONS")]
+    max_connections_per_peer: usize,
+    /// Maximum bytes of requests that have arrived and of responses that are not sent yet, of both addresses together; beyond,
+    /// requests are refused (RESOURCE_EXHAUSTED, 503)
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_MAX_INFLIGHT_BYTES", default_value_t = 256 << 20, value_name = "BYTES")]
+    max_inflight_bytes: usize,
     /// Maximum streams (calls in flight) per HTTP/2 connection
     #[arg(long, help_heading = SECURITY, env = "QEDGIX_MAX_STREAMS", default_value_t = 1024, value_name = "STREAMS")]
     max_streams: u32,
-    /// Read timeout of a TLS handshake, of the head of an HTTP/1 request and of each part of a REST body, at most 1 h
+    /// Time for a TLS handshake, the head of an HTTP/1 request, a body and a gRPC message to arrive, at most 1 h. Bodies and
+    /// messages may take longer while at least 4 KiB arrive per second
     #[arg(long, help_heading = SECURITY, env = "QEDGIX_READ_TIMEOUT", default_value = "30s", value_parser = duration, value_name = "TIME")]
     read_timeout: Duration,
+    /// Time in which a caller must take some bytes of a response, at most 1 h
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_WRITE_TIMEOUT", default_value = "60s", value_parser = duration, value_name = "TIME")]
+    write_timeout: Duration,
+    /// Time after which an HTTP/2 connection without requests is closed, even if it answers pings
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_CONNECTION_IDLE", default_value = "5m", value_parser = duration, value_name = "TIME")]
+    connection_idle: Duration,
+    /// Age after which a connection is closed, so that callers spread over several servers; up to 10 % more or less
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_CONNECTION_AGE", default_value = "1h", value_parser = duration, value_name = "TIME")]
+    connection_age: Duration,
+    /// Time for requests and streams in flight on a connection that is closed because of its age
+    #[arg(long, help_heading = SECURITY, env = "QEDGIX_CONNECTION_GRACE", default_value = "5m", value_parser = duration, value_name = "TIME")]
+    connection_grace: Duration,
     /// Maximum requests per second of an API key without a rate of its own [default: unlimited]
     #[arg(long, help_heading = SECURITY, env = "QEDGIX_KEY_RATE", value_name = "PER_SECOND")]
     key_rate: Option<f64>,
@@ -234,8 +254,14 @@ impl ServeArgs {
             insecure: self.insecure,
             tls: self.security.tls_files(),
             max_connections: self.security.max_connections,
+            max_connections_per_peer: self.security.max_connections_per_peer,
             max_streams: self.security.max_streams,
+            max_inflight_bytes: self.security.max_inflight_bytes,
             read_timeout: self.security.read_timeout,
+            write_timeout: self.security.write_timeout,
+            connection_idle: self.security.connection_idle,
+            connection_age: self.security.connection_age,
+            connection_grace: self.security.connection_grace,
             key_rate: self.security.key_rate,
             key_burst: self.security.key_burst,
             ..default

@@ -1,40 +1,43 @@
-//! Connections of a listener: accepting, the limit on their number, TLS handshakes, HTTP, graceful shutdown.
+//! Connections of a listener: accepting, their places, TLS handshakes, HTTP, graceful shutdown.
 //!
 //! A slow caller never delays another one: each connection has its own task, which includes the TLS handshake, and each stage
-//! before a request has a timeout.
+//! has a time limit.
 
 use std::convert::Infallible;
 use std::error::Error;
 use std::io;
+use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
+use axum::http::{Request, Response};
 use bytes::Bytes;
 use hyper::body::{Body, Incoming};
-use hyper::server::conn::{http1, http2};
-use hyper::{Request, Response};
-use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
-use hyper_util::server::graceful::{GracefulShutdown, Watcher};
-use hyper_util::service::TowerToHyperService;
+use hyper::server::conn::http1;
+use hyper::service::service_fn;
+use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::JoinSet;
 use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
-use tower::Service;
+use tower::{Service, ServiceExt};
 
-use super::read_timeout::FirstBytesTimeout;
+use super::http2;
+use super::lifetime::{LifeLimits, Lifetime, Verdict};
+use super::places::{Place, Places};
 use super::tls::{H2, Tls};
+use super::write_timeout::WriteTimeout;
+use crate::api::body::{Exchange, IncomingBody, TimeLimits};
+use crate::clock::Clock;
+use crate::inflight::Budget;
 
-/// HTTP/2 flow-control window in bytes: holds the observation of a large fleet.
-pub const HTTP2_WINDOW: u32 = 4 << 20;
-/// Time between two pings of a silent HTTP/2 connection.
-pub const KEEPALIVE_INTERVAL: Duration = Duration::from_secs(30);
-/// Time in which a ping must be answered.
-const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(20);
 /// Pause after `accept` failed for lack of resources, such as too many open files.
 const ACCEPT_RETRY: Duration = Duration::from_millis(500);
+/// Maximum memory for the head of an HTTP/1 request, in bytes.
+const HTTP1_BUFFER: usize = 64 << 10;
+/// Limits of the life of a connection from the reserve, which has one request.
+const RESERVED_LIFE: Duration = Duration::from_secs(2);
 
 /// The protocol of a listener.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -48,13 +51,16 @@ pub(super) enum Protocol {
 /// Settings and limits that connections share; cheap to clone.
 #[derive(Clone)]
 pub(super) struct Connections {
-    /// One permit per allowed connection.
-    pub(super) permits: Arc<Semaphore>,
+    pub(super) places: Arc<Places>,
     pub(super) tls: Option<Arc<Tls>>,
-    /// Timeout of a TLS handshake, of the HTTP/2 preface and of the head of an HTTP/1 request.
-    pub(super) read_timeout: Duration,
+    /// Time limits of requests and responses. The one for reading also applies to a TLS handshake, the HTTP/2 preface and the
+    /// head of an HTTP/1 request.
+    pub(super) limits: TimeLimits,
+    pub(super) life: LifeLimits,
+    pub(super) budget: Arc<Budget>,
     /// Maximum HTTP/2 streams per connection.
     pub(super) max_streams: u32,
+    pub(super) clock: Clock,
     /// Cancelled when the server stops accepting.
     pub(super) stop: CancellationToken,
 }
@@ -64,13 +70,12 @@ impl Connections {
     /// connections at once.
     pub(super) async fn serve<S, B>(self, listener: TcpListener, protocol: Protocol, service: S)
     where
-        S: Service<Request<Incoming>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
+        S: Service<Request<IncomingBody>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
         S::Future: Send,
         B: Body<Data = Bytes> + Send + 'static,
         B::Error: Into<Box<dyn Error + Send + Sync>>,
     {
-        let (graceful, mut tasks) = (GracefulShutdown::new(), JoinSet::new());
-        let open = metrics::gauge!("qedgix_connections");
+        let mut tasks = JoinSet::new();
         let refused = metrics::counter!("qedgix_connections_refused_total");
         loop {
             let accepted = tokio::select! {
@@ -80,14 +85,12 @@ impl Connections {
                 accepted = listener.accept() => accepted,
             };
             match accepted {
-                Ok((stream, _)) => match Arc::clone(&self.permits).try_acquire_owned() {
-                    Ok(permit) => {
-                        let connection = OpenConnection { _permit: permit, gauge: open.clone() };
-                        connection.gauge.increment(1.0);
-                        tasks.spawn(self.clone().connection(stream, protocol, service.clone(), graceful.watcher(), connection));
+                Ok((stream, peer)) => match self.places.take(peer.ip()) {
+                    Some(place) => {
+                        tasks.spawn(self.clone().connection(stream, protocol, service.clone(), place));
                     }
                     // Closing at once lets the caller retry or use another server; waiting would look like a hang.
-                    Err(_) => refused.increment(1),
+                    None => refused.increment(1),
                 },
                 Err(e) if is_caller_error(&e) => {}
                 Err(error) => {
@@ -98,22 +101,28 @@ impl Connections {
         }
         // Frees the port while the last requests are answered.
         drop(listener);
-        graceful.shutdown().await;
+        while tasks.join_next().await.is_some() {}
     }
 
-    async fn connection<S, B>(self, stream: TcpStream, protocol: Protocol, service: S, watcher: Watcher, _open: OpenConnection)
+    async fn connection<S, B>(mut self, stream: TcpStream, protocol: Protocol, service: S, place: Place)
     where
-        S: Service<Request<Incoming>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
+        S: Service<Request<IncomingBody>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
         S::Future: Send,
         B: Body<Data = Bytes> + Send + 'static,
         B::Error: Into<Box<dyn Error + Send + Sync>>,
     {
+        if place.reserved {
+            self.shorten();
+        }
         // Failure costs latency only.
         let _ = stream.set_nodelay(true);
-        let Some(tls) = &self.tls else { return self.serve_http(stream, protocol == Protocol::Grpc, service, watcher).await };
+        let stream = WriteTimeout::new(stream, self.limits.write);
+        let Some(tls) = &self.tls else {
+            return self.serve_http(stream, protocol, protocol == Protocol::Grpc, service, &place).await;
+        };
         let configs = tls.current();
         let config = if protocol == Protocol::Grpc { configs.grpc } else { configs.http };
-        let handshake = tokio::time::timeout(self.read_timeout, TlsAcceptor::from(config).accept(stream));
+        let handshake = tokio::time::timeout(self.limits.read, TlsAcceptor::from(config).accept(stream));
         let handshake = tokio::select! {
             done = handshake => done,
             () = self.stop.cancelled() => return,
@@ -123,57 +132,89 @@ impl Connections {
                 let agreed = stream.get_ref().1.alpn_protocol();
                 // Without ALPN, the connection uses the default protocol of the port.
                 let http2 = agreed.map_or(protocol == Protocol::Grpc, |agreed| agreed == H2);
-                self.serve_http(stream, http2, service, watcher).await;
+                self.serve_http(stream, protocol, http2, service, &place).await;
             }
             Ok(Err(error)) => tracing::debug!(%error, "TLS handshake failed"),
-            Err(_) => tracing::debug!(timeout = ?self.read_timeout, "TLS handshake timed out"),
+            Err(_) => tracing::debug!(timeout = ?self.limits.read, "TLS handshake timed out"),
         }
     }
 
-    async fn serve_http<IO, S, B>(&self, io: IO, http2: bool, service: S, watcher: Watcher)
+    /// Limits the life of a connection from the reserve.
+    fn shorten(&mut self) {
+        let tick = self.life.tick.min(RESERVED_LIFE / 4);
+        self.life = LifeLimits { idle: RESERVED_LIFE, age: RESERVED_LIFE, grace: RESERVED_LIFE, tick };
+        self.limits.read = self.limits.read.min(RESERVED_LIFE);
+        self.limits.write = self.limits.write.min(RESERVED_LIFE);
+    }
+
+    async fn serve_http<IO, S, B>(&self, io: IO, protocol: Protocol, http2: bool, service: S, place: &Place)
     where
         IO: AsyncRead + AsyncWrite + Send + Unpin + 'static,
-        S: Service<Request<Incoming>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
+        S: Service<Request<IncomingBody>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
         S::Future: Send,
         B: Body<Data = Bytes> + Send + 'static,
         B::Error: Into<Box<dyn Error + Send + Sync>>,
     {
-        let service = TowerToHyperService::new(service);
-        let served = if http2 {
-            let mut builder = http2::Builder::new(TokioExecutor::new());
-            builder
-                .timer(TokioTimer::new())
-                .initial_stream_window_size(HTTP2_WINDOW)
-                .initial_connection_window_size(HTTP2_WINDOW)
-                .max_concurrent_streams(self.max_streams)
-                .keep_alive_interval(KEEPALIVE_INTERVAL)
-                .keep_alive_timeout(KEEPALIVE_TIMEOUT);
-            // Pings detect silent callers once HTTP/2 has begun; the preface needs a timeout of its own.
-            let io = TokioIo::new(FirstBytesTimeout::new(io, PREFACE_LEN, self.read_timeout));
-            watcher.watch(builder.serve_connection(io, service)).await
+        let mut jitter = [128];
+        // Without a random source, all connections have the same age.
+        let _ = getrandom::fill(&mut jitter);
+        let jitter = f64::from(jitter[0]) / 255.0;
+        let lifetime = Lifetime::new(self.life, self.clock.clone(), self.stop.clone(), place.reserved, jitter);
+        if http2 {
+            let settings = http2::Settings {
+                max_streams: self.max_streams,
+                limits: self.limits,
+                budget: self.budget.clone(),
+                date: protocol == Protocol::Http,
+            };
+            if let Err(error) = http2::serve(io, service, &settings, lifetime).await {
+                tracing::debug!(%error, "connection failed");
+            }
         } else {
-            let mut builder = http1::Builder::new();
-            builder.timer(TokioTimer::new()).header_read_timeout(self.read_timeout);
-            watcher.watch(builder.serve_connection(TokioIo::new(io), service)).await
-        };
-        if let Err(error) = served {
-            tracing::debug!(%error, "connection failed");
+            self.serve_http1(io, service, lifetime).await;
         }
     }
-}
 
-/// Length of the HTTP/2 connection preface in bytes.
-const PREFACE_LEN: usize = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".len();
-
-/// An open connection: holds its permit and counts it in the gauge.
-struct OpenConnection {
-    _permit: OwnedSemaphorePermit,
-    gauge: metrics::Gauge,
-}
-
-impl Drop for OpenConnection {
-    fn drop(&mut self) {
-        self.gauge.decrement(1.0);
+    async fn serve_http1<IO, S, B>(&self, io: IO, service: S, mut lifetime: Lifetime)
+    where
+        IO: AsyncRead + AsyncWrite + Send + Unpin + 'static,
+        S: Service<Request<IncomingBody>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
+        S::Future: Send,
+        B: Body<Data = Bytes> + Send + 'static,
+        B::Error: Into<Box<dyn Error + Send + Sync>>,
+    {
+        let (reserved, read, budget) = (lifetime.is_single(), self.limits.read, self.budget.clone());
+        let service = service_fn(move |request: Request<Incoming>| {
+            let exchange = Exchange::http1(budget.clone(), reserved);
+            service.clone().oneshot(request.map(|body| IncomingBody::http1(body, exchange, read)))
+        });
+        let mut builder = http1::Builder::new();
+        // The timeout for the head of a request includes the time between two requests.
+        builder.timer(TokioTimer::new()).header_read_timeout(read).max_buf_size(HTTP1_BUFFER).keep_alive(!reserved);
+        let mut connection = pin!(builder.serve_connection(TokioIo::new(io), service));
+        let mut ticks = tokio::time::interval(lifetime.tick());
+        let mut stopped = pin!(self.stop.cancelled());
+        loop {
+            tokio::select! {
+                biased;
+                served = connection.as_mut() => {
+                    if let Err(error) = served {
+                        tracing::debug!(%error, "connection failed");
+                    }
+                    return;
+                }
+                () = stopped.as_mut(), if !lifetime.is_closing() => {
+                    lifetime.begin_close("shutdown");
+                    connection.as_mut().graceful_shutdown();
+                }
+                // hyper closes idle connections.
+                _ = ticks.tick() => match lifetime.check(true) {
+                    Verdict::Stay => {}
+                    Verdict::Leave => connection.as_mut().graceful_shutdown(),
+                    Verdict::Close => return,
+                },
+            }
+        }
     }
 }
 

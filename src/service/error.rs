@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use crate::error_code::ErrorCode;
+use crate::inflight::Exhausted;
 use crate::invalid::Invalid;
 use crate::store::WriteFailure;
 
@@ -44,6 +45,9 @@ pub enum Error {
         /// Time after which to retry.
         retry_after: Duration,
     },
+    /// The server holds as many bytes of requests and responses as it may, or as many connections.
+    #[error("the server holds as many requests and responses as it may; retry later")]
+    Overloaded,
     /// The body or message is larger than the limit.
     #[error("{message}")]
     TooLarge {
@@ -92,6 +96,7 @@ impl Error {
             Self::NotFound { .. } => ErrorCode::NotFound,
             Self::Precondition { code, .. } | Self::Conflict { code, .. } => *code,
             Self::Busy { .. } => ErrorCode::ResourceExhausted,
+            Self::Overloaded => ErrorCode::Overloaded,
             Self::TooLarge { .. } => ErrorCode::TooLarge,
             Self::MediaType(_) => ErrorCode::UnsupportedMediaType,
             Self::Deadline(_) => ErrorCode::DeadlineExceeded,
@@ -126,6 +131,12 @@ impl Error {
     /// There is no `what` with this `id`.
     pub fn not_found(what: &'static str, id: impl Into<String>) -> Self {
         Self::NotFound { what, id: id.into() }
+    }
+}
+
+impl From<Exhausted> for Error {
+    fn from(_: Exhausted) -> Self {
+        Self::Overloaded
     }
 }
 

@@ -1,5 +1,6 @@
 //! Tests of a whole server over gRPC and REST, on free ports, with a clock that the tests control.
 
+mod abuse;
 mod act;
 mod batch;
 mod binary;

@@ -1,4 +1,4 @@
-//! One gRPC call: counts the messages of its request and response bodies, and logs its end once.
+//! One gRPC call: the body of its response, whose messages are counted, and its end, which is logged once.
 
 use std::fmt::Display;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -10,14 +10,16 @@ use std::time::Instant;
 use axum::http::{HeaderMap, header};
 use bytes::Bytes;
 use http_body::{Frame, SizeHint};
-use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
+use tokio_util::sync::CancellationToken;
 use tonic::body::Body;
 use tonic::{Code, Status};
 use tracing::Span;
 
 use super::metrics::{MessageCounter, Method, Methods, code_name};
+use crate::api::body::Exchange;
 use crate::api::errors::CODE_METADATA;
 use crate::api::request_log::{Completion, LogLimiter, RequestId, RequestIds, Severity, log_request};
+use crate::inflight::Exhausted;
 use crate::invalid::Invalid;
 use crate::service::Error;
 
@@ -94,69 +96,51 @@ pub(super) fn with_code(status: &Status) -> Option<Status> {
     Some(Status::from(match status.code() {
         Code::OutOfRange => Error::TooLarge { message: status.message().to_owned(), limit: None },
         Code::Internal => Error::from(Invalid::new("message", status.message(), "a message of the request type of the method")),
+        // An unknown method has no message.
+        Code::Unimplemented if status.message().contains("compressed") => {
+            let encoding = status.message().split('`').nth(1).unwrap_or("an encoding");
+            Error::MediaType(Invalid::new("grpc-encoding", encoding, "identity: messages without compression"))
+        }
         _ => return None,
     }))
 }
 
-/// The body of a stream from the client. It ends when the server closes, even if the client has not ended it, so that the
-/// response ends, too.
-pub(super) struct RequestBody {
-    body: Body,
-    messages: MessageCounter,
-    context: Arc<CallContext>,
-    method: usize,
-    closing: Pin<Box<WaitForCancellationFutureOwned>>,
-}
-
-impl RequestBody {
-    pub(super) fn new(body: Body, context: Arc<CallContext>, method: usize) -> Self {
-        let closing = Box::pin(context.closing.clone().cancelled_owned());
-        Self { body, messages: MessageCounter::default(), context, method, closing }
-    }
-}
-
 type Polled = Poll<Option<Result<Frame<Bytes>, Status>>>;
-
-impl http_body::Body for RequestBody {
-    type Data = Bytes;
-    type Error = Status;
-
-    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Polled {
-        let Poll::Ready(frame) = Pin::new(&mut self.body).poll_frame(context) else {
-            return self.closing.as_mut().poll(context).map(|()| None);
-        };
-        if let Some(piece) = frame.as_ref().and_then(|frame| frame.as_ref().ok()?.data_ref()) {
-            let messages = self.messages.count(piece);
-            self.context.methods.get(self.method).metrics().received.increment(messages);
-        }
-        Poll::Ready(frame)
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
-    }
-}
 
 /// The body of a response. The call ends with its last frame.
 pub struct ResponseBody {
     body: Body,
     messages: MessageCounter,
     call: Call,
+    exchange: Arc<Exchange>,
+    /// Bytes of the last frame, which are held until the next one is wanted.
+    last: usize,
 }
 
 impl ResponseBody {
-    pub(super) fn new(body: Body, call: Call) -> Self {
-        Self { body, messages: MessageCounter::default(), call }
+    pub(super) fn new(body: Body, call: Call, exchange: Arc<Exchange>) -> Self {
+        Self { body, messages: MessageCounter::default(), call, exchange, last: 0 }
     }
 
-    fn sent(&mut self, piece: &Bytes) {
+    /// Counts a frame. Fails if the budget of bytes in flight has no room for it.
+    fn sent(&mut self, piece: &Bytes) -> Result<(), Exhausted> {
+        self.exchange.holding.grow(piece.len())?;
+        self.last = piece.len();
         let method = self.call.method();
         let messages = if method.streams.server { self.messages.count(piece) } else { 1 };
         method.metrics().sent.increment(messages);
+        if method.streams.server && method.streams.client {
+            self.exchange.answered(messages);
+        }
+        Ok(())
+    }
+
+    /// Ends the response with an error instead of the rest.
+    fn break_off(&mut self, error: Error) -> Frame<Bytes> {
+        self.body = Body::empty();
+        let status = Status::from(error);
+        self.call.end(status.code(), &status.message());
+        Frame::trailers(trailers_of(status))
     }
 
     /// Ends the call with the status in the trailers, and adds the error code if it is missing.
@@ -195,24 +179,21 @@ impl http_body::Body for ResponseBody {
 
     fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Polled {
         let this = &mut *self;
+        this.exchange.holding.shrink(std::mem::take(&mut this.last));
         let inside = this.call.span.enter();
         let polled = catch_unwind(AssertUnwindSafe(|| Pin::new(&mut this.body).poll_frame(context)));
         drop(inside);
         let Ok(polled) = polled else {
-            this.body = Body::empty();
-            let status = Status::from(Error::internal("a stream panicked"));
-            this.call.end(status.code(), &"a stream panicked");
-            return Poll::Ready(Some(Ok(Frame::trailers(trailers_of(status)))));
+            this.call.end(Code::Internal, &"a stream panicked");
+            return Poll::Ready(Some(Ok(this.break_off(Error::internal("a stream panicked")))));
         };
         Poll::Ready(match ready!(polled) {
             Some(Ok(frame)) => Some(Ok(match frame.into_trailers() {
                 Ok(trailers) => Frame::trailers(this.ended(trailers)),
-                Err(frame) => {
-                    if let Some(piece) = frame.data_ref() {
-                        this.sent(piece);
-                    }
-                    frame
-                }
+                Err(frame) => match frame.data_ref().map_or(Ok(()), |piece| this.sent(piece)) {
+                    Ok(()) => frame,
+                    Err(exhausted) => this.break_off(exhausted.into()),
+                },
             })),
             Some(Err(status)) => {
                 this.call.end(status.code(), &status.message());
@@ -238,6 +219,7 @@ impl http_body::Body for ResponseBody {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::inflight::Budget;
     use http_body::Body as _;
 
     struct Panics;
@@ -253,10 +235,12 @@ mod tests {
 
     #[test]
     fn a_panic_in_a_stream_ends_it_with_a_status() {
-        let (methods, closing) = (Methods::new(&[]), CancellationToken::new());
+        let (methods, closing) = (Methods::new(&[], 1024), CancellationToken::new());
         let context = CallContext { methods, ids: RequestIds::new(), log_limiter: LogLimiter::new(), closing };
         let id = context.ids.for_request(&HeaderMap::new());
-        let mut body = ResponseBody::new(Body::new(Panics), Call::begin(Arc::new(context), 0, id, Span::none()));
+        let call = Call::begin(Arc::new(context), 0, id, Span::none());
+        let exchange = Exchange::http1(Budget::new(Budget::MIN), false);
+        let mut body = ResponseBody::new(Body::new(Panics), call, exchange);
         let mut context = Context::from_waker(std::task::Waker::noop());
         let Poll::Ready(Some(Ok(frame))) = Pin::new(&mut body).poll_frame(&mut context) else { panic!("no frame") };
         let status = Status::from_header_map(frame.trailers_ref().unwrap()).unwrap();

@@ -11,7 +11,14 @@ use prost::Message;
 use prost_types::FileDescriptorSet;
 use tonic::Code;
 
+use super::worker::MAX_WORKER_MESSAGE;
+use crate::api::access::{Requirement, grpc_requirement};
 use crate::api::request_log::has_debug_span;
+use crate::inflight::Class;
+use crate::wire::v1::worker_service_server;
+
+/// Maximum size of a message of health checks, probes and reflection, and of unknown methods.
+const MAX_SMALL_MESSAGE: usize = 4 << 10;
 
 /// Whether client and server send a stream of messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,6 +45,10 @@ pub(super) struct Method {
     pub(super) streams: Streams,
     /// Whether its spans have level DEBUG.
     pub(super) debug_span: bool,
+    /// Maximum size of a message in bytes.
+    pub(super) limit: usize,
+    /// Which part of the budget of bytes in flight its calls use.
+    pub(super) class: Class,
     metrics: OnceLock<MethodMetrics>,
     /// Completed calls by code.
     completed: [OnceLock<Counter>; 17],
@@ -52,9 +63,17 @@ pub(super) struct MethodMetrics {
 }
 
 impl Method {
-    fn new(path: String, streams: Streams) -> Self {
-        let debug_span = path.rsplit_once('/').is_some_and(|(_, name)| has_debug_span(name));
-        Self { path, streams, debug_span, metrics: OnceLock::new(), completed: Default::default() }
+    fn new(path: String, streams: Streams, max_message: usize) -> Self {
+        let (service, name) = path.rsplit_once('/').unwrap_or_default();
+        let debug_span = has_debug_span(name);
+        let is_open = grpc_requirement(&format!("/{path}")) == Requirement::NoKey;
+        let class = if is_open { Class::Open } else { Class::Main };
+        let limit = match service {
+            worker_service_server::SERVICE_NAME => max_message.max(MAX_WORKER_MESSAGE),
+            _ if is_open || service.starts_with("grpc.reflection.") => MAX_SMALL_MESSAGE,
+            _ => max_message,
+        };
+        Self { path, streams, debug_span, limit, class, metrics: OnceLock::new(), completed: Default::default() }
     }
 
     fn labels(&self) -> [(&'static str, String); 3] {
@@ -89,13 +108,13 @@ pub(super) struct Methods {
 }
 
 impl Methods {
-    /// The methods in `descriptors`.
+    /// The methods in `descriptors`. Messages have at most `max_message` bytes, and less where callers need no key.
     ///
     /// # Panics
     /// If a descriptor set does not decode. The callers pass sets that are built into the program.
-    pub(super) fn new(descriptors: &[&[u8]]) -> Self {
+    pub(super) fn new(descriptors: &[&[u8]], max_message: usize) -> Self {
         let streams = Streams { client: false, server: false };
-        let mut all = Self { methods: vec![Method::new("unknown".to_owned(), streams)], by_path: HashMap::new() };
+        let mut all = Self { methods: vec![Method::new("unknown".to_owned(), streams, MAX_SMALL_MESSAGE)], by_path: HashMap::new() };
         for set in descriptors {
             let set = FileDescriptorSet::decode(*set).expect(super::BUILT_IN);
             for file in &set.file {
@@ -104,7 +123,7 @@ impl Methods {
                         let path = format!("{}.{}/{}", file.package(), service.name(), method.name());
                         let streams = Streams { client: method.client_streaming(), server: method.server_streaming() };
                         all.by_path.insert(format!("/{path}"), all.methods.len());
-                        all.methods.push(Method::new(path, streams));
+                        all.methods.push(Method::new(path, streams, max_message));
                     }
                 }
             }
@@ -199,7 +218,7 @@ mod tests {
 
     #[test]
     fn methods_are_found_with_their_stream_kind() {
-        let methods = Methods::new(&[crate::wire::DESCRIPTORS, tonic_health::pb::FILE_DESCRIPTOR_SET]);
+        let methods = Methods::new(&[crate::wire::DESCRIPTORS, tonic_health::pb::FILE_DESCRIPTOR_SET], 1 << 20);
         let kind = |path| methods.get(methods.find(path)).streams.name();
         assert_eq!(kind("/qedgix.v1.PolicyService/Act"), "unary");
         assert_eq!(kind("/qedgix.v1.PolicyService/ActStream"), "bidi_stream");

@@ -1,4 +1,4 @@
-//! The outermost middleware of gRPC. It applies the caller's deadline, assigns the request id, opens the span, catches
+//! The outermost middleware of gRPC. It admits the call to the budget of bytes in flight, applies the caller's deadline, assigns the request id, opens the span, catches
 //! panics, adds an error code to statuses that have none, and logs and counts the call.
 //!
 //! A call ends when its last byte is sent, with the status in its trailers, or as cancelled if the client disconnects before.
@@ -19,10 +19,14 @@ use tonic::Status;
 use tonic::body::Body;
 use tower::Service;
 
-use super::call::{Call, CallContext, RequestBody, ResponseBody, with_code};
+use super::call::{Call, CallContext, ResponseBody, with_code};
 use super::deadline::{Deadline, read_deadline};
 use super::metrics::Methods;
+use super::request_body::RequestBody;
+use crate::api::body::{Exchange, IncomingBody};
 use crate::api::request_log::{LogLimiter, REQUEST_ID, RequestIds, span};
+use crate::api::is_probe;
+use crate::inflight::Exhausted;
 use crate::service::Error;
 
 /// Services with this middleware.
@@ -33,14 +37,14 @@ pub struct Middleware<S> {
 }
 
 impl<S> Middleware<S> {
-    /// Wraps services whose methods are in `descriptors`. Streams from clients end when `closing` is cancelled.
-    pub(super) fn new(inner: S, descriptors: &[&[u8]], closing: CancellationToken) -> Self {
-        let (methods, ids, log_limiter) = (Methods::new(descriptors), RequestIds::new(), LogLimiter::new());
+    /// Wraps services with these `methods`. Streams from clients end when `closing` is cancelled.
+    pub(super) fn new(inner: S, methods: Methods, closing: CancellationToken) -> Self {
+        let (ids, log_limiter) = (RequestIds::new(), LogLimiter::new());
         Self { inner, context: Arc::new(CallContext { methods, ids, log_limiter, closing }) }
     }
 }
 
-impl<S> Service<Request<Body>> for Middleware<S>
+impl<S> Service<Request<IncomingBody>> for Middleware<S>
 where
     S: Service<Request<Body>, Response = Response<Body>, Error = Infallible>,
 {
@@ -52,8 +56,8 @@ where
         self.inner.poll_ready(context)
     }
 
-    fn call(&mut self, request: Request<Body>) -> Self::Future {
-        let mut request = read_deadline(request);
+    fn call(&mut self, request: Request<IncomingBody>) -> Self::Future {
+        let request = read_deadline(request);
         let deadline = request.extensions().get::<Deadline>().map(|deadline| deadline.0);
         let number = self.context.methods.find(request.uri().path());
         let method = self.context.methods.get(number);
@@ -61,26 +65,36 @@ where
         let span = span(&method.path, method.debug_span, &id, request.headers());
         let call = Call::begin(self.context.clone(), number, id, span);
         method.metrics().started.increment(1);
-        if method.streams.client {
-            request = request.map(|body| Body::new(RequestBody::new(body, self.context.clone(), number)));
-        } else {
+        if !method.streams.client {
             method.metrics().received.increment(1);
         }
-        let work = call.span().in_scope(|| self.inner.call(request));
-        ResponseFuture { work, deadline, sleep: None, call: Some(call) }
+        let exchange = request.body().exchange().clone();
+        // Only probes have a place in the reserve of connections.
+        let admitted = if exchange.reserved && !is_probe(request.uri().path()) {
+            Err(Exhausted)
+        } else {
+            exchange.holding.admit(method.class)
+        };
+        let work = admitted.is_ok().then(|| {
+            let request = request.map(|body| Body::new(RequestBody::new(body, self.context.clone(), number)));
+            call.span().in_scope(|| self.inner.call(request))
+        });
+        ResponseFuture { work, deadline, sleep: None, call: Some(call), exchange }
     }
 }
 
 pin_project! {
     /// The head of the response to a call, or the error if the deadline passes first.
     pub struct ResponseFuture<F> {
+        // None if the call is not admitted.
         #[pin]
-        work: F,
+        work: Option<F>,
         deadline: Option<Instant>,
         #[pin]
         sleep: Option<Sleep>,
         // Moved to the body of the response.
         call: Option<Call>,
+        exchange: Arc<Exchange>,
     }
 }
 
@@ -95,10 +109,13 @@ where
         let Some(call) = this.call else { return Poll::Pending };
         // No work starts after the deadline.
         if this.deadline.is_some_and(|deadline| deadline <= Instant::now()) {
-            return Poll::Ready(Ok(respond(deadline_exceeded(), this.call)));
+            return Poll::Ready(Ok(respond(deadline_exceeded(), this.call, this.exchange)));
         }
+        let Some(work) = this.work.as_pin_mut() else {
+            return Poll::Ready(Ok(respond(Status::from(Error::Overloaded).into_http(), this.call, this.exchange)));
+        };
         let inside = call.span().enter();
-        let polled = catch_unwind(AssertUnwindSafe(|| this.work.poll(context)));
+        let polled = catch_unwind(AssertUnwindSafe(|| work.poll(context)));
         drop(inside);
         let response = match polled {
             Ok(Poll::Ready(Ok(response))) => response,
@@ -114,7 +131,7 @@ where
             }
             Err(_) => Status::from(Error::internal("a handler panicked")).into_http(),
         };
-        Poll::Ready(Ok(respond(response, this.call)))
+        Poll::Ready(Ok(respond(response, this.call, this.exchange)))
     }
 }
 
@@ -123,7 +140,7 @@ fn deadline_exceeded() -> Response<Body> {
 }
 
 /// Completes the response. If it is only a status, the call ends here; otherwise it ends with the last byte of the body.
-fn respond(response: Response<Body>, call: &mut Option<Call>) -> Response<ResponseBody> {
+fn respond(response: Response<Body>, call: &mut Option<Call>, exchange: &Arc<Exchange>) -> Response<ResponseBody> {
     let mut call = call.take().expect("a future that is ready is not polled again");
     // tonic reports an unknown method in the headers only.
     let in_headers = || Status::from_header_map(response.headers());
@@ -137,5 +154,5 @@ fn respond(response: Response<Body>, call: &mut Option<Call>) -> Response<Respon
     }
     let mut response = replaced.map(Status::into_http).unwrap_or(response);
     response.headers_mut().insert(REQUEST_ID, call.id().header());
-    response.map(|body| ResponseBody::new(body, call))
+    response.map(|body| ResponseBody::new(body, call, exchange.clone()))
 }

@@ -9,6 +9,7 @@ mod job;
 mod metrics;
 mod middleware;
 mod policy;
+mod request_body;
 mod stream;
 mod upload;
 mod worker;
@@ -20,6 +21,7 @@ use tonic::service::Routes;
 
 use deadline::deadline;
 pub use health::Health;
+use metrics::Methods;
 use middleware::Middleware;
 
 use super::auth::Authorized;
@@ -63,7 +65,7 @@ pub fn services(app: &Arc<App>, health: &Health, max_message: usize, closing: Ca
         .add_service(health.server())
         .add_service(reflection().build_v1().expect(BUILT_IN))
         .add_service(reflection().build_v1alpha().expect(BUILT_IN));
-    wrap(app, routes.routes(), closing)
+    wrap(app, routes.routes(), max_message, closing)
 }
 
 /// Only the service for workers, for an address of its own.
@@ -71,15 +73,15 @@ pub fn services(app: &Arc<App>, health: &Health, max_message: usize, closing: Ca
 /// # Panics
 /// As [`services`].
 pub fn worker_services(app: &Arc<App>, max_message: usize, closing: CancellationToken) -> Services {
-    wrap(app, Routes::new(workers(app, max_message)), closing)
+    wrap(app, Routes::new(workers(app, max_message)), max_message, closing)
 }
 
 fn workers(app: &Arc<App>, max_message: usize) -> WorkerServiceServer<impl WorkerService> {
     worker::service(app.clone()).max_decoding_message_size(max_message.max(worker::MAX_WORKER_MESSAGE))
 }
 
-fn wrap(app: &Arc<App>, routes: Routes, closing: CancellationToken) -> Services {
+fn wrap(app: &Arc<App>, routes: Routes, max_message: usize, closing: CancellationToken) -> Services {
     use tonic_reflection::pb::{v1, v1alpha};
     let known = [DESCRIPTORS, tonic_health::pb::FILE_DESCRIPTOR_SET, v1::FILE_DESCRIPTOR_SET, v1alpha::FILE_DESCRIPTOR_SET];
-    Middleware::new(Authorized::new(routes.prepare(), app.clone()), &known, closing)
+    Middleware::new(Authorized::new(routes.prepare(), app.clone()), Methods::new(&known, max_message), closing)
 }

@@ -1,5 +1,7 @@
 //! Extractors of bodies, paths and queries whose rejections are errors of the service.
 
+use std::sync::Arc;
+
 use axum::body::BodyDataStream;
 use axum::extract::{FromRequest, FromRequestParts, Request};
 use axum::http::request::Parts;
@@ -9,6 +11,7 @@ use futures::StreamExt;
 use serde::de::DeserializeOwned;
 
 use super::json::ObjectOnly;
+use crate::api::body::Exchange;
 use crate::api::offload;
 use crate::invalid::Invalid;
 use crate::service::Error;
@@ -78,19 +81,26 @@ pub fn unsupported(kind: Option<String>, expected: &str) -> Error {
 /// Reads a body of at most `limit` bytes.
 ///
 /// # Errors
-/// [`Error::TooLarge`]; [`Error::Invalid`] where the body is incomplete.
+/// [`Error::TooLarge`]; [`Error::MediaType`] where the body is compressed; [`Error::Invalid`] where it is incomplete;
+/// [`Error::Overloaded`] where the budget of bytes in flight has no room for it.
 pub async fn read(request: Request, limit: usize) -> Result<Bytes, Error> {
+    check_encoding(request.headers())?;
     let too_large =
         || Error::TooLarge { message: format!("the body is larger than the limit of {limit} bytes"), limit: Some(limit as u64) };
     let announced = announced_size(request.headers());
+    let exchange = request.extensions().get::<Arc<Exchange>>().cloned();
     let mut body = request.into_body().into_data_stream();
     if announced > limit as u64 {
         discard(body).await;
         return Err(too_large());
     }
-    let mut received = bytes::BytesMut::with_capacity(announced as usize);
+    // The buffer grows with what arrives, not with what is announced.
+    let mut received = bytes::BytesMut::with_capacity((announced as usize).min(FIRST_BUFFER));
     while let Some(part) = body.next().await {
         let part = part.map_err(|e| Invalid::new("body", e, "a complete body"))?;
+        if let Some(exchange) = &exchange {
+            exchange.holding.grow(part.len())?;
+        }
         if received.len() + part.len() > limit {
             discard(body).await;
             return Err(too_large());
@@ -98,6 +108,18 @@ pub async fn read(request: Request, limit: usize) -> Result<Bytes, Error> {
         received.extend_from_slice(&part);
     }
     Ok(received.freeze())
+}
+
+/// Size of the buffer for a body, before it grows.
+const FIRST_BUFFER: usize = 64 << 10;
+
+/// Refuses compressed bodies.
+fn check_encoding(headers: &HeaderMap) -> Result<(), Error> {
+    let encodings = headers.get_all(header::CONTENT_ENCODING).iter().map(|value| value.to_str().unwrap_or("unreadable"));
+    match encodings.flat_map(|value| value.split(',')).map(str::trim).find(|name| !name.eq_ignore_ascii_case("identity")) {
+        None => Ok(()),
+        Some(name) => Err(Error::MediaType(Invalid::new("content-encoding", name, "identity: a body without compression"))),
+    }
 }
 
 /// Size of the body by its header, 0 when the header is missing. A body that differs is rejected by HTTP, or by the limit.

@@ -1,22 +1,31 @@
-//! The outermost middleware of REST. It assigns the request id, opens the span, catches panics, and logs and counts the response.
+//! The outermost middleware of REST. It admits the request to the budget of bytes in flight, assigns the request id, opens the span, catches panics, and logs and counts the response.
 
 use std::collections::HashMap;
 use std::fmt;
 use std::panic::AssertUnwindSafe;
+use std::pin::Pin;
 use std::sync::{Arc, PoisonError, RwLock};
+use std::task::{Context, Poll};
 use std::time::Instant;
 
+use axum::body::Body;
 use axum::extract::{MatchedPath, Request};
 use axum::http::{Method, StatusCode};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
 use futures::FutureExt;
+use http_body::{Body as HttpBody, Frame, SizeHint};
 use metrics::{Counter, Histogram};
 use tracing::Instrument;
 
 use super::v2;
+use crate::api::access::{Requirement, rest_requirement};
+use crate::api::body::Exchange;
 use crate::api::errors::LogDetail;
+use crate::api::is_probe;
 use crate::api::request_log::{Completion, LogLimiter, REQUEST_ID, RequestIds, Severity, has_debug_span, log_request, span};
+use crate::inflight::{Class, Exhausted};
 use crate::service::Error;
 
 /// The state that all requests share.
@@ -41,8 +50,19 @@ impl Middleware {
         let method = MethodName { verb, route };
         let span = span(&method, has_debug_span(route), &id, request.headers());
         let is_v2 = v2::is_v2(request.uri().path());
-        let response = AssertUnwindSafe(next.run(request).instrument(span.clone())).catch_unwind().await;
-        let mut response = response.unwrap_or_else(|_| Error::internal("a handler panicked").into_response());
+        // Tests call the router without a connection.
+        let exchange = request.extensions().get::<Arc<Exchange>>().cloned();
+        let admitted = exchange.as_ref().map_or(Ok(()), |exchange| admit(exchange, &request));
+        let mut response = match admitted {
+            Err(exhausted) => Error::from(exhausted).into_response(),
+            Ok(()) => {
+                let response = AssertUnwindSafe(next.run(request).instrument(span.clone())).catch_unwind().await;
+                response.unwrap_or_else(|_| Error::internal("a handler panicked").into_response())
+            }
+        };
+        if let Some(exchange) = exchange {
+            response = held(response, exchange);
+        }
         response.headers_mut().insert(REQUEST_ID, id.header());
         let (seconds, status) = (started.elapsed().as_secs_f64(), response.status());
         // Clients choose the method of a 405. It must not become a label.
@@ -52,6 +72,49 @@ impl Middleware {
         let completion = Completion { method: &method, id: &id, code, seconds, severity, detail: &detail };
         log_request(&completion, &span, &self.log_limiter);
         if is_v2 { v2::convert_problem(response) } else { response }
+    }
+}
+
+/// Admits a request to the budget of bytes in flight.
+fn admit(exchange: &Exchange, request: &Request) -> Result<(), Exhausted> {
+    // Only probes have a place in the reserve of connections.
+    if exchange.reserved && !is_probe(request.uri().path()) {
+        return Err(Exhausted);
+    }
+    let route = request.extensions().get::<MatchedPath>().map(MatchedPath::as_str);
+    let is_open = rest_requirement(request.method(), route) == Requirement::NoKey;
+    exchange.holding.admit(if is_open { Class::Open } else { Class::Main })
+}
+
+/// The response, holding its bytes until they are sent; an error if the budget has no room for them.
+fn held(response: Response, exchange: Arc<Exchange>) -> Response {
+    let size = response.body().size_hint().exact().unwrap_or(0) as usize;
+    match exchange.holding.grow(size) {
+        Ok(()) => response.map(|body| Body::new(HeldBody { body, _exchange: exchange })),
+        Err(exhausted) => Error::from(exhausted).into_response(),
+    }
+}
+
+/// The body of a response, which holds what its request holds until it is sent.
+struct HeldBody {
+    body: Body,
+    _exchange: Arc<Exchange>,
+}
+
+impl HttpBody for HeldBody {
+    type Data = Bytes;
+    type Error = axum::Error;
+
+    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
+        Pin::new(&mut self.body).poll_frame(context)
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
     }
 }
 

@@ -38,18 +38,20 @@ async fn the_connection_limit_covers_both_addresses() {
     for fleet in &mut fleets {
         fleet.act(held_slot()).await.unwrap();
     }
-    // Further connections are closed at once on both addresses; open ones continue.
-    for address in [server.endpoints.http, server.endpoints.grpc] {
-        assert_eq!(closed(TcpStream::connect(address).await.unwrap()).await, b"");
-    }
-    assert!(!live(&server).await);
+    // Further connections serve only probes, on both addresses; open ones continue.
+    assert!(live(&server).await);
+    let answer = reqwest::get(server.url("/v1/policies")).await.unwrap();
+    assert_eq!(answer.status(), 503);
+    assert!(answer.headers().contains_key("retry-after"));
+    let (code, reason, _) = refused(server.grpc().await.act(held_slot()).await);
+    assert_eq!((code, reason.as_str()), (tonic::Code::ResourceExhausted, "overloaded"));
     for fleet in &mut fleets {
         fleet.act(held_slot()).await.unwrap();
     }
     // A closed connection frees its place.
     drop(stream);
     with_timeout(async {
-        while !live(&server).await {
+        while !reqwest::get(server.url("/v1/policies")).await.is_ok_and(|answer| answer.status() == 200) {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
     })

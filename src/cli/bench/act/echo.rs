@@ -19,7 +19,7 @@ use tonic::transport::server::TcpIncoming;
 use tonic::{Request, Response, Status, Streaming};
 
 use crate::cli::output::outln;
-use crate::server::{HTTP2_WINDOW, KEEPALIVE_INTERVAL};
+use crate::server::{CONNECTION_WINDOW, KEEPALIVE_INTERVAL, STREAM_WINDOW};
 use crate::wire::v1;
 use crate::wire::v1::policy_service_server::{PolicyService, PolicyServiceServer};
 
@@ -115,8 +115,8 @@ fn transport() -> Transport {
     Transport::builder()
         .http2_keepalive_interval(Some(KEEPALIVE_INTERVAL))
         .max_concurrent_streams(1024)
-        .initial_stream_window_size(HTTP2_WINDOW)
-        .initial_connection_window_size(HTTP2_WINDOW)
+        .initial_stream_window_size(STREAM_WINDOW)
+        .initial_connection_window_size(CONNECTION_WINDOW)
 }
 
 /// Connections with TCP_NODELAY, as the server has them.
