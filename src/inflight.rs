@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, AtomicUsize, Ordering};
 
 /// Bytes that every request holds: about the memory of an open request with a small message.
-pub const BASE: usize = 16 << 10;
+pub const BASE: usize = 8 << 10;
 
 /// There is no room in the budget; the caller may retry later.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -68,10 +68,37 @@ impl Budget {
     }
 }
 
+/// What the requests of one peer hold. One peer may hold half of the budget.
+#[derive(Debug)]
+pub struct Purse {
+    budget: Arc<Budget>,
+    used: AtomicUsize,
+}
+
+impl Purse {
+    /// A peer without requests.
+    pub fn new(budget: Arc<Budget>) -> Arc<Self> {
+        Arc::new(Self { budget, used: AtomicUsize::new(0) })
+    }
+
+    /// Takes bytes. Returns whether they fit; if not, they have to be given back.
+    fn take(&self, class: u8, bytes: usize, large: bool) -> bool {
+        let share = self.budget.share(class);
+        let of_all = share.used.fetch_add(bytes, Ordering::Relaxed) + bytes;
+        let of_peer = self.used.fetch_add(bytes, Ordering::Relaxed) + bytes;
+        of_all <= if large { share.max_large } else { share.max } && of_peer <= share.max / 2
+    }
+
+    fn give_back(&self, class: u8, bytes: usize) {
+        self.budget.share(class).used.fetch_sub(bytes, Ordering::Relaxed);
+        self.used.fetch_sub(bytes, Ordering::Relaxed);
+    }
+}
+
 /// The bytes that one request and its response hold. They are given back when this is dropped.
 #[derive(Debug)]
 pub struct Holding {
-    budget: Arc<Budget>,
+    purse: Arc<Purse>,
     /// The [`Class`], 0 before [`Holding::admit`].
     class: AtomicU8,
     bytes: AtomicUsize,
@@ -79,8 +106,8 @@ pub struct Holding {
 
 impl Holding {
     /// Holds nothing.
-    pub fn new(budget: Arc<Budget>) -> Self {
-        Self { budget, class: AtomicU8::new(0), bytes: AtomicUsize::new(0) }
+    pub fn new(purse: Arc<Purse>) -> Self {
+        Self { purse, class: AtomicU8::new(0), bytes: AtomicUsize::new(0) }
     }
 
     /// Admits the request, which then holds [`BASE`] bytes. To be called once.
@@ -88,15 +115,13 @@ impl Holding {
     /// # Errors
     /// [`Exhausted`] when the budget has no room.
     pub fn admit(&self, class: Class) -> Result<(), Exhausted> {
-        let (class, bytes) = (class as u8, self.bytes.load(Ordering::Relaxed));
-        let share = self.budget.share(class);
-        let taken = bytes.max(BASE);
-        if share.used.fetch_add(taken, Ordering::Relaxed) + taken > share.max {
-            share.used.fetch_sub(taken, Ordering::Relaxed);
-            return Err(Exhausted);
+        let (class, taken) = (class as u8, self.bytes.load(Ordering::Relaxed).max(BASE));
+        if self.purse.take(class, taken, false) {
+            self.class.store(class, Ordering::Relaxed);
+            return Ok(());
         }
-        self.class.store(class, Ordering::Relaxed);
-        Ok(())
+        self.purse.give_back(class, taken);
+        Err(Exhausted)
     }
 
     /// Holds `bytes` more.
@@ -107,11 +132,7 @@ impl Holding {
         let before = self.bytes.fetch_add(bytes, Ordering::Relaxed);
         let beyond = (before + bytes).max(BASE) - before.max(BASE);
         let class = self.class.load(Ordering::Relaxed);
-        if beyond == 0 || class == 0 {
-            return Ok(());
-        }
-        let share = self.budget.share(class);
-        if share.used.fetch_add(beyond, Ordering::Relaxed) + beyond <= share.max_large {
+        if beyond == 0 || class == 0 || self.purse.take(class, beyond, true) {
             return Ok(());
         }
         self.shrink(bytes);
@@ -120,20 +141,23 @@ impl Holding {
 
     /// Gives `bytes` back.
     pub fn shrink(&self, bytes: usize) {
+        if bytes == 0 {
+            return;
+        }
         let before = self.bytes.fetch_sub(bytes, Ordering::Relaxed);
         let beyond = before.max(BASE) - (before - bytes).max(BASE);
         let class = self.class.load(Ordering::Relaxed);
         if beyond > 0 && class != 0 {
-            self.budget.share(class).used.fetch_sub(beyond, Ordering::Relaxed);
+            self.purse.give_back(class, beyond);
         }
     }
 }
 
 impl Drop for Holding {
     fn drop(&mut self) {
-        let class = *self.class.get_mut();
+        let (class, bytes) = (*self.class.get_mut(), *self.bytes.get_mut());
         if class != 0 {
-            self.budget.share(class).used.fetch_sub((*self.bytes.get_mut()).max(BASE), Ordering::Relaxed);
+            self.purse.give_back(class, bytes.max(BASE));
         }
     }
 }
@@ -142,23 +166,46 @@ impl Drop for Holding {
 mod tests {
     use super::*;
 
+    fn holding(budget: &Arc<Budget>) -> Holding {
+        Holding::new(Purse::new(budget.clone()))
+    }
+
     #[test]
     fn small_requests_fit_where_large_ones_do_not() {
         let budget = Budget::new(8 << 20);
-        let (large, small) = (Holding::new(budget.clone()), Holding::new(budget.clone()));
-        large.admit(Class::Main).unwrap();
-        large.grow(5 << 20).unwrap();
-        assert_eq!(large.grow(1 << 20), Err(Exhausted));
+        let [first, second, small] = [(); 3].map(|()| holding(&budget));
+        for large in [&first, &second] {
+            large.admit(Class::Main).unwrap();
+        }
+        first.grow(3 << 20).unwrap();
+        second.grow(2 << 20).unwrap();
+        assert_eq!(second.grow(1 << 20), Err(Exhausted));
         assert_eq!(budget.used(), 5 << 20);
         small.admit(Class::Main).unwrap();
         small.grow(BASE).unwrap();
         assert_eq!(budget.used(), (5 << 20) + BASE);
         assert_eq!(small.grow(1 << 20), Err(Exhausted));
-        large.shrink(5 << 20);
-        assert_eq!(budget.used(), 2 * BASE);
+        first.shrink(3 << 20);
+        assert_eq!(budget.used(), (2 << 20) + 2 * BASE);
         small.grow(1 << 20).unwrap();
-        drop((large, small));
+        drop((first, second, small));
         assert_eq!(budget.used(), 0);
+    }
+
+    #[test]
+    fn one_peer_holds_at_most_half() {
+        let budget = Budget::new(8 << 20);
+        let purse = Purse::new(budget.clone());
+        let (one, other) = (Holding::new(purse.clone()), Holding::new(purse));
+        one.admit(Class::Main).unwrap();
+        other.admit(Class::Main).unwrap();
+        one.grow(3 << 20).unwrap();
+        assert_eq!((one.grow(1 << 20), other.grow(1 << 20)), (Err(Exhausted), Err(Exhausted)));
+        let of_another = holding(&budget);
+        of_another.admit(Class::Main).unwrap();
+        of_another.grow(2 << 20).unwrap();
+        drop(one);
+        other.grow(3 << 20).unwrap();
     }
 
     #[test]
@@ -166,7 +213,7 @@ mod tests {
         let budget = Budget::new(Budget::MIN);
         for (class, other) in [(Class::Main, Class::Open), (Class::Open, Class::Main)] {
             let admit = |class| {
-                let holding = Holding::new(budget.clone());
+                let holding = holding(&budget);
                 holding.admit(class).map(|()| holding)
             };
             let mut all = Vec::new();
@@ -182,7 +229,7 @@ mod tests {
     #[test]
     fn what_arrives_before_the_admission_counts() {
         let budget = Budget::new(8 << 20);
-        let holding = Holding::new(budget.clone());
+        let holding = holding(&budget);
         holding.grow(1 << 20).unwrap();
         assert_eq!(budget.used(), 0);
         holding.admit(Class::Main).unwrap();

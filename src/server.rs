@@ -249,9 +249,8 @@ pub async fn run(
     let connections = connections(config, &listeners, &app, &stop);
     // Workers share nothing with other callers: no caller can keep them out.
     let worker_connections = Connections {
-        places: Places::new(MAX_WORKER_CONNECTIONS, MAX_WORKER_CONNECTIONS),
+        places: Places::new(MAX_WORKER_CONNECTIONS, MAX_WORKER_CONNECTIONS, Budget::new(WORKER_INFLIGHT_BYTES)),
         tls: None,
-        budget: Budget::new(WORKER_INFLIGHT_BYTES),
         life: LifeLimits { idle: Duration::MAX / 4, age: Duration::MAX / 4, ..connections.life },
         ..connections.clone()
     };
@@ -267,7 +266,7 @@ pub async fn run(
         Protocol::Grpc,
         grpc::worker_services(&app, config.max_message_size, stop.clone()),
     );
-    let budget = connections.budget.clone();
+    let budget = connections.places.budget().clone();
     let serve_grpc = connections.clone().serve(listeners.grpc, Protocol::Grpc, services);
     let serve_rest = connections.serve(listeners.http, Protocol::Http, router);
 
@@ -318,11 +317,10 @@ fn connections(config: &Config, listeners: &Listeners, app: &App, stop: &Cancell
         tick: (shortest / 4).clamp(Duration::from_millis(20), Duration::from_secs(5)),
     };
     Connections {
-        places: Places::new(config.max_connections, config.max_connections_per_peer),
+        places: Places::new(config.max_connections, config.max_connections_per_peer, Budget::new(config.max_inflight_bytes)),
         tls: listeners.tls.clone(),
         limits,
         life,
-        budget: Budget::new(config.max_inflight_bytes),
         max_streams: config.max_streams,
         clock: app.clock.clone(),
         stop: stop.clone(),

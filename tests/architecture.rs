@@ -85,7 +85,21 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("config", &["service", "jobs", "serving", "inflight", "invalid"]),
     (
         "server",
-        &["clock", "draining", "inflight", "api", "service", "jobs", "serving", "store", "config", "telemetry", "wire", "invalid", "files"],
+        &[
+            "clock",
+            "draining",
+            "inflight",
+            "api",
+            "service",
+            "jobs",
+            "serving",
+            "store",
+            "config",
+            "telemetry",
+            "wire",
+            "invalid",
+            "files",
+        ],
     ),
     (
         "cli",

@@ -18,7 +18,7 @@ use qedgix::api::{grpc, rest};
 use qedgix::checkpoint::{Checkpoint, parameter_layout};
 use qedgix::clock::Clock;
 use qedgix::config::Config;
-use qedgix::inflight::Budget;
+use qedgix::inflight::{Budget, Purse};
 use qedgix::policy::{FleetGraph, FleetStep, Policy};
 use qedgix::server::{self, DataDir};
 use qedgix::service::App;
@@ -259,7 +259,7 @@ fn documents() -> Vec<(&'static str, &'static str, &'static str, Vec<u8>)> {
 struct Subject {
     app: Arc<App>,
     rest: axum::Router,
-    budget: Arc<Budget>,
+    purse: Arc<Purse>,
     grpc: BoxCloneSyncService<Request<IncomingBody>, Response<Body>, Infallible>,
     checkpoint: Vec<u8>,
     graph: FleetGraph,
@@ -283,7 +283,7 @@ impl Subject {
         Self {
             rest: rest::router(app.clone(), telemetry::render_metrics, LARGEST),
             grpc: BoxCloneSyncService::new(grpc),
-            budget: Budget::new(1 << 30),
+            purse: Purse::new(Budget::new(1 << 30)),
             app,
             checkpoint: Checkpoint::new(config, 1, None, weights).unwrap().to_bytes(),
             graph: FleetGraph::from_scene(&points(3), &points(5), &[1.0; 5], 0.28),
@@ -298,7 +298,7 @@ impl Subject {
         let request = Request::post(format!("http://here/{method}"))
             .header(header::CONTENT_TYPE, "application/grpc")
             .header("te", "trailers")
-            .body(IncomingBody::http1(http_body_util::Full::from(body), Exchange::http1(self.budget.clone(), false), LONGEST));
+            .body(IncomingBody::http1(http_body_util::Full::from(body), Exchange::http1(self.purse.clone(), false), LONGEST));
         let response = self.grpc.clone().oneshot(request.unwrap()).await.unwrap();
         let (head, body) = response.into_parts();
         let body = http_body_util::BodyExt::collect(body).await.unwrap();

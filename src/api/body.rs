@@ -18,7 +18,7 @@ use h2::{Reason, RecvStream};
 use http_body::{Body, Frame, SizeHint};
 use tokio::time::{Instant, Sleep};
 
-use crate::inflight::{Budget, Exhausted, Holding};
+use crate::inflight::{Exhausted, Holding, Purse};
 
 /// Bytes per second below which a body or message is too slow, after the read timeout.
 pub const MIN_RATE: u64 = 4 << 10;
@@ -105,18 +105,18 @@ impl fmt::Debug for Exchange {
 
 impl Exchange {
     /// A request over HTTP/1.
-    pub fn http1(budget: Arc<Budget>, reserved: bool) -> Arc<Self> {
-        Arc::new(Self { holding: Holding::new(budget), reserved, state: Mutex::default() })
+    pub fn http1(purse: Arc<Purse>, reserved: bool) -> Arc<Self> {
+        Arc::new(Self { holding: Holding::new(purse), reserved, state: Mutex::default() })
     }
 
     /// A request over HTTP/2. The body counts as one part until [`Exchange::between_parts`].
-    pub fn http2(budget: Arc<Budget>, reserved: bool, stream: RecvStream) -> Arc<Self> {
+    pub fn http2(purse: Arc<Purse>, reserved: bool, stream: RecvStream) -> Arc<Self> {
         let state = if stream.is_end_stream() {
             State::default()
         } else {
             State { stream: Some(stream), part: Some(Part::default()), ..State::default() }
         };
-        Arc::new(Self { holding: Holding::new(budget), reserved, state: Mutex::new(state) })
+        Arc::new(Self { holding: Holding::new(purse), reserved, state: Mutex::new(state) })
     }
 
     fn state(&self) -> MutexGuard<'_, State> {

@@ -171,6 +171,7 @@ pub async fn run(args: ServeArgs) -> anyhow::Result<()> {
     let traces = args.otlp_endpoint.as_deref().map(TraceExporter::start).transpose()?;
     let logs = LogConfig { json: matches!(args.log_format, LogFormat::Json), access: args.access_log };
     telemetry::init_logs(logs, traces.as_ref());
+    refuse_huge_pages();
     let config = args.config();
     config.validate()?;
     let data = DataDir::lock(&config.data_dir)?;
@@ -189,6 +190,15 @@ pub async fn run(args: ServeArgs) -> anyhow::Result<()> {
         traces.shutdown(config.drain_timeout.min(SPAN_FLUSH_TIMEOUT)).await;
     }
     Ok(served?)
+}
+
+/// Memory that requests leave is given back to the system page by page. A huge page of 2 MiB would stay as long as one allocation
+/// in it lives, so after a peak a server would keep what it needed at the peak. Where the system has none, this changes nothing.
+fn refuse_huge_pages() {
+    #[cfg(target_os = "linux")]
+    if let Err(error) = rustix::thread::disable_transparent_huge_pages(true) {
+        tracing::debug!(%error, "cannot switch off transparent huge pages");
+    }
 }
 
 /// Maximum time to send the last spans to the collector.

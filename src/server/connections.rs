@@ -30,7 +30,6 @@ use super::tls::{H2, Tls};
 use super::write_timeout::WriteTimeout;
 use crate::api::body::{Exchange, IncomingBody, TimeLimits};
 use crate::clock::Clock;
-use crate::inflight::Budget;
 
 /// Pause after `accept` failed for lack of resources, such as too many open files.
 const ACCEPT_RETRY: Duration = Duration::from_millis(500);
@@ -57,7 +56,6 @@ pub(super) struct Connections {
     /// head of an HTTP/1 request.
     pub(super) limits: TimeLimits,
     pub(super) life: LifeLimits,
-    pub(super) budget: Arc<Budget>,
     /// Maximum HTTP/2 streams per connection.
     pub(super) max_streams: u32,
     pub(super) clock: Clock,
@@ -164,18 +162,18 @@ impl Connections {
             let settings = http2::Settings {
                 max_streams: self.max_streams,
                 limits: self.limits,
-                budget: self.budget.clone(),
+                purse: place.purse.clone(),
                 date: protocol == Protocol::Http,
             };
             if let Err(error) = http2::serve(io, service, &settings, lifetime).await {
                 tracing::debug!(%error, "connection failed");
             }
         } else {
-            self.serve_http1(io, service, lifetime).await;
+            self.serve_http1(io, service, lifetime, place).await;
         }
     }
 
-    async fn serve_http1<IO, S, B>(&self, io: IO, service: S, mut lifetime: Lifetime)
+    async fn serve_http1<IO, S, B>(&self, io: IO, service: S, mut lifetime: Lifetime, place: &Place)
     where
         IO: AsyncRead + AsyncWrite + Send + Unpin + 'static,
         S: Service<Request<IncomingBody>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
@@ -183,9 +181,9 @@ impl Connections {
         B: Body<Data = Bytes> + Send + 'static,
         B::Error: Into<Box<dyn Error + Send + Sync>>,
     {
-        let (reserved, read, budget) = (lifetime.is_single(), self.limits.read, self.budget.clone());
+        let (reserved, read, purse) = (place.reserved, self.limits.read, place.purse.clone());
         let service = service_fn(move |request: Request<Incoming>| {
-            let exchange = Exchange::http1(budget.clone(), reserved);
+            let exchange = Exchange::http1(purse.clone(), reserved);
             service.clone().oneshot(request.map(|body| IncomingBody::http1(body, exchange, read)))
         });
         let mut builder = http1::Builder::new();

@@ -23,7 +23,7 @@ use tower::{Service, ServiceExt};
 
 use super::lifetime::{Lifetime, Verdict};
 use crate::api::body::{Exchange, IncomingBody, TimeLimits};
-use crate::inflight::Budget;
+use crate::inflight::Purse;
 
 /// Flow-control window of a stream in bytes: holds the observation of a large fleet. Also the most that is kept of a stream whose
 /// requests are not answered as fast as they arrive.
@@ -42,15 +42,18 @@ const MAX_SEND_BUFFER: usize = 32 << 10;
 const MAX_PENDING_RESETS: usize = 20;
 /// Streams that the server resets because of errors of the caller: beyond, the connection is closed.
 const MAX_ERROR_RESETS: usize = 256;
+/// Overhead of small DATA frames that `h2` holds, which it counts as up to 256 bytes each: beyond, the connection is closed. Tasks
+/// take their frames out as they arrive, so this must only hold what one stream sends while its task waits for a thread: a whole
+/// window of messages without content, of 5 bytes each.
+const FRAME_BUDGET: usize = 256 / 5 * STREAM_WINDOW as usize;
 /// Time to send the last frame of a connection.
 const GOODBYE: Duration = Duration::from_secs(1);
 
-/// What all connections of a listener share.
-#[derive(Clone)]
+/// Settings of a connection.
 pub(super) struct Settings {
     pub(super) max_streams: u32,
     pub(super) limits: TimeLimits,
-    pub(super) budget: Arc<Budget>,
+    pub(super) purse: Arc<Purse>,
     /// Whether responses have a date, as HTTP requires and gRPC does not use.
     pub(super) date: bool,
 }
@@ -72,8 +75,7 @@ where
         .max_send_buffer_size(MAX_SEND_BUFFER)
         .max_pending_accept_reset_streams(MAX_PENDING_RESETS)
         .max_local_error_reset_streams(Some(MAX_ERROR_RESETS))
-        // Tasks take their frames out as they arrive, so this fills up only for as long as a task waits for a thread.
-        .data_frame_budget(CONNECTION_WINDOW as usize);
+        .data_frame_budget(FRAME_BUDGET);
     let Ok(connection) = tokio::time::timeout(settings.limits.read, builder.handshake(io)).await else {
         tracing::debug!(timeout = ?settings.limits.read, "HTTP/2 preface timed out");
         return Ok(());
@@ -158,7 +160,7 @@ where
             self.connection.graceful_shutdown();
         }
         let (head, stream) = request.into_parts();
-        let exchange = Exchange::http2(self.settings.budget.clone(), reserved, stream);
+        let exchange = Exchange::http2(self.settings.purse.clone(), reserved, stream);
         self.exchanges.add(&exchange);
         let request = Request::from_parts(head, IncomingBody::http2(exchange.clone()));
         let work = self.service.clone().oneshot(request);
@@ -315,12 +317,7 @@ struct Sender {
 }
 
 impl Sender {
-    fn poll<B: Body<Data = Bytes>>(
-        &mut self,
-        context: &mut Context<'_>,
-        mut body: Pin<&mut B>,
-        exchange: &Exchange,
-    ) -> Poll<()> {
+    fn poll<B: Body<Data = Bytes>>(&mut self, context: &mut Context<'_>, mut body: Pin<&mut B>, exchange: &Exchange) -> Poll<()> {
         loop {
             if self.stream.poll_reset(context).is_ready() {
                 return Poll::Ready(());

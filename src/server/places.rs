@@ -1,8 +1,11 @@
-//! Places of connections: how many there are in all, from one peer, and in the reserve.
+//! Places of connections: how many there are in all, from one peer, and in the reserve. A peer also has a share of the budget of
+//! bytes in flight.
 
 use std::collections::HashMap;
 use std::net::{IpAddr, Ipv6Addr};
 use std::sync::{Arc, Mutex, PoisonError};
+
+use crate::inflight::{Budget, Purse};
 
 /// Connections beyond the others, one request each, only for probes: a supervisor must not take a server for dead because its
 /// connections are in use.
@@ -15,6 +18,7 @@ const RESERVE_PER_PEER: usize = 8;
 pub(super) struct Places {
     max: usize,
     max_per_peer: usize,
+    budget: Arc<Budget>,
     taken: Mutex<Taken>,
 }
 
@@ -22,58 +26,78 @@ pub(super) struct Places {
 struct Taken {
     all: usize,
     reserve: usize,
-    /// Connections and connections of the reserve of each peer that has one.
-    peers: HashMap<IpAddr, (usize, usize)>,
+    /// The peers that have a connection.
+    peers: HashMap<IpAddr, Peer>,
+}
+
+#[derive(Debug)]
+struct Peer {
+    connections: usize,
+    in_reserve: usize,
+    purse: Arc<Purse>,
 }
 
 /// The place of one connection; dropping it gives the place back.
-#[derive(Debug)]
 pub(super) struct Place {
     places: Arc<Places>,
     peer: IpAddr,
     /// Whether the place is in the reserve.
     pub(super) reserved: bool,
+    /// What the requests of the peer hold.
+    pub(super) purse: Arc<Purse>,
     gauge: metrics::Gauge,
 }
 
 impl Places {
-    pub(super) fn new(max: usize, max_per_peer: usize) -> Arc<Self> {
-        Arc::new(Self { max, max_per_peer, taken: Mutex::default() })
+    pub(super) fn new(max: usize, max_per_peer: usize, budget: Arc<Budget>) -> Arc<Self> {
+        Arc::new(Self { max, max_per_peer, budget, taken: Mutex::default() })
+    }
+
+    /// The budget of bytes in flight that the peers share.
+    pub(super) fn budget(&self) -> &Arc<Budget> {
+        &self.budget
     }
 
     /// A place for a connection from `address`, in the reserve if the others are taken; `None` if there is none.
     pub(super) fn take(self: &Arc<Self>, address: IpAddr) -> Option<Place> {
-        let peer = peer(address);
-        let mut taken = self.taken.lock().unwrap_or_else(PoisonError::into_inner);
-        let (all, reserve) = (taken.all, taken.reserve);
-        let (ordinary, in_reserve) = taken.peers.get(&peer).copied().unwrap_or_default();
-        let reserved = all >= self.max || ordinary >= self.max_per_peer;
-        if reserved && (reserve >= RESERVE || in_reserve >= RESERVE_PER_PEER) {
+        let key = peer(address);
+        let mut guard = self.taken.lock().unwrap_or_else(PoisonError::into_inner);
+        let taken = &mut *guard;
+        let (connections, in_reserve) = taken.peers.get(&key).map_or((0, 0), |peer| (peer.connections, peer.in_reserve));
+        let reserved = taken.all >= self.max || connections >= self.max_per_peer;
+        if reserved && (taken.reserve >= RESERVE || in_reserve >= RESERVE_PER_PEER) {
             return None;
         }
-        taken.change(peer, reserved, |number| number + 1);
-        drop(taken);
+        let new = || Peer { connections: 0, in_reserve: 0, purse: Purse::new(self.budget.clone()) };
+        let peer = taken.peers.entry(key).or_insert_with(new);
+        let purse = peer.purse.clone();
+        let (all, of_peer) = peer.counts(&mut taken.all, &mut taken.reserve, reserved);
+        (*all, *of_peer) = (*all + 1, *of_peer + 1);
+        drop(guard);
         let gauge = metrics::gauge!("qedgix_connections");
         gauge.increment(1.0);
-        Some(Place { places: self.clone(), peer, reserved, gauge })
+        Some(Place { places: self.clone(), peer: key, reserved, purse, gauge })
     }
 }
 
-impl Taken {
-    fn change(&mut self, peer: IpAddr, reserved: bool, change: impl Fn(usize) -> usize) {
-        let of_peer = self.peers.entry(peer).or_default();
-        let (all, of_peer) = if reserved { (&mut self.reserve, &mut of_peer.1) } else { (&mut self.all, &mut of_peer.0) };
-        (*all, *of_peer) = (change(*all), change(*of_peer));
-        if self.peers.get(&peer) == Some(&(0, 0)) {
-            self.peers.remove(&peer);
-        }
+impl Peer {
+    /// The counters of all peers and of this one.
+    fn counts<'a>(&'a mut self, all: &'a mut usize, reserve: &'a mut usize, reserved: bool) -> (&'a mut usize, &'a mut usize) {
+        if reserved { (reserve, &mut self.in_reserve) } else { (all, &mut self.connections) }
     }
 }
 
 impl Drop for Place {
     fn drop(&mut self) {
-        let mut taken = self.places.taken.lock().unwrap_or_else(PoisonError::into_inner);
-        taken.change(self.peer, self.reserved, |number| number - 1);
+        let mut guard = self.places.taken.lock().unwrap_or_else(PoisonError::into_inner);
+        let taken = &mut *guard;
+        if let Some(peer) = taken.peers.get_mut(&self.peer) {
+            let (all, of_peer) = peer.counts(&mut taken.all, &mut taken.reserve, self.reserved);
+            (*all, *of_peer) = (*all - 1, *of_peer - 1);
+            if (peer.connections, peer.in_reserve) == (0, 0) {
+                taken.peers.remove(&self.peer);
+            }
+        }
         self.gauge.decrement(1.0);
     }
 }
@@ -103,7 +127,7 @@ mod tests {
 
     #[test]
     fn one_peer_leaves_places_for_others() {
-        let places = Places::new(100, 40);
+        let places = Places::new(100, 40, Budget::new(Budget::MIN));
         let greedy = fill(&places, "10.0.0.1");
         assert_eq!((greedy.len(), ordinary(&greedy)), (40 + RESERVE_PER_PEER, 40));
         let second = fill(&places, "10.0.0.2");
@@ -117,7 +141,7 @@ mod tests {
 
     #[test]
     fn probes_get_in_when_all_places_are_taken() {
-        let places = Places::new(2, 2);
+        let places = Places::new(2, 2, Budget::new(Budget::MIN));
         let greedy = fill(&places, "10.0.0.1");
         assert_eq!(ordinary(&greedy), 2);
         let probe = places.take("10.0.0.2".parse().unwrap()).unwrap();

@@ -219,7 +219,7 @@ impl http_body::Body for ResponseBody {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::inflight::Budget;
+    use crate::inflight::{Budget, Purse};
     use http_body::Body as _;
 
     struct Panics;
@@ -239,7 +239,7 @@ mod tests {
         let context = CallContext { methods, ids: RequestIds::new(), log_limiter: LogLimiter::new(), closing };
         let id = context.ids.for_request(&HeaderMap::new());
         let call = Call::begin(Arc::new(context), 0, id, Span::none());
-        let exchange = Exchange::http1(Budget::new(Budget::MIN), false);
+        let exchange = Exchange::http1(Purse::new(Budget::new(Budget::MIN)), false);
         let mut body = ResponseBody::new(Body::new(Panics), call, exchange);
         let mut context = Context::from_waker(std::task::Waker::noop());
         let Poll::Ready(Some(Ok(frame))) = Pin::new(&mut body).poll_frame(&mut context) else { panic!("no frame") };

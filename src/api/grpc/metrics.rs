@@ -114,7 +114,8 @@ impl Methods {
     /// If a descriptor set does not decode. The callers pass sets that are built into the program.
     pub(super) fn new(descriptors: &[&[u8]], max_message: usize) -> Self {
         let streams = Streams { client: false, server: false };
-        let mut all = Self { methods: vec![Method::new("unknown".to_owned(), streams, MAX_SMALL_MESSAGE)], by_path: HashMap::new() };
+        let mut all =
+            Self { methods: vec![Method::new("unknown".to_owned(), streams, MAX_SMALL_MESSAGE)], by_path: HashMap::new() };
         for set in descriptors {
             let set = FileDescriptorSet::decode(*set).expect(super::BUILT_IN);
             for file in &set.file {

@@ -24,8 +24,8 @@ use super::deadline::{Deadline, read_deadline};
 use super::metrics::Methods;
 use super::request_body::RequestBody;
 use crate::api::body::{Exchange, IncomingBody};
-use crate::api::request_log::{LogLimiter, REQUEST_ID, RequestIds, span};
 use crate::api::is_probe;
+use crate::api::request_log::{LogLimiter, REQUEST_ID, RequestIds, span};
 use crate::inflight::Exhausted;
 use crate::service::Error;
 

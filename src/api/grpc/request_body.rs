@@ -284,7 +284,8 @@ mod tests {
     fn messages_are_found_for_any_split_of_the_body() {
         let body: Vec<u8> = [0, 3, 300, 0, 1].into_iter().flat_map(message).collect();
         for size in 1..=body.len() {
-            let (mut framing, mut partial, mut out) = (Framing { limit: 300, ..Framing::default() }, Pieces::default(), Vec::new());
+            let (mut framing, mut partial, mut out) =
+                (Framing { limit: 300, ..Framing::default() }, Pieces::default(), Vec::new());
             let mut messages = 0;
             for piece in body.chunks(size) {
                 let scanned = framing.scan(piece).unwrap();

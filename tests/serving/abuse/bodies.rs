@@ -6,9 +6,9 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
 use super::*;
 
-/// Whether the budget has room for a body of 400 KiB over REST.
+/// Whether the budget has room for a body of 600 KiB over REST.
 async fn room(server: &Server) -> u16 {
-    let body = format!("{{\"policy\": \"sweep\"{}", " ".repeat(400 << 10));
+    let body = format!("{{\"policy\": \"sweep\"{}", " ".repeat(600 << 10));
     let client = reqwest::Client::new();
     let response = client.post(server.url("/v1/act")).header("content-type", "application/json").body(body).send().await.unwrap();
     let status = response.status().as_u16();
@@ -20,23 +20,17 @@ async fn room(server: &Server) -> u16 {
     status
 }
 
-/// Sends `bytes`. Returns the status if the call ends before.
-async fn send(response: &mut ResponseFuture, stream: &mut SendStream<Bytes>, mut bytes: usize) -> Option<Status> {
+/// Sends `bytes`, or less if the server ends the call.
+async fn send(stream: &mut SendStream<Bytes>, mut bytes: usize) {
     while bytes > 0 {
         stream.reserve_capacity(bytes);
-        tokio::select! {
-            biased;
-            ended = &mut *response => return Status::from_header_map(ended.unwrap().headers()),
-            capacity = std::future::poll_fn(|context| stream.poll_capacity(context)) => {
-                let part = capacity.and_then(Result::ok).unwrap_or(0).min(bytes);
-                // Fails when the server has ended the call.
-                if part > 0 && stream.send_data(vec![0; part].into(), false).is_ok() {
-                    bytes -= part;
-                }
-            }
+        let Some(Ok(capacity)) = std::future::poll_fn(|context| stream.poll_capacity(context)).await else { return };
+        let part = capacity.min(bytes);
+        if stream.send_data(vec![0; part].into(), false).is_err() {
+            return;
         }
+        bytes -= part;
     }
-    None
 }
 
 #[tokio::test]
@@ -54,14 +48,13 @@ async fn the_budget_of_bytes_in_flight_covers_both_transports_and_is_given_back(
     }
     assert_eq!(room(&server).await, 400);
     // What arrives counts, until the budget is exhausted.
-    let mut refused = None;
-    for (response, stream) in &mut waiting {
-        refused = send(response, stream, 600 << 10).await;
-        if refused.is_some() {
-            break;
-        }
+    let (responses, mut streams): (Vec<_>, Vec<_>) = waiting.into_iter().unzip();
+    for stream in &mut streams {
+        send(stream, 600 << 10).await;
     }
-    assert_status(refused.expect("the budget is exhausted"), Code::ResourceExhausted, "overloaded");
+    let (refused, _, responses) = with_timeout(futures::future::select_all(responses)).await;
+    let status = Status::from_header_map(refused.unwrap().headers()).unwrap();
+    assert_status(status, Code::ResourceExhausted, "overloaded");
     with_timeout(async {
         while room(&server).await != 503 {
             tokio::time::sleep(Duration::from_millis(5)).await;
@@ -71,7 +64,7 @@ async fn the_budget_of_bytes_in_flight_covers_both_transports_and_is_given_back(
     // Small requests and probes get in.
     server.grpc().await.act(slot()).await.unwrap();
     assert!(reqwest::get(server.url("/livez")).await.unwrap().status().is_success());
-    drop((waiting, raw));
+    drop((responses, streams, raw));
     with_timeout(async {
         while room(&server).await != 400 {
             tokio::time::sleep(Duration::from_millis(5)).await;
@@ -84,16 +77,15 @@ async fn the_budget_of_bytes_in_flight_covers_both_transports_and_is_given_back(
 async fn probes_and_unknown_methods_accept_small_messages_only() {
     let server = Server::start().await;
     let mut raw = Raw::connect(&server).await;
-    for path in [
-        "/grpc.health.v1.Health/Check",
-        "/grpc.health.v1.Health/Watch",
-        "/inference.GRPCInferenceService/ServerLive",
-        "/grpc.reflection.v1.ServerReflection/ServerReflectionInfo",
-    ] {
+    for path in ["/grpc.health.v1.Health/Check", "/grpc.health.v1.Health/Watch", "/inference.GRPCInferenceService/ServerLive"] {
         let (response, mut stream) = raw.call(path).await;
         stream.send_data(announced(8 << 10), false).unwrap();
         assert_status(complete(response).await.0, Code::ResourceExhausted, "too_large");
     }
+    // Reflection ends without an error of its own.
+    let (response, mut stream) = raw.call("/grpc.reflection.v1.ServerReflection/ServerReflectionInfo").await;
+    stream.send_data(announced(8 << 10), false).unwrap();
+    complete(response).await;
     // Over REST, probes have no body: the response does not wait for one.
     let mut socket = TcpStream::connect(server.endpoints.http).await.unwrap();
     socket.write_all(b"GET /livez HTTP/1.1\r\nhost: x\r\ncontent-length: 16777216\r\n\r\n{").await.unwrap();

@@ -39,7 +39,8 @@ impl Raw {
 
     /// Begins a call.
     async fn call(&mut self, path: &str) -> (ResponseFuture, SendStream<Bytes>) {
-        let request = Request::post(format!("http://x{path}")).header("content-type", "application/grpc").header("te", "trailers");
+        let request =
+            Request::post(format!("http://x{path}")).header("content-type", "application/grpc").header("te", "trailers");
         let mut client = self.client.clone().ready().await.unwrap();
         client.send_request(request.body(()).unwrap(), false).unwrap()
     }

@@ -25,7 +25,11 @@ async fn a_stream_of_many_small_messages_waits_for_the_policy() {
     let writer = tokio::spawn(async move {
         for number in 0..MESSAGES {
             // Only the first waits at the gate; the others are errors, which cost nothing.
-            let message = if number == 0 { framed(&held("waits", Bytes::new(), scene(1, 1, 0))) } else { framed(&v1::ActRequest::default()) };
+            let message = if number == 0 {
+                framed(&held("waits", Bytes::new(), scene(1, 1, 0)))
+            } else {
+                framed(&v1::ActRequest::default())
+            };
             stream.reserve_capacity(message.len());
             while stream.capacity() < message.len() {
                 poll_fn(|context| stream.poll_capacity(context)).await.expect("an open stream").expect("no error");

@@ -29,7 +29,7 @@ async fn a_response_that_is_not_taken_is_given_up() {
 #[tokio::test]
 async fn requests_that_are_reset_at_once_harm_nobody_else() {
     let server = Server::start().await;
-    let mut raw = Raw::connect(&server).await;
+    let raw = Raw::connect(&server).await;
     for _ in 0..5000 {
         let Ok(mut client) = raw.client.clone().ready().await else { break };
         let request = Request::post(format!("http://x{ACT}")).header("content-type", "application/grpc").body(()).unwrap();
