@@ -1,6 +1,7 @@
 //! The input of a policy for one fleet in one slot: what each node detects, the users' AoI, and positions where they are known
 //! (docs/model.md, "Observations").
 
+use super::Sight;
 use super::neighbor_search::{Detection, NeighborSearch};
 use crate::env::{Point, Ranges};
 
@@ -149,6 +150,12 @@ impl FleetGraph {
     /// What node `i` detects, in ascending order of target (UAVs before users).
     pub fn detections(&self, i: usize) -> &[Detection] {
         &self.detections[self.offsets[i] as usize..self.offsets[i + 1] as usize]
+    }
+
+    /// What the UAVs detect; `None` if their positions are not known.
+    pub fn sight(&self) -> Option<Sight<'_>> {
+        let positions = self.uav_positions.as_deref()?;
+        Some(Sight { positions, aoi: &self.aoi, offsets: &self.offsets, detections: &self.detections })
     }
 
     /// Number of detections of all nodes.

@@ -4,6 +4,7 @@
 //! Networks compute *rows*: first all UAVs in the order given, then the users within L links of a UAV, ordered by the number
 //! of links to the nearest UAV, for L graph layers. Other users have no row and are never computed.
 
+use super::Sight;
 use super::fleet_graph::FleetGraph;
 use super::hop_search::HopSearch;
 use super::neighbor_search::{Detection, NeighborSearch};
@@ -116,6 +117,13 @@ impl Geometry {
         self.search.append_detections((&self.points, uavs), observers, config.ranges, lists, usize::MAX);
         self.offsets.resize(self.row_of.len() + 1, self.detections.len() as u32);
         self.aoi_scaled.extend(aoi.iter().map(|a| a / config.episode_slots as f32));
+    }
+
+    /// What the UAVs of the last fleet detect, which was added by [`Geometry::push_scene`] with this AoI.
+    pub fn last_sight<'a>(&'a self, aoi: &'a [f32]) -> Sight<'a> {
+        let fleet = self.fleets.last().expect("a fleet was added");
+        let (positions, offsets) = (&self.points[..fleet.uavs], &self.offsets[fleet.first_node..]);
+        Sight { positions, aoi, offsets, detections: &self.detections }
     }
 
     /// Adds a fleet from what its nodes detect.

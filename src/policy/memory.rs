@@ -7,7 +7,7 @@
 //! Encoding of one UAV: [`GRID`] rows of the ground, each an integer with one bit per cell; then per user [`USER`] numbers. All are
 //! integers or f32 positions, which f32 holds exactly.
 
-use super::FleetGraph;
+use super::Sight;
 use crate::env::Point;
 
 /// Cells along each side of the unit square. A row of cells is an integer below 2^GRID, which f32 holds exactly.
@@ -78,19 +78,17 @@ pub enum Sharing {
     Shared,
 }
 
-/// Advances the memories of a fleet, one after another in `memories`, to slot `slot`. `graph` needs the positions of the UAVs.
-/// `received` is a buffer.
-pub fn remember(graph: &FleetGraph, range: f64, slot: u64, sharing: Sharing, memories: &mut [f32], received: &mut Vec<f32>) {
-    let len = uav_memory_len(graph.users());
+/// Advances the memories of a fleet, one after another in `memories`, to slot `slot`. `received` is a buffer.
+pub fn remember(sight: &Sight<'_>, range: f64, slot: u64, sharing: Sharing, memories: &mut [f32], received: &mut Vec<f32>) {
+    let len = uav_memory_len(sight.users());
     for (i, memory) in memories.chunks_exact_mut(len).enumerate() {
-        observe(graph, i, range, slot as f32, memory);
+        observe(sight, i, range, slot as f32, memory);
     }
-    if sharing == Sharing::Shared && graph.uavs() > 1 {
+    if sharing == Sharing::Shared && sight.uavs() > 1 {
         received.clear();
         received.extend_from_slice(memories);
         for (i, memory) in memories.chunks_exact_mut(len).enumerate() {
-            let senders = graph.detections(i).iter().map(|d| d.target as usize).take_while(|&j| j < graph.uavs());
-            for j in senders {
+            for (j, _) in sight.detected_uavs(i) {
                 merge(&received[j * len..][..len], memory);
             }
         }
@@ -98,8 +96,8 @@ pub fn remember(graph: &FleetGraph, range: f64, slot: u64, sharing: Sharing, mem
 }
 
 /// Writes what UAV `i` detects into its memory.
-fn observe(graph: &FleetGraph, i: usize, range: f64, slot: f32, memory: &mut [f32]) {
-    let at = graph.uav_positions().expect("the caller provides what `needs` requires")[i];
+fn observe(sight: &Sight<'_>, i: usize, range: f64, slot: f32, memory: &mut [f32]) {
+    let at = sight.positions[i];
     let (ground, users) = memory.split_at_mut(GRID);
     search(at, range, ground);
     // A user that should be detected and is not has moved away. The margin allows for rounding.
@@ -109,11 +107,8 @@ fn observe(graph: &FleetGraph, i: usize, range: f64, slot: f32, memory: &mut [f3
             (user[0], user[4]) = (UNKNOWN, slot);
         }
     }
-    let first_user = graph.detections(i).partition_point(|d| (d.target as usize) < graph.uavs());
-    for detection in &graph.detections(i)[first_user..] {
-        let j = detection.target as usize - graph.uavs();
-        let [x, y] = [0, 1].map(|axis| (at[axis] + f64::from(detection.rel[axis])) as f32);
-        users[j * USER..][..USER].copy_from_slice(&[KNOWN, x, y, slot - graph.aoi()[j], slot]);
+    for (j, [x, y]) in sight.detected_users(i) {
+        users[j * USER..][..USER].copy_from_slice(&[KNOWN, x as f32, y as f32, slot - sight.aoi[j], slot]);
     }
 }
 
@@ -149,6 +144,7 @@ fn merge(received: &[f32], memory: &mut [f32]) {
 
 #[cfg(test)]
 mod tests {
+    use super::super::FleetGraph;
     use super::*;
     use crate::env::Ranges;
 
@@ -167,7 +163,7 @@ mod tests {
 
         fn see(&mut self, slot: u64, uavs: &[Point], users: &[Point], aoi: &[f32], sharing: Sharing, ranges: Ranges) {
             let graph = FleetGraph::from_scene(uavs, users, aoi, ranges);
-            remember(&graph, ranges.detection, slot, sharing, &mut self.memory, &mut self.buffer);
+            remember(&graph.sight().unwrap(), ranges.detection, slot, sharing, &mut self.memory, &mut self.buffer);
         }
 
         fn of(&self, uav: usize) -> UavMemory<'_> {

@@ -13,6 +13,7 @@ mod learned;
 pub mod memory;
 pub mod mixer;
 mod neighbor_search;
+mod sight;
 
 pub use agent::{Agent, AgentCache, Dims};
 pub use batched_agent::{BatchedAgent, StepInput};
@@ -24,6 +25,7 @@ pub use geometry::{FleetSpan, Geometry, GeometryConfig, NodeView};
 pub use hop_search::HopSearch;
 pub use learned::LearnedPolicy;
 pub use neighbor_search::Detection;
+pub use sight::Sight;
 
 use crate::env::Ranges;
 use crate::invalid::Invalid;

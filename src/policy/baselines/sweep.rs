@@ -8,7 +8,7 @@
 use std::f64::consts::{PI, TAU};
 
 use super::geometry::{distance, heading_toward, travel_slots};
-use super::rule::{Rule, uav_positions};
+use super::rule::Rule;
 use crate::env::Point;
 use crate::policy::memory::{GRID, RememberedUser, Sharing, UavMemory, remember, uav_memory_len};
 use crate::policy::{EnvParams, FleetGraph, RequiredInput};
@@ -53,17 +53,13 @@ impl<const SHARED: bool> Rule for Sweep<SHARED> {
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}
 
     fn decide(&self, env: &EnvParams, graph: &FleetGraph, step: u64, memory: &mut [f32], headings: &mut [u8]) {
+        let sight = graph.sight().expect("the caller provides what `needs` requires");
         let sharing = if SHARED { Sharing::Shared } else { Sharing::Own };
-        remember(graph, env.detection_range, step, sharing, memory, &mut Vec::new());
+        remember(&sight, env.detection_range, step, sharing, memory, &mut Vec::new());
         let memories = memory.chunks_exact(uav_memory_len(graph.users())).map(UavMemory::new);
         for ((i, memory), heading) in memories.enumerate().zip(headings) {
-            let uav = Uav { env, index: i, uavs: graph.uavs(), at: uav_positions(graph)[i], now: step as f64 };
-            let nearby: Vec<Point> = graph
-                .detections(i)
-                .iter()
-                .take_while(|d| (d.target as usize) < graph.uavs())
-                .map(|d| [0, 1].map(|axis| uav.at[axis] + f64::from(d.rel[axis])))
-                .collect();
+            let uav = Uav { env, index: i, uavs: graph.uavs(), at: sight.positions[i], now: step as f64 };
+            let nearby: Vec<Point> = sight.detected_uavs(i).map(|(_, at)| at).collect();
             let serving = uav.best_user(memory.users().flatten(), &nearby);
             let unknown = memory.users().filter(Option::is_none).count();
             let searching = uav.best_block(memory, unknown);
