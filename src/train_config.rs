@@ -8,7 +8,7 @@ use serde_json::{Map, Value};
 use crate::env::EnvConfig;
 use crate::invalid::{Invalid, expectation, in_range};
 use crate::policy::mixer::MixerKind;
-use crate::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, ObservationKind};
+use crate::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, Memory, ObservationKind};
 
 /// The algorithms of the paper, and common baselines.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -66,6 +66,10 @@ pub struct Training {
     /// Whether relative positions are divided by the detection range in flat observations, and own positions scaled to [-1, 1].
     #[serde(default)]
     pub normalise: bool,
+    /// What a UAV remembers: `none`, as in the paper; `own`, what it detected itself; `shared`, also what UAVs in communication range
+    /// remember.
+    #[serde(default, skip_serializing_if = "Memory::is_none")]
+    pub memory: Memory,
     /// Mixer.
     pub mixer: MixerKind,
     /// Factor of the initial weights of the hypernetworks' last layers.
@@ -161,6 +165,7 @@ impl TrainConfig {
             self_loops: false,
             hops: 1,
             normalise: false,
+            memory: Memory::None,
             mixer: MixerKind::Invariant,
             hyper_init: 1.0,
             steps: 2_050_000,
@@ -254,6 +259,7 @@ impl TrainConfig {
             self_loops: t.self_loops,
             hops: t.hops,
             normalise: t.normalise,
+            memory: t.memory,
         }
     }
 

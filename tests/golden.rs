@@ -14,8 +14,8 @@ use qedgix::learner::loss::{Loss, TdLambda, Trace};
 use qedgix::nn::Adam;
 use qedgix::policy::mixer::MixerKind;
 use qedgix::policy::{
-    AgentConfig, Aggregation, Dims, EnvParams, Geometry, GeometryConfig, Gnn, HopSearch, Identity, ObservationKind, TOKEN,
-    flat_observation, flat_state,
+    AgentConfig, Aggregation, Dims, EnvParams, Geometry, GeometryConfig, Gnn, HopSearch, Identity, Memory, ObservationKind,
+    TOKEN, flat_observation, flat_state,
 };
 use safetensors::{Dtype, SafeTensors};
 
@@ -115,6 +115,7 @@ impl Config {
             self_loops: flag("self_loops")?,
             hops: 1,
             normalise: false,
+            memory: Memory::None,
         };
         if count("token")? != TOKEN {
             return Err(format!("metadata token = {}; expected {TOKEN}", text("token")?));

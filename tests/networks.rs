@@ -10,7 +10,7 @@ use qedgix::nn::{Batch, Graph, GraphLayer, HIDDEN, LayerCache, ParameterLayout, 
 use qedgix::policy::mixer::{Mixer, MixerCache, MixerKind};
 use qedgix::policy::{
     Agent, AgentConfig, BatchedAgent, Dims, EnvParams, FleetGraph, FleetStep, Geometry, GeometryConfig, Gnn, HopSearch, Identity,
-    LearnedPolicy, ObservationKind, Policy, RequiredInput, StepInput, TOKEN,
+    LearnedPolicy, Memory, ObservationKind, Policy, RequiredInput, StepInput, TOKEN,
 };
 use qedgix::rng;
 use rand::RngExt;
@@ -75,6 +75,8 @@ fn batching_does_not_change_a_bit_of_the_result() {
         AgentConfig { gnn: Gnn::Rgcn, identity: Identity::None, ..SET },
         AgentConfig { gnn: Gnn::None, ..SET },
         AgentConfig { gnn: Gnn::None, hops: 3, ..SET },
+        AgentConfig { gnn: Gnn::None, memory: Memory::Own, ..SET },
+        AgentConfig { memory: Memory::Shared, ..SET },
     ];
     for config in variants {
         let policy = learned(config);
@@ -140,8 +142,14 @@ fn more_hops_hold_no_more_detections() {
 #[test]
 fn batched_agent_policy_and_update_compute_the_same_values() {
     let plain = AgentConfig { gnn: Gnn::None, ..AGENT };
-    let configs =
-        [AGENT, SET, AgentConfig { identity: Identity::Token, ..plain }, AgentConfig { hops: 3, normalise: true, ..plain }];
+    let configs = [
+        AGENT,
+        SET,
+        AgentConfig { identity: Identity::Token, ..plain },
+        AgentConfig { hops: 3, normalise: true, ..plain },
+        AgentConfig { memory: Memory::Own, ..plain },
+        AgentConfig { memory: Memory::Shared, identity: Identity::Token, ..SET },
+    ];
     for config in configs {
         let dims = Dims { env: EnvParams { slots: 6, ..ENV }, ..DIMS };
         let (m, n, slots) = (dims.uavs, dims.users, dims.env.slots);
@@ -160,8 +168,9 @@ fn batched_agent_policy_and_update_compute_the_same_values() {
             let mut memory = vec![0.0; policy.memory_len(m, n)];
             policy.start(m, n, 0, &mut memory);
             if config.identity == Identity::Token {
-                for (uav, identity_token) in
-                    memory.chunks_exact_mut(HIDDEN + 1 + TOKEN).zip(ep.identity_token[e * m * TOKEN..].chunks_exact(TOKEN))
+                for (uav, identity_token) in memory[..m * (HIDDEN + 1 + TOKEN)]
+                    .chunks_exact_mut(HIDDEN + 1 + TOKEN)
+                    .zip(ep.identity_token[e * m * TOKEN..].chunks_exact(TOKEN))
                 {
                     uav[HIDDEN + 1..].copy_from_slice(identity_token);
                 }
@@ -179,7 +188,7 @@ fn batched_agent_policy_and_update_compute_the_same_values() {
                 let turn = FleetStep {
                     env: dims.env,
                     graph: &graph,
-                    step: 0,
+                    step: t as u64,
                     memory: &mut memory,
                     headings: &mut headings,
                     q_values: Some(&mut served),
@@ -190,8 +199,8 @@ fn batched_agent_policy_and_update_compute_the_same_values() {
                 let actions = &ep.actions[(e * slots + t) * m..][..m];
                 batched_agent.record_actions(actions);
                 // Continue with the action of the episode instead of the greedy heading.
-                let stride = memory.len() / m;
-                memory.chunks_exact_mut(stride).zip(actions).for_each(|(uav, &a)| uav[HIDDEN] = f32::from(a));
+                let stride = HIDDEN + 1 + if config.identity == Identity::Token { TOKEN } else { 0 };
+                memory[..stride * m].chunks_exact_mut(stride).zip(actions).for_each(|(uav, &a)| uav[HIDDEN] = f32::from(a));
             }
         }
     }

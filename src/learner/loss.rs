@@ -15,8 +15,9 @@ use rayon::prelude::*;
 
 use super::episodes::Episodes;
 use crate::nn::{Batch, ParameterLayout, Real, Weights, argmax, norm_squared};
+use crate::policy::memory::memories;
 use crate::policy::mixer::{Mixer, MixerCache, MixerKind};
-use crate::policy::{Agent, AgentCache, AgentConfig, Dims, Geometry, Inputs, NO_ACTION, TOKEN, flat_state};
+use crate::policy::{Agent, AgentCache, AgentConfig, Dims, Geometry, Goals, Inputs, NO_ACTION, TOKEN, flat_state};
 
 /// Rows (UAVs of all episodes) per slot of a chunk: enough for efficient matrix products, few enough for the CPU caches.
 const ROWS: usize = 24;
@@ -87,6 +88,10 @@ struct Chunk<T> {
 #[derive(Debug, Default)]
 struct Workspace<T: Real> {
     geometry: Geometry,
+    goals: Goals,
+    /// What the UAVs of each episode remember.
+    memory: Vec<f32>,
+    received: Vec<f32>,
     last: Vec<u8>,
     identity_token: Vec<f32>,
     position: Vec<f32>,
@@ -225,8 +230,13 @@ impl<T: Real> Pass<'_, T> {
         let (m, k, b) = (ep.uavs, ep.slots, range.len());
         let (slots, per_slot) = (k + 1, b * m);
         ws.load(self.agent, ep, range.clone());
-        let inputs =
-            Inputs { geometry: &ws.geometry, last: &ws.last, identity_token: &ws.identity_token, position: &ws.position };
+        let inputs = Inputs {
+            geometry: &ws.geometry,
+            goals: &ws.goals,
+            last: &ws.last,
+            identity_token: &ws.identity_token,
+            position: &ws.position,
+        };
         for (weights, cache) in [(self.online, &mut ws.online), (self.target, &mut ws.target)] {
             cache.begin(per_slot, slots).fill(T::ZERO);
             self.agent.forward(weights, &inputs, slots, cache);
@@ -304,7 +314,11 @@ impl<T: Real> Workspace<T> {
         let (m, n, k) = (ep.uavs, ep.users, ep.slots);
         let config = agent.geometry_config();
         let slots = k + 1;
+        let memory_len = agent.memory_len();
         self.geometry.clear();
+        self.goals.clear();
+        self.memory.clear();
+        self.memory.resize(memory_len * range.len(), 0.0);
         self.last.clear();
         self.identity_token.clear();
         self.position.clear();
@@ -320,6 +334,12 @@ impl<T: Real> Workspace<T> {
                 match t {
                     0 => self.last.resize(self.last.len() + m, NO_ACTION),
                     t => self.last.extend_from_slice(&ep.actions[(e * k + t - 1) * m..][..m]),
+                }
+                if memory_len > 0 {
+                    let memory = &mut self.memory[(e - range.start) * memory_len..][..memory_len];
+                    let (sight, env) = (self.geometry.last_sight(aoi), &agent.dims().env);
+                    agent.remember(env, &sight, t as u64, memory, &mut self.received);
+                    self.goals.push_fleet(env, &sight, t as u64, memories(memory, n), &self.last[self.last.len() - m..]);
                 }
                 self.identity_token.extend_from_slice(&ep.identity_token[e * m * TOKEN..][..m * TOKEN]);
                 self.position.extend_from_slice(uav_xy);

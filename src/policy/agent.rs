@@ -12,7 +12,10 @@ use super::EnvParams;
 use super::config::{AgentConfig, Aggregation, Gnn, Identity, ObservationKind};
 use super::features::{Inputs, SetEncoder, flat_observation, identity_width, write_action_identity_position};
 use super::geometry::{Geometry, GeometryConfig};
+use super::goal_head::{GoalCache, GoalHead};
 use super::hop_search::HopSearch;
+use super::memory::{remember, uav_memory_len};
+use super::sight::Sight;
 use crate::invalid::Invalid;
 use crate::nn::matmul::InitialValue;
 use crate::nn::{
@@ -41,6 +44,7 @@ pub struct Agent {
     fc: Linear,
     rnn: Gru,
     body: Body,
+    goals: Option<GoalHead>,
     /// Width of an observation.
     observation_width: usize,
 }
@@ -66,6 +70,7 @@ pub struct AgentCache<T: Real> {
     y: Vec<Batch<T>>,
     layers: Vec<LayerCache<T>>,
     head: MlpCache<T>,
+    goals: GoalCache<T>,
     search: HopSearch,
     scratch: Scratch<T>,
 }
@@ -119,7 +124,9 @@ impl Agent {
             let layers = (0..config.layers).map(|l| layer(&mut layout, &format!("agent.layers.{l}"))).collect();
             Body::Graph { w1, w2, layers, head: Mlp::new(&mut layout, "agent.head", 2 * HIDDEN, dims.env.actions) }
         };
-        Self { config, dims, layout, sets, fc, rnn, body, observation_width: observation }
+        let context = if config.gnn == Gnn::None { HIDDEN } else { 2 * HIDDEN };
+        let goals = (!config.memory.is_none()).then(|| GoalHead::new(&mut layout, "agent.goals", context));
+        Self { config, dims, layout, sets, fc, rnn, body, goals, observation_width: observation }
     }
 
     /// The architecture.
@@ -147,6 +154,18 @@ impl Agent {
             layers,
             self_loops: self.config.self_loops,
             hops: self.config.hops,
+        }
+    }
+
+    /// Length of what the UAVs of the fleet that the agent was made for remember; 0 without memory.
+    pub fn memory_len(&self) -> usize {
+        if self.config.memory.is_none() { 0 } else { self.dims.uavs * uav_memory_len(self.dims.users) }
+    }
+
+    /// Advances what the UAVs of a fleet remember; does nothing without memory. `received` is a buffer.
+    pub fn remember(&self, env: &EnvParams, sight: &Sight<'_>, slot: u64, memory: &mut [f32], received: &mut Vec<f32>) {
+        if let Some(sharing) = self.config.memory.sharing() {
+            remember(sight, env.detection_range, slot, sharing, memory, received);
         }
     }
 
@@ -183,6 +202,9 @@ impl Agent {
         }
         self.fc.prepare(params, prepared);
         self.rnn.prepare(params, prepared);
+        if let Some(goals) = &self.goals {
+            goals.prepare(params, prepared);
+        }
         match &self.body {
             Body::Plain { head } => head.prepare(params, prepared),
             Body::Graph { w1, w2, layers, head } => {
@@ -253,7 +275,12 @@ impl Agent {
         let h = hidden(&c.h, uavs);
         c.q.resize(self.dims.env.actions, uavs);
         match &self.body {
-            Body::Plain { head } => head.forward(w, h, c.q.rows_mut()),
+            Body::Plain { head } => {
+                head.forward(w, h, c.q.rows_mut());
+                if let Some(goals) = &self.goals {
+                    goals.forward(w, inputs.goals, &[h], &mut c.goals, &mut c.q);
+                }
+            }
             Body::Graph { w1, w2, layers, head } => {
                 let graph = inputs.geometry.graph();
                 c.user_obs.resize(self.observation_width, rows - uavs);
@@ -273,7 +300,11 @@ impl Agent {
                         relu(y.as_mut_slice());
                     }
                 }
-                head.forward(w, (h, c.y[layers.len()].rows(), HIDDEN), &mut c.head, c.q.rows_mut());
+                let y = c.y[layers.len()].rows();
+                head.forward(w, (h, y, HIDDEN), &mut c.head, c.q.rows_mut());
+                if let Some(goals) = &self.goals {
+                    goals.forward(w, inputs.goals, &[h, y], &mut c.goals, &mut c.q);
+                }
             }
         }
     }
@@ -292,7 +323,13 @@ impl Agent {
         let s = &mut c.scratch;
         s.dh.resize(HIDDEN, uavs);
         match &self.body {
-            Body::Plain { head } => head.backward(w.params, h, dq, grads, Some(s.dh.rows_mut())),
+            Body::Plain { head } => {
+                head.backward(w.params, h, dq, grads, Some(s.dh.rows_mut()));
+                if let Some(goals) = &self.goals {
+                    goals.backward(w.params, &[h], dq, &mut c.goals, grads);
+                    goals.backward_context(w.params, 0, &c.goals, s.dh.rows_mut());
+                }
+            }
             Body::Graph { w1, w2, layers, head } => {
                 let graph = inputs.geometry.graph();
                 head.backward(w.params, (h, c.y[layers.len()].rows(), HIDDEN), dq, &mut c.head, grads);
@@ -300,6 +337,11 @@ impl Agent {
                 head.first.backward_input(w.params, (0, HIDDEN), d, s.dh.rows_mut(), InitialValue::Zero);
                 s.dy.resize(HIDDEN, uavs);
                 head.first.backward_input(w.params, (HIDDEN, HIDDEN), d, s.dy.rows_mut(), InitialValue::Zero);
+                if let Some(goals) = &self.goals {
+                    goals.backward(w.params, &[h, c.y[layers.len()].rows()], dq, &mut c.goals, grads);
+                    goals.backward_context(w.params, 0, &c.goals, s.dh.rows_mut());
+                    goals.backward_context(w.params, 1, &c.goals, s.dy.rows_mut());
+                }
                 for (l, layer) in layers.iter().enumerate().rev() {
                     if l + 1 < layers.len() {
                         relu_back(c.y[l + 1].as_slice(), s.dy.as_mut_slice());

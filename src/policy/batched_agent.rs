@@ -4,6 +4,8 @@ use super::agent::{Agent, AgentCache};
 use super::config::TOKEN;
 use super::features::{Inputs, NO_ACTION};
 use super::geometry::Geometry;
+use super::goals::Goals;
+use super::memory::memories;
 use crate::nn::{HIDDEN, Weights};
 
 /// The scenes of B fleets in one slot.
@@ -27,6 +29,11 @@ pub struct BatchedAgent {
     last: Vec<u8>,
     identity_token: Vec<f32>,
     geometry: Geometry,
+    /// What the UAVs remember, fleet after fleet.
+    memory: Vec<f32>,
+    received: Vec<f32>,
+    goals: Goals,
+    slot: u64,
     cache: AgentCache<f32>,
 }
 
@@ -42,6 +49,10 @@ impl BatchedAgent {
             last: vec![NO_ACTION; rows],
             identity_token: vec![0.0; rows * TOKEN],
             geometry: Geometry::default(),
+            memory: vec![0.0; agent.memory_len() * fleets],
+            received: Vec::new(),
+            goals: Goals::default(),
+            slot: 0,
             cache: AgentCache::default(),
         }
     }
@@ -56,6 +67,8 @@ impl BatchedAgent {
         self.identity_token.copy_from_slice(identity_token);
         self.hidden.fill(0.0);
         self.last.fill(NO_ACTION);
+        self.memory.fill(0.0);
+        self.slot = 0;
     }
 
     /// Returns the Q-values (B, M, A) of the next slot and advances the hidden states.
@@ -68,16 +81,31 @@ impl BatchedAgent {
         assert_eq!(lengths, (self.fleets * m * 2, self.fleets * n * 2, self.fleets * n), "B fleets of M and N");
         let config = agent.geometry_config();
         self.geometry.clear();
+        self.goals.clear();
         for f in 0..self.fleets {
             let (uav_xy, user_xy) = (&input.uav_xy[f * 2 * m..][..2 * m], &input.user_xy[f * 2 * n..][..2 * n]);
-            self.geometry.push_scene(&config, uav_xy, user_xy, &input.aoi[f * n..][..n]);
+            let aoi = &input.aoi[f * n..][..n];
+            self.geometry.push_scene(&config, uav_xy, user_xy, aoi);
+            if !self.memory.is_empty() {
+                let len = agent.memory_len();
+                let (memory, last) = (&mut self.memory[f * len..][..len], &self.last[f * m..][..m]);
+                let sight = self.geometry.last_sight(aoi);
+                agent.remember(&agent.dims().env, &sight, self.slot, memory, &mut self.received);
+                self.goals.push_fleet(&agent.dims().env, &sight, self.slot, memories(memory, n), last);
+            }
         }
         self.geometry.finish(&config);
+        self.slot += 1;
         let rows = self.fleets * m;
         self.cache.begin(rows, 1).copy_from_slice(&self.hidden);
         let weights = Weights { params: &self.params, prepared: &self.prepared };
-        let inputs =
-            Inputs { geometry: &self.geometry, last: &self.last, identity_token: &self.identity_token, position: input.uav_xy };
+        let inputs = Inputs {
+            geometry: &self.geometry,
+            goals: &self.goals,
+            last: &self.last,
+            identity_token: &self.identity_token,
+            position: input.uav_xy,
+        };
         agent.forward(weights, &inputs, 1, &mut self.cache);
         self.hidden.copy_from_slice(self.cache.last_hidden(rows));
         self.cache.q.as_slice()

@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::memory::Sharing;
+
 /// The graph layer of an agent (docs/model.md, "Agents").
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -50,6 +52,19 @@ pub enum Identity {
     None,
 }
 
+/// What a UAV remembers besides its hidden state (docs/model.md, "Memory").
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Memory {
+    /// Nothing, as in the paper.
+    #[default]
+    None,
+    /// The users it has detected and the ground it has searched.
+    Own,
+    /// The same, exchanged among UAVs in communication range.
+    Shared,
+}
+
 /// Width of a `token` identity.
 pub const TOKEN: usize = 4;
 
@@ -73,6 +88,26 @@ pub struct AgentConfig {
     pub self_loops: bool,
     /// Number of links over which a UAV observes. More than 1 only without a graph layer.
     pub hops: usize,
+    /// What a UAV remembers.
+    #[serde(default, skip_serializing_if = "Memory::is_none")]
+    pub memory: Memory,
     /// Whether flat observations have relative positions in units of d, and own positions are scaled to [-1, 1].
     pub normalise: bool,
+}
+
+impl Memory {
+    /// Whether UAVs have no memory.
+    #[allow(clippy::trivially_copy_pass_by_ref, reason = "the form that serde calls")]
+    pub fn is_none(&self) -> bool {
+        *self == Self::None
+    }
+
+    /// How memories are shared; `None` without memory.
+    pub fn sharing(self) -> Option<Sharing> {
+        match self {
+            Self::None => None,
+            Self::Own => Some(Sharing::Own),
+            Self::Shared => Some(Sharing::Shared),
+        }
+    }
 }

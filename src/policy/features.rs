@@ -2,6 +2,7 @@
 
 use super::config::{AgentConfig, Identity, TOKEN};
 use super::geometry::{Geometry, NodeView};
+use super::goals::Goals;
 use super::hop_search::HopSearch;
 use crate::nn::{Embedding, EmbeddingParams, HIDDEN, ParameterLayout, Real, Rows, Weights, simd};
 
@@ -13,6 +14,8 @@ pub const NO_ACTION: u8 = u8::MAX;
 pub struct Inputs<'a> {
     /// Detections; the first rows are the UAVs.
     pub geometry: &'a Geometry,
+    /// Goals per UAV row; empty without a memory.
+    pub goals: &'a Goals,
     /// Last action per UAV row, [`NO_ACTION`] in slot 0.
     pub last: &'a [u8],
     /// Identity token per UAV row; used with identity `token`.

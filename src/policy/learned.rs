@@ -1,6 +1,7 @@
 //! A trained agent as a [`Policy`]. One forward pass computes a batch of fleets of different sizes.
 //!
-//! Memory per UAV: hidden state (64), last heading (-1 in slot 0), and the token with identity `token`.
+//! Memory: per UAV its hidden state (64), last heading (-1 in slot 0), and the token with identity `token`; then, for agents with a
+//! memory, what each UAV remembers (`policy::memory`).
 
 use std::sync::{Mutex, PoisonError};
 
@@ -10,6 +11,8 @@ use super::agent::{Agent, AgentCache, Dims};
 use super::config::{AgentConfig, Identity, TOKEN};
 use super::features::{Inputs, NO_ACTION};
 use super::geometry::Geometry;
+use super::goals::Goals;
+use super::memory::{memories, uav_memory_len};
 use super::{EnvParams, FleetStep, Policy, RequiredInput};
 use crate::invalid::Invalid;
 use crate::nn::{HIDDEN, Weights, argmax};
@@ -28,6 +31,8 @@ pub struct LearnedPolicy {
 #[derive(Debug, Default)]
 struct Buffers {
     geometry: Geometry,
+    goals: Goals,
+    received: Vec<f32>,
     cache: AgentCache<f32>,
     last: Vec<u8>,
     identity_token: Vec<f32>,
@@ -67,7 +72,7 @@ impl LearnedPolicy {
         self.agent.config().identity == Identity::Token
     }
 
-    /// Length of the memory of one UAV.
+    /// Length of the hidden state, last heading and token of one UAV.
     fn stride(&self) -> usize {
         HIDDEN + 1 + if self.has_token() { TOKEN } else { 0 }
     }
@@ -79,7 +84,11 @@ impl Policy for LearnedPolicy {
     }
 
     fn needs(&self) -> RequiredInput {
-        if self.agent.config().self_position { RequiredInput::OwnPositions } else { RequiredInput::Detections }
+        if self.agent.config().self_position || !self.agent.config().memory.is_none() {
+            RequiredInput::OwnPositions
+        } else {
+            RequiredInput::Detections
+        }
     }
 
     fn env(&self) -> EnvParams {
@@ -90,11 +99,14 @@ impl Policy for LearnedPolicy {
         self.agent.check_fleet(uavs, users)
     }
 
-    fn memory_len(&self, uavs: usize, _users: usize) -> usize {
-        uavs * self.stride()
+    fn memory_len(&self, uavs: usize, users: usize) -> usize {
+        let remembered = if self.agent.config().memory.is_none() { 0 } else { uav_memory_len(users) };
+        uavs * (self.stride() + remembered)
     }
 
-    fn start(&self, _uavs: usize, _users: usize, seed: u64, memory: &mut [f32]) {
+    fn start(&self, uavs: usize, _users: usize, seed: u64, memory: &mut [f32]) {
+        let (memory, remembered) = memory.split_at_mut(uavs * self.stride());
+        remembered.fill(0.0);
         let mut stream = rng::stream(seed, "token", 0);
         for uav in memory.chunks_exact_mut(self.stride()) {
             uav.fill(0.0);
@@ -124,13 +136,21 @@ impl LearnedPolicy {
         b.last.clear();
         b.identity_token.clear();
         b.position.clear();
-        for fleet in fleets.iter() {
+        b.goals.clear();
+        for fleet in fleets.iter_mut() {
             b.geometry.push_graph(&config, fleet.graph);
-            for uav in fleet.memory.chunks_exact(stride) {
+            let (memory, remembered) = fleet.memory.split_at_mut(fleet.graph.uavs() * stride);
+            for uav in memory.chunks_exact(stride) {
                 // The memory may come from a client. A number that is not a heading counts as no heading.
                 let known = (0.0..self.actions() as f32).contains(&uav[HIDDEN]);
                 b.last.push(if known { uav[HIDDEN] as u8 } else { NO_ACTION });
                 b.identity_token.extend_from_slice(&uav[HIDDEN + 1..]);
+            }
+            if !self.agent.config().memory.is_none() {
+                let sight = fleet.graph.sight().expect("the caller provides what `needs` requires");
+                self.agent.remember(&fleet.env, &sight, fleet.step, remembered, &mut b.received);
+                let last = &b.last[b.last.len() - sight.uavs()..];
+                b.goals.push_fleet(&fleet.env, &sight, fleet.step, memories(remembered, sight.users()), last);
             }
             if let Some(own) = fleet.graph.uav_positions() {
                 b.position.extend(own.iter().flatten().map(|&x| x as f32));
@@ -138,16 +158,23 @@ impl LearnedPolicy {
         }
         b.geometry.finish(&config);
         let rows = b.geometry.uav_rows();
-        let memories = fleets.iter().flat_map(|fleet| fleet.memory.chunks_exact(stride));
+        let memories = fleets.iter().flat_map(|fleet| fleet.memory[..fleet.graph.uavs() * stride].chunks_exact(stride));
         for (h, uav) in b.cache.begin(rows, 1).chunks_exact_mut(HIDDEN).zip(memories) {
             h.copy_from_slice(&uav[..HIDDEN]);
         }
-        let inputs = Inputs { geometry: &b.geometry, last: &b.last, identity_token: &b.identity_token, position: &b.position };
+        let inputs = Inputs {
+            geometry: &b.geometry,
+            goals: &b.goals,
+            last: &b.last,
+            identity_token: &b.identity_token,
+            position: &b.position,
+        };
         let weights = Weights { params: &self.params, prepared: &self.prepared };
         self.agent.forward(weights, &inputs, 1, &mut b.cache);
         let mut after = b.cache.last_hidden(rows).chunks_exact(HIDDEN).zip(b.cache.q.as_slice().chunks_exact(self.actions()));
         for fleet in fleets {
-            for (i, uav) in fleet.memory.chunks_exact_mut(stride).enumerate() {
+            let hidden = &mut fleet.memory[..fleet.graph.uavs() * stride];
+            for (i, uav) in hidden.chunks_exact_mut(stride).enumerate() {
                 let (h, q) = after.next().expect("one row per UAV");
                 let best = argmax(q);
                 uav[..HIDDEN].copy_from_slice(h);

@@ -66,6 +66,11 @@ impl<'a> UavMemory<'a> {
     }
 }
 
+/// The memories of a fleet in `numbers`, one per UAV.
+pub fn memories(numbers: &[f32], users: usize) -> impl Iterator<Item = UavMemory<'_>> {
+    numbers.chunks_exact(uav_memory_len(users)).map(UavMemory::new)
+}
+
 /// All cells of a row.
 const ALL: u32 = (1 << GRID) - 1;
 

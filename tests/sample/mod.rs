@@ -2,7 +2,7 @@
 #![allow(dead_code)] // each test binary uses its part
 
 use qedgix::learner::Episodes;
-use qedgix::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, ObservationKind, TOKEN};
+use qedgix::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, Memory, ObservationKind, TOKEN};
 use qedgix::rng;
 use rand::RngExt;
 
@@ -17,6 +17,7 @@ pub const AGENT: AgentConfig = AgentConfig {
     self_loops: false,
     hops: 1,
     normalise: false,
+    memory: Memory::None,
 };
 
 /// Episodes of UAVs that fly at random from the centre. Each episode has its own users.

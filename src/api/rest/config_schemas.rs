@@ -7,7 +7,7 @@ use utoipa::{PartialSchema, ToSchema};
 
 use crate::env::{Boundary, EnvConfig};
 use crate::policy::mixer::MixerKind;
-use crate::policy::{Aggregation, Identity, ObservationKind};
+use crate::policy::{Aggregation, Identity, Memory, ObservationKind};
 use crate::store::{AttemptOutcome, CheckpointKind, JobState, PendingAction};
 use crate::train_config::{Algorithm, Preset, Training};
 
@@ -112,6 +112,11 @@ fn training() -> Map<String, Value> {
         ("self_loops", boolean(), "Whether a node is its own neighbour."),
         ("hops", integer(1, 9), "Links over which a UAV without a graph network observes; L + 1 reach as far as L graph layers."),
         ("normalise", boolean(), "Whether flat observations divide relative positions by d and scale own positions to [-1, 1]."),
+        (
+            "memory",
+            string_enum::<Memory>(),
+            "What a UAV remembers: the users it detected and the ground it searched; shared: exchanged within the communication range.",
+        ),
         ("mixer", string_enum::<MixerKind>(), "Mixer of the UAVs' values."),
         ("hyper_init", number(0.0, 10.0), "Factor of the initial weights of the hypernetworks' last layers."),
         ("steps", integer(1, STEPS), "Environment steps (slots) to train for."),
@@ -198,6 +203,7 @@ string_enums! {
     Algorithm { Qmix Vdn Iql Qedgix Agggnn Rgcn }
     Preset { Paper Authors Practical }
     MixerKind { Qmix Invariant Vdn None }
+    Memory { None Own Shared }
     ObservationKind { Flat Set }
     Identity { Onehot Phase Token None }
     Aggregation { Mean Sum }

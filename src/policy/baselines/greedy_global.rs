@@ -1,7 +1,7 @@
 //! `greedy-global`: knows all positions and AoI, and pairs UAVs with users by AoI per slot of flight.
 
-use super::geometry::{heading_toward, travel_slots};
 use super::rule::{Rule, uav_positions, user_positions};
+use crate::policy::flight::{heading_toward, travel_slots};
 use crate::policy::{EnvParams, FleetGraph, RequiredInput};
 
 /// Has no memory.

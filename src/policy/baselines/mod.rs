@@ -3,7 +3,6 @@
 //! All state is in the memory that the caller holds. Random numbers depend on (seed, slot) only. A rule decides for one fleet;
 //! [`Baseline`] makes a [`Policy`] of it.
 
-mod geometry;
 mod greedy_global;
 mod max_aoi;
 mod nearest;

@@ -6,9 +6,9 @@ use std::marker::PhantomData;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
-use super::geometry::{heading_toward, in_square, next_position};
 use super::rule::{Rule, SEED_LEN, slot_rng, store_seed, uav_positions};
 use crate::env::{EnvConfig, Point};
+use crate::policy::flight::{heading_toward, in_square, next_position};
 use crate::policy::{EnvParams, FleetGraph, RequiredInput};
 
 /// A user that a UAV detects.

@@ -7,9 +7,9 @@
 
 use std::f64::consts::{PI, TAU};
 
-use super::geometry::{distance, heading_toward, travel_slots};
 use super::rule::Rule;
 use crate::env::Point;
+use crate::policy::flight::{distance, heading_toward, travel_slots};
 use crate::policy::memory::{GRID, RememberedUser, Sharing, UavMemory, remember, uav_memory_len};
 use crate::policy::{EnvParams, FleetGraph, RequiredInput};
 

@@ -10,9 +10,9 @@ mod pilot;
 mod plan;
 
 use self::pilot::{Pilot, Problem, TourState};
-use super::geometry::distance;
 use super::rule::{Rule, uav_positions, user_positions};
 use crate::env::Point;
+use crate::policy::flight::distance;
 use crate::policy::{EnvParams, FleetGraph, RequiredInput};
 
 /// Memory: for each UAV, 1 + the index in its tour, and the length of the tour; the positions of users at the time of planning;

@@ -1,7 +1,7 @@
 //! Short cyclic tours through points: nearest neighbour, then 2-opt and Or-opt. Work is bounded for any number of points.
 
-use super::super::geometry::distance;
 use crate::env::Point;
+use crate::policy::flight::distance;
 
 /// Maximum number of points for which the first tour is by nearest neighbour, which compares all pairs. Larger tours start row
 /// by row.

@@ -3,9 +3,9 @@
 //! Up to [`MAX_EXHAUSTIVE`] users and UAVs, all assignments are compared. Larger problems start from clusters of users, and users
 //! are moved between UAVs that are near, within a bounded number of simulated flights.
 
-use super::super::geometry::distance;
 use super::order::shorten;
 use super::pilot::{Pilot, Problem};
+use crate::policy::flight::distance;
 
 /// Maximum number of users, and of UAVs, for which all assignments are compared.
 const MAX_EXHAUSTIVE: usize = 8;

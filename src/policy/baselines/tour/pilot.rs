@@ -3,9 +3,9 @@
 //! The pilot flies to the next user of the tour on a shortest path along the eight headings. Of several shortest paths it takes
 //! the one that ends nearest to the user after the next. A user is reached as soon as it is in range.
 
-use super::super::geometry::{distance, in_square, next_position};
 use crate::env::{EnvConfig, Point};
 use crate::policy::EnvParams;
+use crate::policy::flight::{distance, in_square, next_position};
 
 /// A fleet, its users, and the number of slots to plan for.
 #[derive(Clone, Copy)]

@@ -1,0 +1,220 @@
+//! The places that a UAV with a memory may fly to: users that it remembers, and ground that it has not searched (docs/model.md,
+//! "Goals"). Each goal lies in the direction of one heading, and has features that do not depend on the size of the fleet, the ranges
+//! or the horizon, except through the quantities that matter: flight times, ages, and numbers of users.
+
+use super::env_params::EnvParams;
+use super::flight::{distance, heading_toward, travel_slots};
+use super::memory::{GRID, RememberedUser, UavMemory};
+use super::sight::Sight;
+use crate::env::Point;
+
+/// Number of features of a goal.
+pub const FEATURES: usize = 16;
+/// Blocks of ground along each side of the square. Each block that is not searched is a goal.
+const BLOCKS: usize = 5;
+/// Cells along each side of a block.
+const SIDE: usize = GRID / BLOCKS;
+
+/// The goals of a batch of UAVs, in the order of the rows of a [`super::Geometry`].
+#[derive(Clone, Debug, Default)]
+pub struct Goals {
+    /// The goals of row r are `offsets[r]..offsets[r + 1]`.
+    offsets: Vec<u32>,
+    headings: Vec<u8>,
+    /// (goals, [`FEATURES`]).
+    features: Vec<f32>,
+    users: Vec<RememberedUser>,
+}
+
+impl Goals {
+    /// Removes all rows.
+    pub fn clear(&mut self) {
+        self.offsets.clear();
+        self.offsets.push(0);
+        self.headings.clear();
+        self.features.clear();
+    }
+
+    /// Number of rows.
+    pub fn rows(&self) -> usize {
+        self.offsets.len().saturating_sub(1)
+    }
+
+    /// Number of goals.
+    pub fn len(&self) -> usize {
+        self.headings.len()
+    }
+
+    /// Whether there are no goals.
+    pub fn is_empty(&self) -> bool {
+        self.headings.is_empty()
+    }
+
+    /// Indices of the goals of row `r`.
+    pub fn of_row(&self, r: usize) -> std::ops::Range<usize> {
+        self.offsets[r] as usize..self.offsets[r + 1] as usize
+    }
+
+    /// The heading of each goal.
+    pub fn headings(&self) -> &[u8] {
+        &self.headings
+    }
+
+    /// The features of all goals, (goals, [`FEATURES`]).
+    pub fn features(&self) -> &[f32] {
+        &self.features
+    }
+
+    /// Adds one row per UAV of a fleet in slot `slot`. `memories` holds their memories, `last` their last headings.
+    pub fn push_fleet<'a>(
+        &mut self,
+        env: &EnvParams,
+        sight: &Sight<'_>,
+        slot: u64,
+        memories: impl Iterator<Item = UavMemory<'a>>,
+        last: &[u8],
+    ) {
+        for ((i, memory), &last) in memories.enumerate().zip(last) {
+            let at = sight.positions[i];
+            let view = View { env, uav: i, uavs: sight.uavs(), at, slot: slot as f64, last };
+            self.push_row(&view, memory, sight.detected_uavs(i).map(|(_, at)| at));
+        }
+    }
+
+    fn push_row(&mut self, view: &View<'_>, memory: UavMemory<'_>, others: impl Iterator<Item = Point> + Clone) {
+        let mut users = std::mem::take(&mut self.users);
+        users.clear();
+        users.extend(memory.users().flatten());
+        let all = memory.users().len();
+        let ground = Ground::new(memory);
+        let common = [
+            ln1(ground.unsearched as f64 * CELL_SHARE * (all - users.len()) as f64),
+            (all - users.len()) as f64 / all.max(1) as f64,
+            ground.unsearched as f64 * CELL_SHARE,
+            ln1(users.len() as f64 / view.uavs as f64),
+        ];
+        for (j, user) in users.iter().enumerate() {
+            let goal = view.user(user, &users, j);
+            self.push(view, user.position, goal, common, others.clone());
+        }
+        for block in 0..BLOCKS * BLOCKS {
+            if ground.blocks[block] > 0 {
+                let to = ground.centers[block];
+                let goal = view.ground(to, &ground, all - users.len());
+                self.push(view, to, goal, common, others.clone());
+            }
+        }
+        self.users = users;
+        self.offsets.push(self.headings.len() as u32);
+    }
+
+    /// Adds a goal at `to`.
+    fn push(&mut self, view: &View<'_>, to: Point, own: [f64; 7], common: [f64; 4], others: impl Iterator<Item = Point>) {
+        let heading = heading_toward(view.env, view.at, to);
+        let mine = distance(view.at, to);
+        let nearest = others.map(|other| distance(other, to)).fold(f64::INFINITY, f64::min);
+        // How much nearer this UAV is than the nearest other one that it detects, in units of d.
+        let lead = ((nearest - mine) / view.env.detection_range).clamp(-1.0, 1.0);
+        let contested = f64::from(u8::from(nearest < mine));
+        let onward = f64::from(u8::from(heading == view.last));
+        let shared = [lead, contested, onward, ((mine / view.env.detection_range) - 1.0).clamp(-1.0, 1.0), 1.0];
+        self.headings.push(heading);
+        self.features.extend(own.iter().chain(&common).chain(&shared).map(|&x| x as f32));
+    }
+}
+
+/// Share of a cell of the ground.
+const CELL_SHARE: f64 = 1.0 / (GRID * GRID) as f64;
+
+/// A coordinate that is out of range of everything.
+const FAR: f64 = 1e9;
+
+/// ln(1 + x).
+fn ln1(x: f64) -> f64 {
+    x.max(0.0).ln_1p()
+}
+
+/// One UAV in one slot.
+struct View<'a> {
+    env: &'a EnvParams,
+    uav: usize,
+    uavs: usize,
+    at: Point,
+    slot: f64,
+    last: u8,
+}
+
+impl View<'_> {
+    /// Features of user `j` of the remembered users.
+    fn user(&self, user: &RememberedUser, users: &[RememberedUser], j: usize) -> [f64; 7] {
+        let range = self.env.transmission_range;
+        let age_after = |user: &RememberedUser, slots: f64| self.slot - f64::from(user.collected) + slots;
+        let slots = travel_slots(self.env, self.at, user.position, range);
+        let age = age_after(user, slots);
+        // The best AoI per slot that the next flight, from there, promises.
+        let next = users.iter().enumerate().filter(|(k, _)| *k != j).fold(0.0, |best: f64, (_, next)| {
+            let onward = travel_slots(self.env, user.position, next.position, range);
+            best.max(age_after(next, slots + onward) / onward)
+        });
+        let rate = age / slots;
+        [1.0, ln1(slots), 1.0 / slots, ln1(age), ln1(rate), ln1(next), ln1(self.slot - f64::from(user.observed))]
+    }
+
+    /// Features of unsearched ground around `to`.
+    fn ground(&self, to: Point, ground: &Ground, unknown: usize) -> [f64; 7] {
+        let range = self.env.detection_range;
+        let slots = travel_slots(self.env, self.at, to, range);
+        let expected = unknown as f64 * ground.within(to, range) / f64::from(ground.unsearched.max(1));
+        let rate = expected * (self.slot + slots) / slots;
+        let own = f64::from(u8::from(self.owns(to)));
+        [0.0, ln1(slots), 1.0 / slots, ln1(self.slot + slots), ln1(rate), ln1(expected), own]
+    }
+
+    /// Whether `p` is in the sector of this UAV, around the centre of the square. UAVs that start together search different sectors.
+    fn owns(&self, p: Point) -> bool {
+        use std::f64::consts::{PI, TAU};
+        let own = TAU * self.uav as f64 / self.uavs as f64;
+        let off = ((p[1] - 0.5).atan2(p[0] - 0.5) - own).rem_euclid(TAU);
+        off.min(TAU - off) <= PI / self.uavs as f64
+    }
+}
+
+/// The ground that was not searched, by block.
+struct Ground {
+    /// Cells per block.
+    blocks: [u32; BLOCKS * BLOCKS],
+    /// Mean position of these cells; far away without any.
+    centers: [Point; BLOCKS * BLOCKS],
+    /// Cells of all blocks.
+    unsearched: u32,
+}
+
+impl Ground {
+    fn new(memory: UavMemory<'_>) -> Self {
+        let mut ground = Self { blocks: [0; _], centers: [[FAR; 2]; _], unsearched: 0 };
+        let mut sums = [[0; 2]; BLOCKS * BLOCKS];
+        for row in 0..GRID {
+            let mut cells = !memory.searched(row) & ((1 << GRID) - 1);
+            while cells != 0 {
+                let column = cells.trailing_zeros();
+                cells &= cells - 1;
+                let block = row / SIDE * BLOCKS + column as usize / SIDE;
+                ground.blocks[block] += 1;
+                sums[block][0] += column;
+                sums[block][1] += row as u32;
+                ground.unsearched += 1;
+            }
+        }
+        for ((center, sums), &cells) in ground.centers.iter_mut().zip(sums).zip(&ground.blocks).filter(|(_, cells)| **cells > 0) {
+            *center = sums.map(|sum: u32| (f64::from(sum) / f64::from(cells) + 0.5) / GRID as f64);
+        }
+        ground
+    }
+
+    /// Cells of the blocks whose centre is within `range` of `to`.
+    fn within(&self, to: Point, range: f64) -> f64 {
+        let near = |p: &Point| (p[0] - to[0]).powi(2) + (p[1] - to[1]).powi(2) <= range * range;
+        let cells: u32 = self.centers.iter().zip(&self.blocks).map(|(center, cells)| if near(center) { *cells } else { 0 }).sum();
+        f64::from(cells)
+    }
+}
