@@ -7,6 +7,7 @@ use serde_json::{Map, Value};
 
 use crate::env::EnvConfig;
 use crate::invalid::{Invalid, expectation, in_range};
+use crate::policy::baselines;
 use crate::policy::mixer::MixerKind;
 use crate::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, Memory, ObservationKind};
 
@@ -117,6 +118,13 @@ pub struct Training {
     /// Whether replayed episodes are rotated and mirrored at random, by the eight symmetries of the square.
     #[serde(default)]
     pub augment: bool,
+    /// Baseline that flies some of the UAVs while episodes are collected, so that they show the policy what the rule does. Absent: the
+    /// policy explores by random headings only, as in the paper.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub teacher: Option<String>,
+    /// With a teacher: smallest probability that it flies a UAV for an episode. The probability is epsilon while that is larger.
+    #[serde(default = "default_teacher_share", skip_serializing_if = "is_default_teacher_share")]
+    pub teacher_share: f64,
     /// Environment steps between evaluations.
     pub eval_every: u64,
     /// Episodes per evaluation.
@@ -185,6 +193,8 @@ impl TrainConfig {
             average: 0,
             shaping: false,
             augment: false,
+            teacher: None,
+            teacher_share: default_teacher_share(),
             eval_every: 10_000,
             eval_episodes: 64,
         };
@@ -321,6 +331,13 @@ impl Training {
         in_range("target_every", self.target_every, 1..=1_000_000_000)?;
         in_range("target_tau", self.target_tau, 0.0..=1.0)?;
         in_range("average", self.average, 0..=1_000_000_000)?;
+        in_range("teacher_share", self.teacher_share, 0.0..=1.0)?;
+        if let Some(teacher) = &self.teacher
+            && !baselines::LIST.iter().any(|baseline| baseline.name == teacher)
+        {
+            let names: Vec<_> = baselines::LIST.iter().map(|baseline| baseline.name).collect();
+            return Err(Invalid::new("teacher", format!("{teacher:?}"), format!("one of {}", names.join(", "))));
+        }
         in_range("eval_every", self.eval_every, 1..=1_000_000_000_000)?;
         in_range("eval_episodes", self.eval_episodes, 1..=4096)?;
         if self.shaping && self.gamma > 0.9999 {
@@ -335,6 +352,15 @@ impl Training {
 
 fn default_hops() -> usize {
     1
+}
+
+fn default_teacher_share() -> f64 {
+    0.2
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, clippy::float_cmp, reason = "the form that serde calls; the default is exact")]
+fn is_default_teacher_share(share: &f64) -> bool {
+    *share == default_teacher_share()
 }
 
 fn default_factor() -> f64 {

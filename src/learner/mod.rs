@@ -11,6 +11,7 @@ mod rollout;
 mod snapshot;
 mod state;
 mod summary;
+mod teacher;
 mod trainer;
 mod update;
 

@@ -10,6 +10,8 @@
 //! Phi is the discounted return of a fleet that collects nothing from now on. It is a potential, so the optimal policies are the
 //! same (Ng, Harada and Russell 1999).
 //!
+//! With `training.teacher`, a rule flies some of the UAVs (`learner::teacher`).
+//!
 //! The random streams of an episode (layout, tokens, exploration) depend on its number only, not on the episodes collected with it.
 //! Nothing is allocated per slot.
 
@@ -17,6 +19,7 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
 use super::replay::EpisodeShape;
+use super::teacher::Teacher;
 use super::{Episodes, TrainConfig};
 use crate::env::BatchEnv;
 use crate::invalid::Invalid;
@@ -34,6 +37,7 @@ pub struct Rollout {
     seeds: Vec<u64>,
     exploration_rngs: Vec<ChaCha8Rng>,
     actions: Vec<u8>,
+    teacher: Option<Teacher>,
     /// With shaping: per user reward_scale / (1 - gamma) * w_i / N.
     shaping_factors: Option<Vec<f64>>,
 }
@@ -67,6 +71,7 @@ impl Rollout {
             seeds: Vec::with_capacity(fleets),
             exploration_rngs: Vec::with_capacity(fleets),
             actions: vec![0; fleets * m],
+            teacher: Teacher::new(config, fleets)?,
             shaping_factors: config.training.shaping.then(|| {
                 let factor = environment.effective_reward_scale() / (1.0 - config.training.gamma) / n as f64;
                 environment.user_weights().iter().map(|w| w * factor).collect()
@@ -90,13 +95,27 @@ impl Rollout {
         self.batched_agent.begin(agent, parameters, &self.episodes.identity_token);
         let actions = self.env.config().actions();
         let uavs = self.env.config().uavs;
+        if let Some(teacher) = &mut self.teacher {
+            teacher.begin(epsilon, &self.seeds, &mut self.exploration_rngs);
+        }
         self.record_scene();
         while !self.env.done() {
             let input = StepInput { uav_xy: self.env.uav_xy(), user_xy: self.env.user_xy(), aoi: self.env.aoi() };
             let q = self.batched_agent.step(agent, input);
+            if let Some(teacher) = &mut self.teacher {
+                teacher.decide(&self.env);
+            }
             for (i, (action, q)) in self.actions.iter_mut().zip(q.chunks_exact(actions)).enumerate() {
                 let rng = &mut self.exploration_rngs[i / uavs];
-                *action = if rng.random::<f64>() < epsilon { rng.random_range(0..actions as u8) } else { argmax(q) as u8 };
+                let (led, epsilon) = match &self.teacher {
+                    Some(teacher) => (teacher.leads(i, rng), teacher.epsilon),
+                    None => (None, epsilon),
+                };
+                *action = match led {
+                    Some(heading) => heading,
+                    None if rng.random::<f64>() < epsilon => rng.random_range(0..actions as u8),
+                    None => argmax(q) as u8,
+                };
             }
             self.batched_agent.record_actions(&self.actions);
             self.env.step(&self.actions);

@@ -148,6 +148,12 @@ fn training() -> Map<String, Value> {
         ),
         ("shaping", boolean(), "Whether potential-based shaping rewards the collected age; optimal policies stay the same."),
         ("augment", boolean(), "Whether replayed episodes are rotated and mirrored at random."),
+        (
+            "teacher",
+            json!({"type": ["string", "null"]}),
+            "Baseline that flies some of the UAVs while episodes are collected; absent: none.",
+        ),
+        ("teacher_share", number(0.0, 1.0), "Smallest probability that the teacher flies a UAV for an episode."),
         ("eval_every", integer(1, STEPS), "Environment steps between evaluations."),
         ("eval_episodes", integer(1, 4096), "Episodes of an evaluation."),
     ];
