@@ -1,9 +1,16 @@
 //! Inputs made wrong at random, over the real services without a network between: no panic, no hang, bounded memory.
 //!
 //! Every input is a valid one that was cut, spliced, flipped or fed with extreme numbers; the same number of inputs is the
-//! same inputs. A few thousand by default; for more:
+//! same inputs. And once more with API keys and TLS, over the network. A few thousand by default; for more:
 //!
 //!     QEDGIX_FUZZ_INPUTS=1000000 cargo test --release --test fuzz -- --nocapture
+
+#[path = "certificates/mod.rs"]
+mod certificates;
+#[path = "process/mod.rs"]
+mod process;
+#[path = "fuzz/secured.rs"]
+mod secured;
 
 use std::collections::BTreeMap;
 use std::convert::Infallible;
@@ -32,14 +39,25 @@ use tokio_util::sync::CancellationToken;
 use tower::util::BoxCloneSyncService;
 use tower::{ServiceBuilder, ServiceExt};
 
+use self::secured::Secured;
+
 /// Largest body and message, in bytes.
 const LARGEST: usize = 1 << 20;
 /// Most memory that one input may take at a time, in bytes.
 const MEMORY: u64 = 64 << 20;
-/// Ways into the server.
-const KINDS: [&str; 4] = ["proto", "JSON", "tensors", "safetensors"];
+/// Ways into the server. TLS only where it is on.
+const KINDS: [&str; 5] = ["proto", "JSON", "tensors", "safetensors", "TLS"];
 /// An input that takes longer hangs.
 const LONGEST: Duration = Duration::from_secs(10);
+
+/// How the inputs reach the server.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Access {
+    /// Its services are called directly.
+    Open,
+    /// Over TLS, with API keys.
+    KeysAndTls,
+}
 
 /// Numbers, words and shapes that programs trip over.
 const TOKENS: [&str; 24] = [
@@ -258,36 +276,58 @@ fn documents() -> Vec<(&'static str, &'static str, &'static str, Vec<u8>)> {
 
 struct Subject {
     app: Arc<App>,
-    rest: axum::Router,
-    purse: Arc<Purse>,
-    grpc: BoxCloneSyncService<Request<IncomingBody>, Response<Body>, Infallible>,
+    rest: BoxCloneSyncService<Request<Body>, Response<Body>, Infallible>,
+    grpc: BoxCloneSyncService<Request<Body>, Response<Body>, Infallible>,
+    /// Where the server requires keys and speaks TLS.
+    secured: Option<Secured>,
     checkpoint: Vec<u8>,
     graph: FleetGraph,
 }
 
 impl Subject {
-    async fn new(dir: &std::path::Path) -> Self {
+    async fn new(dir: &std::path::Path, access: Access) -> Self {
         let mut config = Config::new(dir);
         config.environment_memory = 1 << 20;
+        config.max_message_size = LARGEST;
         (config.max_sessions, config.max_environments) = (64, 16);
-        let data = DataDir::lock(dir).unwrap();
-        let app = server::open(&config, &data, Clock::system()).await.unwrap();
         telemetry::install_metrics();
-        let health = grpc::Health::new(app.draining.clone(), CancellationToken::new());
-        let services = grpc::services(&app, &health, LARGEST, CancellationToken::new());
-        let grpc = ServiceBuilder::new().map_response(|r: Response<_>| r.map(Body::new)).service(services);
+        let (app, rest, grpc, secured) = match access {
+            Access::Open => {
+                let data = DataDir::lock(dir).unwrap();
+                let app = server::open(&config, &data, Clock::system()).await.unwrap();
+                let health = grpc::Health::new(app.draining.clone(), CancellationToken::new());
+                let services = grpc::services(&app, &health, LARGEST, CancellationToken::new());
+                let purse = Purse::new(Budget::new(1 << 30));
+                let incoming = move |body| IncomingBody::http1(body, Exchange::http1(purse.clone(), false), LONGEST);
+                let grpc = ServiceBuilder::new()
+                    .map_request(move |request: Request<Body>| request.map(&incoming))
+                    .map_response(|r: Response<_>| r.map(Body::new))
+                    .service(services);
+                let rest = rest::router(app.clone(), telemetry::render_metrics, LARGEST);
+                (app, BoxCloneSyncService::new(rest), BoxCloneSyncService::new(grpc), None)
+            }
+            Access::KeysAndTls => {
+                let secured = Secured::start(dir, config).await;
+                (secured.app.clone(), secured.service(false), secured.service(true), Some(secured))
+            }
+        };
         let mut config = TrainConfig::preset(Algorithm::Vdn, Preset::Practical);
         config.environment.reward_scale = Some(1.0);
         let weights = (0..parameter_layout(&config).len()).map(|i| (i % 7) as f32 * 0.01).collect();
         let points = |n: usize| (0..n).map(|i| [0.1 * i as f64, 0.2]).collect::<Vec<_>>();
         Self {
-            rest: rest::router(app.clone(), telemetry::render_metrics, LARGEST),
-            grpc: BoxCloneSyncService::new(grpc),
-            purse: Purse::new(Budget::new(1 << 30)),
             app,
+            rest,
+            grpc,
+            secured,
             checkpoint: Checkpoint::new(config, 1, None, weights).unwrap().to_bytes(),
             graph: FleetGraph::from_scene(&points(3), &points(5), &[1.0; 5], 0.28),
         }
+    }
+
+    /// The ways into this server.
+    fn kinds(&self) -> &'static [&'static str] {
+        if self.secured.is_some() { &KINDS } else { &KINDS[..4] }
     }
 
     /// Sends a message; the code of the status.
@@ -298,7 +338,7 @@ impl Subject {
         let request = Request::post(format!("http://here/{method}"))
             .header(header::CONTENT_TYPE, "application/grpc")
             .header("te", "trailers")
-            .body(IncomingBody::http1(http_body_util::Full::from(body), Exchange::http1(self.purse.clone(), false), LONGEST));
+            .body(Body::from(body));
         let response = self.grpc.clone().oneshot(request.unwrap()).await.unwrap();
         let (head, body) = response.into_parts();
         let body = http_body_util::BodyExt::collect(body).await.unwrap();
@@ -362,11 +402,20 @@ fn watch(current: &Arc<Mutex<(Instant, u64)>>) {
 
 #[test]
 fn wrong_inputs_are_refused_and_nothing_else_happens() {
+    fuzz(Access::Open);
+}
+
+#[test]
+fn wrong_inputs_are_refused_and_nothing_else_happens_with_keys_and_tls() {
+    fuzz(Access::KeysAndTls);
+}
+
+fn fuzz(access: Access) {
     let inputs: u64 =
         std::env::var("QEDGIX_FUZZ_INPUTS").map_or(6000, |text| text.parse().expect("QEDGIX_FUZZ_INPUTS: a number"));
     let dir = tempfile::tempdir().unwrap();
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    let subject = runtime.block_on(Subject::new(dir.path()));
+    let subject = runtime.block_on(Subject::new(dir.path(), access));
     let (messages, documents) = (messages(), documents());
     let mut rng = qedgix::rng::stream(1, "fuzz", 0);
     let mut answers: BTreeMap<(&str, String), u64> = BTreeMap::new();
@@ -374,7 +423,7 @@ fn wrong_inputs_are_refused_and_nothing_else_happens() {
     watch(&watched);
     let (mut slowest, mut largest) = (Duration::ZERO, 0);
     for number in 0..inputs {
-        let kind = KINDS[rng.random_range(0..KINDS.len())];
+        let kind = subject.kinds()[rng.random_range(0..subject.kinds().len())];
         let began = Instant::now();
         *watched.lock().unwrap() = (began, number);
         let (mut input, mut answer) = (Vec::new(), String::new());
@@ -399,6 +448,10 @@ fn wrong_inputs_are_refused_and_nothing_else_happens() {
                 input = [document, rest].concat();
                 answer = runtime.block_on(subject.send_binary(input.clone(), length));
             }
+            "TLS" => {
+                let secured = subject.secured.as_ref().expect("a kind of secured servers only");
+                (input, answer) = runtime.block_on(secured.shake_hands(|hello| spoil(&mut rng, hello, hello)));
+            }
             _ => {
                 input = spoil(&mut rng, &subject.checkpoint, &subject.checkpoint);
                 answer = subject.read(&input);
@@ -417,7 +470,7 @@ fn wrong_inputs_are_refused_and_nothing_else_happens() {
     }
     println!("{inputs} inputs; the slowest took {slowest:?}, the largest {largest} bytes");
     println!("sessions {}, environments {}", subject.app.sessions.len(), subject.app.environments.table().len());
-    for kind in KINDS {
+    for &kind in subject.kinds() {
         assert!(answers.keys().filter(|(of, _)| *of == kind).count() > 1, "some of {kind} are right and some are wrong");
     }
 }

@@ -52,7 +52,8 @@ async fn the_good_client_gets_every_answer() {
     let dir = tempfile::tempdir().unwrap();
     let (ours, theirs) = (process::create_key(dir.path(), "act"), process::create_key(dir.path(), "read,act"));
     let mut command = process::serve(dir.path());
-    command.env("QEDGIX_LOG", "error");
+    let log = dir.path().join("log");
+    command.stderr(std::fs::File::create(&log).unwrap());
     let mut server = Process::start(command).await;
     let good = Good::start(&server.grpc, &ours);
     // The first answers wait for pages of memory and for branches of code.
@@ -77,6 +78,12 @@ async fn the_good_client_gets_every_answer() {
         let slots = phase.latencies.len();
         println!("{name:>7}: {slots} slots, p50 {half:.1?}, p99 {most:.1?}, slowest {worst:.1?}, {} errors", phase.errors.len());
     }
+    let log = std::fs::read_to_string(&log).unwrap();
+    println!(
+        "{} lines in the log, {} of them errors",
+        log.lines().count(),
+        log.lines().filter(|line| line.contains("ERROR")).count()
+    );
     println!("p99 times {ratio:.1}; memory in MiB: {begin:.0} at first, {peak:.0} at most, {end:.0} at the end");
     assert!(ended.success(), "the hostile clients: {ended}");
     assert_eq!(server.ended(), None, "the server lives");
