@@ -29,6 +29,15 @@ pub struct Seen {
     pub violations: Vec<String>,
 }
 
+impl Seen {
+    /// The first violations are enough.
+    fn violation(&mut self, text: String) {
+        if self.violations.len() < 3 {
+            self.violations.push(text);
+        }
+    }
+}
+
 /// Samples until it is dropped.
 pub struct Monitor {
     pub seen: Arc<Mutex<Seen>>,
@@ -71,7 +80,7 @@ async fn watch(seen: Arc<Mutex<Seen>>, budget: usize) {
                 above.clear();
                 seen.most.0 = seen.most.0.max(used);
             } else if above.len() + 1 >= SAMPLES {
-                seen.violations.push(format!("workers use {used} threads: {workers:?}"));
+                seen.violation(format!("workers use {used} threads: {workers:?}"));
                 seen.most.0 = seen.most.0.max(used);
                 above.clear();
             } else {
@@ -83,7 +92,7 @@ async fn watch(seen: Arc<Mutex<Seen>>, budget: usize) {
         let mut seen = seen.lock().unwrap();
         seen.most.1 = seen.most.1.max(used);
         if used > budget {
-            seen.violations.push(format!("running jobs have {used} threads"));
+            seen.violation(format!("running jobs have {used} threads"));
         }
     }
 }

@@ -1,7 +1,7 @@
 //! A real server process with real worker processes, and what happens when either of them dies.
 
 use std::path::Path;
-use std::process::Command;
+use std::process::{Command, Stdio};
 use std::sync::Arc;
 
 use qedgix::checkpoint::Checkpoint;
@@ -273,6 +273,27 @@ async fn a_server_whose_program_was_replaced_starts_workers() {
     std::fs::write(&program, "another version").unwrap();
     let id = server.rest.submit(&tiny()).await;
     server.rest.reaches(&id, "succeeded").await;
+}
+
+#[tokio::test]
+async fn orphaned_worker_ends_although_nobody_reads_its_output() {
+    let mut command = Command::new(PROGRAM);
+    command.args(["worker", "--tethered"]).env("QEDGIX_ATTEMPT", "1").env("QEDGIX_TOKEN", "of a server that has ended");
+    // Nothing listens there, and workers try for long to reach their server.
+    command.env("QEDGIX_SERVER", "http://127.0.0.1:1").env("QEDGIX_JOB", uuid::Uuid::nil().to_string());
+    let mut worker = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    drop((worker.stdout.take(), worker.stderr.take()));
+    drop(worker.stdin.take());
+    let status = within(async {
+        loop {
+            match worker.try_wait().unwrap() {
+                Some(status) => break status,
+                None => tokio::time::sleep(POLL).await,
+            }
+        }
+    })
+    .await;
+    assert_eq!(status.code(), Some(3));
 }
 
 #[tokio::test]

@@ -9,7 +9,7 @@ mod report;
 mod training;
 
 use std::any::Any;
-use std::io::Read;
+use std::io::{Read, Write};
 use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
@@ -113,7 +113,9 @@ pub fn exit_with_stdin() -> std::io::Result<()> {
     let watch = || {
         let mut input = std::io::stdin().lock();
         while let Ok(1..) = input.read(&mut [0; 64]) {}
-        eprintln!("the server has ended");
+        // The server also held the other end of standard error, so this write may fail. `eprintln!` would panic then, and the
+        // process would go on without a server.
+        let _ = writeln!(std::io::stderr(), "the server has ended");
         std::process::exit(3);
     };
     std::thread::Builder::new().name("stdin".into()).spawn(watch).map(drop)
