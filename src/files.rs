@@ -24,6 +24,15 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> io::Result<()> {
     written.and_then(|()| sync_directory_of(path))
 }
 
+/// Replaces `path` by the file `partial`, whose content is on disk. On success this survives a power failure.
+///
+/// # Errors
+/// The directory is not writable.
+pub fn replace(partial: &Path, path: &Path) -> io::Result<()> {
+    fs::rename(partial, path)?;
+    sync_directory_of(path)
+}
+
 /// Writes `bytes` and waits until they are on disk. Renamed without this, a file can be empty after a power failure.
 fn write_synced(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let mut file = File::create(path)?;

@@ -143,8 +143,9 @@ impl Listeners {
 #[derive(Debug)]
 pub struct DataDir {
     path: PathBuf,
-    /// Holds the file lock. The operating system releases it when the process ends, for whatever reason.
-    _lock: File,
+    /// Holds the locks of the directory itself, which nobody can remove while it is in use, and of the file `lock`, which earlier
+    /// versions lock. The operating system releases them when the process ends, for whatever reason.
+    _locks: [File; 2],
 }
 
 impl DataDir {
@@ -158,10 +159,17 @@ impl DataDir {
             move |cause| Error::File { path, cause }
         };
         std::fs::create_dir_all(path).map_err(failed(path))?;
+        let directory = File::open(path).map_err(failed(path))?;
+        match directory.try_lock() {
+            Err(TryLockError::WouldBlock) => return Err(Error::InUse(path.to_owned())),
+            // Some file systems lock only files.
+            Err(TryLockError::Error(error)) => tracing::debug!(%error, "the data directory cannot be locked, only a file in it"),
+            Ok(()) => {}
+        }
         let file = path.join("lock");
         let lock = File::options().create(true).truncate(false).write(true).open(&file).map_err(failed(&file))?;
         match lock.try_lock() {
-            Ok(()) => Ok(Self { path: path.to_owned(), _lock: lock }),
+            Ok(()) => Ok(Self { path: path.to_owned(), _locks: [directory, lock] }),
             Err(TryLockError::WouldBlock) => Err(Error::InUse(path.to_owned())),
             Err(TryLockError::Error(cause)) => Err(failed(&file)(cause)),
         }

@@ -23,7 +23,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("checkpoint", &["train_config", "policy", "env", "nn", "invalid"]),
     ("learner", &["checkpoint", "train_config", "policy", "env", "nn", "invalid", "rng"]),
     ("experiment", &["learner", "checkpoint", "train_config", "plot", "policy", "env", "invalid", "rng"]),
-    ("store", &["train_config", "invalid"]),
+    ("store", &["train_config", "invalid", "files"]),
     (
         "jobs",
         &[

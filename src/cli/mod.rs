@@ -1,6 +1,7 @@
 //! The command line. Each command has its own file. Most flags are also environment variables `QEDGIX_*`; `--help` shows them.
 
 mod act_client;
+mod backup;
 mod bench;
 mod client;
 mod comparison;
@@ -50,6 +51,10 @@ enum Command {
     Experiment(experiment::ExperimentArgs),
     /// Create, list, rotate and revoke the API keys of a server
     Keys(keys::KeysArgs),
+    /// Copy the database of a server, which may be running, to one file
+    Backup(backup::BackupArgs),
+    /// Put a backup into the data directory of a server that is stopped
+    Restore(backup::RestoreArgs),
     /// Measure the speed of Act and of the learner on this machine
     Bench(bench::BenchArgs),
     /// Run one job for a server (servers start their workers themselves)
@@ -70,6 +75,8 @@ pub fn run() -> ExitCode {
         Command::Policies(args) => block_on(policies::run(args)),
         Command::Experiment(args) => block_on(experiment::run(args)),
         Command::Keys(args) => block_on(keys::run(args)),
+        Command::Backup(args) => block_on(backup::backup(args)),
+        Command::Restore(args) => block_on(backup::restore(args)),
         Command::Bench(args) => block_on(bench::run(args)),
         // A worker lowers its priority before it has threads, so it creates its own runtime.
         Command::Worker(args) => output::exit_code(worker::run(&args)),

@@ -66,9 +66,13 @@ impl Scheduler {
     }
 
     async fn start_all(&self, server: &str) -> Result<(), StartError> {
-        while let Some(job) = self.0.store.head_of_queue().await?
-            && let Some(running) = self.reserve(&job)
-        {
+        while let Some(job) = self.0.store.head_of_queue().await? {
+            if let Err(unreadable) = job.spec.decode() {
+                tracing::error!(job = %job.id, reason = %unreadable, "the job cannot be started");
+                self.0.store.fail_queued_job(&job, &unreadable.to_string(), self.0.clock.now()).await?;
+                continue;
+            }
+            let Some(running) = self.reserve(&job) else { break };
             let begun = self.begin(&job).await;
             let Ok(Some((lease, token))) = begun else {
                 // Cancelled or paused in the meantime, or an error.

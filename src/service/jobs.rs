@@ -11,7 +11,7 @@ use crate::invalid::Invalid;
 use crate::jobs::spec::JobRequest;
 use crate::serving::Owner;
 use crate::store::{
-    ActionResult, Attempt, Checkpoint, Job, JobAction, JobFilter, JobId, JobState, JobSummary, MetricCursor, MetricRow, NewJob,
+    ActionResult, Attempt, Checkpoint, Job, JobAction, JobFilter, JobId, JobState, MetricCursor, MetricRow, NewJob,
     PendingAction, SubmitResult, is_metric_name,
 };
 
@@ -48,7 +48,7 @@ pub async fn submit(
     let new = NewJob { id, owner, any_name, spec, now: app.clock.now(), idempotency };
     match app.store.submit_job(new).await? {
         SubmitResult::Created(job) => {
-            tracing::info!(job = %job.id, algorithm = ?job.spec.config.algorithm, threads = job.spec.threads, "job submitted");
+            tracing::info!(job = %job.id, algorithm = job.spec.algorithm, threads = job.spec.threads, "job submitted");
             metrics::counter!("qedgix_jobs_submitted_total").increment(1);
             app.scheduler.job_changed(job.row_id);
             Ok((job, true))
@@ -78,10 +78,10 @@ pub async fn get(app: &App, caller: &Caller, id: &str) -> Result<Job, Error> {
 ///
 /// # Errors
 /// [`Error::Invalid`]: the page size is over 1000, or the token is invalid.
-pub async fn list(app: &App, caller: &Caller, state: Option<JobState>, page: &PageRequest) -> Result<Page<JobSummary>, Error> {
+pub async fn list(app: &App, caller: &Caller, state: Option<JobState>, page: &PageRequest) -> Result<Page<Job>, Error> {
     let (limit, before) = (page.usual_limit()?, page.parse_token(parse_number)?);
     let filter = JobFilter { owner: caller.sees().and_then(Owner::id), state, before };
-    let (jobs, more) = app.store.job_summaries(filter, limit, paging::MAX_BYTES).await?;
+    let (jobs, more) = app.store.jobs(filter, limit, paging::MAX_BYTES).await?;
     Ok(Page::new(jobs, more, |job| job.row_id.to_string()))
 }
 

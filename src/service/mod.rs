@@ -1,6 +1,7 @@
 //! Use cases: one function each, with one error type. Both transports call only this layer.
 
 pub mod act;
+pub mod backup;
 pub mod checkpoints;
 pub mod environments;
 mod error;

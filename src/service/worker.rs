@@ -81,7 +81,7 @@ pub async fn fetch(app: &App, lease: Lease) -> Result<AttemptTask, Error> {
     let config = app.scheduler.config();
     Ok(AttemptTask {
         threads: job.spec.threads.min(config.cpu_budget),
-        config: job.spec.config,
+        config: job.spec.decode().map_err(Error::internal)?.config,
         snapshot: app.store.snapshot(lease.job_id).await?,
         snapshot_every: config.snapshot_every,
     })

@@ -244,7 +244,10 @@ impl Store {
         let rows: Vec<(String, i64, i64)> = sqlx::query_as(sql).fetch_all(&mut *tx).await?;
         let mut jobs = Vec::with_capacity(rows.len());
         for (id, job, attempt) in rows {
-            let id = JobId::parse(&id).ok_or_else(|| corrupt("job", &id, "not an id"))?;
+            let Some(id) = JobId::parse(&id) else {
+                tracing::error!(job = id, "a job has no valid id, so it is left as it is");
+                continue;
+            };
             let lease = Lease { job_id: id, job_row: job, attempt: attempt as u32 };
             // A stopped attempt is not a failure, so the limit has no effect.
             let ended = EndedAttempt { lease, result: &WorkerResult::Stopped, publish: None, max_attempts: u32::MAX, now };

@@ -86,8 +86,9 @@ impl TryFrom<CheckpointRow> for Checkpoint {
             step: row.step as u64,
             sha256: row.sha256,
             size: row.size as u64,
-            metrics: serde_json::from_str(&row.metrics).map_err(|e| corrupt("checkpoint", &row.id, e))?,
-            config: serde_json::from_str(&row.config).map_err(|e| corrupt("checkpoint", &row.id, e))?,
+            // Documents of other versions are shown as they are, as far as this is possible.
+            metrics: serde_json::from_str(&row.metrics).unwrap_or_default(),
+            config: serde_json::from_str(&row.config).unwrap_or(serde_json::Value::String(row.config)),
             created_at: timestamp(row.created_at)?,
         })
     }
@@ -125,7 +126,7 @@ impl Store {
         }
         let id = Uuid::now_v7();
         let sql = "REPLACE INTO checkpoints (id, job, kind, attempt, step, sha256, config, metrics, created_at, size, bytes)
-                   SELECT ?, number, ?, ?, ?, ?, spec -> '$.config', ?, ?, ?, ? FROM jobs WHERE number = ?";
+                   SELECT ?, number, ?, ?, ?, ?, CASE WHEN json_valid(spec) THEN spec -> '$.config' ELSE spec END, ?, ?, ?, ? FROM jobs WHERE number = ?";
         sqlx::query(sql)
             .bind(id.to_string())
             .bind(new.kind.as_str())
@@ -150,7 +151,9 @@ impl Store {
     pub async fn checkpoints(&self, job: JobId) -> Result<Vec<Checkpoint>> {
         let rows: Vec<CheckpointRow> =
             sqlx::query_as(SELECT).bind(job.to_string()).bind(None::<String>).bind(None::<String>).fetch_all(&self.read).await?;
-        rows.into_iter().map(Checkpoint::try_from).collect()
+        let read =
+            |row| Checkpoint::try_from(row).inspect_err(|error| tracing::error!(%error, "a checkpoint is left out of a list"));
+        Ok(rows.into_iter().filter_map(|row| read(row).ok()).collect())
     }
 
     /// Bytes of a job's best checkpoint, or else of its last.

@@ -1,18 +1,16 @@
 //! Jobs: their specifications, their states, and the rules by which states change.
 
-use std::collections::BTreeMap;
 use std::fmt;
 
 use futures::TryStreamExt;
 use jiff::Timestamp;
-use serde::de::DeserializeOwned;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use sqlx::SqliteConnection;
 use uuid::Uuid;
 
 use super::named_enum::named_enum;
+use super::specs::{JobSpec, StoredSpec};
 use super::{Error, Result, Store, corrupt, timestamp};
-use crate::train_config::{Algorithm, Preset, TrainConfig};
 
 /// Identifies a job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
@@ -80,71 +78,9 @@ named_enum! {
     }
 }
 
-/// The specification of a job, with all defaults filled in.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct JobSpec {
-    /// What the job does.
-    pub kind: JobKind,
-    /// Display name, and name of the policy that the job publishes.
-    pub name: Option<String>,
-    /// Labels, which the server does not interpret.
-    pub labels: BTreeMap<String, String>,
-    /// Threads that the worker may use.
-    pub threads: usize,
-    /// Jobs with a higher priority start first.
-    pub priority: i64,
-    /// The complete training configuration.
-    pub config: TrainConfig,
-}
-
-/// The part of a [`JobSpec`] that lists return: all but the environment and the training configuration, which may be large.
-// `Store::job_summaries` reads it from a JSON array in the order of the fields.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct SpecSummary {
-    /// As in [`JobSpec`].
-    pub kind: JobKind,
-    /// As in [`JobSpec`].
-    pub name: Option<String>,
-    /// As in [`JobSpec`].
-    pub labels: BTreeMap<String, String>,
-    /// As in [`JobSpec`].
-    pub threads: usize,
-    /// As in [`JobSpec`].
-    pub priority: i64,
-    /// As in [`TrainConfig`].
-    pub algorithm: Algorithm,
-    /// As in [`TrainConfig`].
-    pub preset: Preset,
-    /// As in [`TrainConfig`].
-    pub seed: u64,
-    /// Environment steps of the training. Not a field of job documents.
-    #[serde(skip_serializing)]
-    pub steps: u64,
-}
-
-impl From<&JobSpec> for SpecSummary {
-    fn from(spec: &JobSpec) -> Self {
-        let JobSpec { kind, name, labels, threads, priority, config } = spec;
-        Self {
-            kind: *kind,
-            name: name.clone(),
-            labels: labels.clone(),
-            threads: *threads,
-            priority: *priority,
-            algorithm: config.algorithm,
-            preset: config.preset,
-            seed: config.seed,
-            steps: config.training.steps,
-        }
-    }
-}
-
-/// A job as returned by lists.
-pub type JobSummary = Job<SpecSummary>;
-
 /// The current record of a job.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Job<S = JobSpec> {
+pub struct Job {
     /// The id.
     pub id: JobId,
     /// Key of the row. Jobs submitted later have larger keys.
@@ -160,7 +96,7 @@ pub struct Job<S = JobSpec> {
     /// Why the job, or its last attempt, failed.
     pub reason: Option<String>,
     /// The specification.
-    pub spec: S,
+    pub spec: StoredSpec,
     /// Number of attempts that have begun.
     pub attempts: u32,
     /// Number of attempts that have failed.
@@ -181,36 +117,6 @@ pub struct Job<S = JobSpec> {
     pub ended_at: Option<Timestamp>,
 }
 
-impl Job {
-    /// The job as returned by lists, and the configuration that lists omit.
-    pub fn split(self) -> (JobSummary, TrainConfig) {
-        let spec = SpecSummary::from(&self.spec);
-        let Self { spec: JobSpec { config, .. }, id, row_id, owner, any_name, state, pending_action, reason, .. } = self;
-        let Self { attempts, failures, consecutive_failures, step, policy, .. } = self;
-        let Self { last_event, created_at, started_at, ended_at, .. } = self;
-        let summary = Job {
-            id,
-            row_id,
-            owner,
-            any_name,
-            state,
-            pending_action,
-            reason,
-            spec,
-            attempts,
-            failures,
-            consecutive_failures,
-            step,
-            policy,
-            last_event,
-            created_at,
-            started_at,
-            ended_at,
-        };
-        (summary, config)
-    }
-}
-
 from_row! {
     struct JobRow {
         number: i64,
@@ -222,6 +128,15 @@ from_row! {
         wanted: Option<String>,
         reason: Option<String>,
         spec: String,
+        kind: Option<String>,
+        name: Option<String>,
+        labels: Option<String>,
+        threads: i64,
+        priority: i64,
+        algorithm: Option<String>,
+        preset: Option<String>,
+        seed: Option<String>,
+        steps: Option<i64>,
         attempts: i64,
         failures: i64,
         consecutive_failures: i64,
@@ -234,7 +149,7 @@ from_row! {
     }
 }
 
-impl<S: DeserializeOwned> TryFrom<JobRow> for Job<S> {
+impl TryFrom<JobRow> for Job {
     type Error = Error;
 
     fn try_from(row: JobRow) -> Result<Self> {
@@ -246,7 +161,18 @@ impl<S: DeserializeOwned> TryFrom<JobRow> for Job<S> {
             state: JobState::from_column(&row.state)?,
             pending_action: row.wanted.as_deref().map(PendingAction::from_column).transpose()?,
             reason: row.reason,
-            spec: serde_json::from_str(&row.spec).map_err(|e| corrupt("job", &row.id, e))?,
+            spec: StoredSpec {
+                kind: row.kind,
+                name: row.name,
+                labels: row.labels.and_then(|labels| serde_json::from_str(&labels).ok()).unwrap_or_default(),
+                threads: row.threads as usize,
+                priority: row.priority,
+                algorithm: row.algorithm,
+                preset: row.preset,
+                seed: row.seed.and_then(|seed| seed.parse().ok()),
+                steps: row.steps.unwrap_or_default() as u64,
+                document: row.spec,
+            },
             attempts: row.attempts as u32,
             failures: row.failures as u32,
             consecutive_failures: row.consecutive_failures as u32,
@@ -403,39 +329,42 @@ impl Store {
         find(&mut *self.read.acquire().await?, id).await
     }
 
-    /// Summaries of jobs, newest first, and whether there are more. At most `limit` summaries of together about `max_bytes`
+    /// Jobs, newest first, and whether there are more. At most `limit` jobs whose summaries have together about `max_bytes`
     /// bytes, but at least one.
     ///
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
-    pub async fn job_summaries(&self, filter: JobFilter<'_>, limit: usize, max_bytes: usize) -> Result<(Vec<JobSummary>, bool)> {
+    pub async fn jobs(&self, filter: JobFilter<'_>, limit: usize, max_bytes: usize) -> Result<(Vec<Job>, bool)> {
         /// Bytes of a summary besides its texts.
         const FIXED: usize = 512;
         /// SQL of the jobs with a condition on the owner.
-        macro_rules! summaries {
+        macro_rules! jobs {
             ($owner:literal) => {
                 concat!(
-                    "SELECT number, id, owner, any_name, state, wanted, reason, attempts, failures, consecutive_failures, step, policy,
-                     seq, created_at, started_at, ended_at,
-                     json_extract(spec, '$.kind', '$.name', '$.labels', '$.threads', '$.priority', '$.config.algorithm',
-                     '$.config.preset', '$.config.seed', '$.config.training.steps') AS spec
-                     FROM jobs WHERE (?1 IS NULL OR state = ?1) AND (?2 IS NULL OR number < ?2)",
+                    "SELECT * FROM jobs WHERE (?1 IS NULL OR state = ?1) AND (?2 IS NULL OR number < ?2)",
                     $owner,
                     " ORDER BY number DESC"
                 )
             };
         }
         let JobFilter { owner, state, before } = filter;
-        let sql = if owner.is_some() { summaries!(" AND owner = ?3") } else { summaries!("") };
+        let sql = if owner.is_some() { jobs!(" AND owner = ?3") } else { jobs!("") };
         let query = sqlx::query_as(sql).bind(state.map(JobState::as_str)).bind(before).bind(owner);
         let (mut rows, mut jobs, mut bytes) = (query.fetch(&self.read), Vec::new(), 0);
         while let Some(row) = rows.try_next().await? {
             let row: JobRow = row;
-            bytes += FIXED + row.spec.len() + row.reason.as_ref().map_or(0, String::len);
+            let job = match Job::try_from(row) {
+                Ok(job) => job,
+                Err(error) => {
+                    tracing::error!(%error, "a job is left out of a list");
+                    continue;
+                }
+            };
+            bytes += FIXED + job.spec.shown_bytes() + job.reason.as_ref().map_or(0, String::len);
             if jobs.len() == limit || (bytes > max_bytes && !jobs.is_empty()) {
                 return Ok((jobs, true));
             }
-            jobs.push(row.try_into()?);
+            jobs.push(job);
         }
         Ok((jobs, false))
     }
@@ -459,6 +388,24 @@ impl Store {
         let sql = "SELECT * FROM jobs WHERE state = 'queued' ORDER BY priority DESC, number LIMIT 1";
         let row: Option<JobRow> = sqlx::query_as(sql).fetch_optional(&self.read).await?;
         row.map(Job::try_from).transpose()
+    }
+
+    /// Ends a queued job that cannot be started. Returns whether it was queued.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn fail_queued_job(&self, job: &Job, reason: &str, now: Timestamp) -> Result<bool> {
+        let mut tx = self.begin().await?;
+        let queued = find(&mut tx, job.id).await?.is_some_and(|job| job.state == JobState::Queued);
+        if queued {
+            let (to, attempt, reason) = (JobState::Failed, job.attempts, Some(reason));
+            transition(&mut tx, Transition { job: job.row_id, to, attempt, reason, now }).await?;
+            tx.commit().await?;
+            self.notify(job.row_id);
+        } else {
+            tx.abandon().await?;
+        }
+        Ok(queued)
     }
 
     /// Applies `action` if the state of the job allows it. A running job gets a pending action and changes when its worker
@@ -514,16 +461,26 @@ impl Store {
 async fn insert(tx: &mut SqliteConnection, new: &NewJob) -> Result<Job> {
     let spec = serde_json::to_string(&new.spec).map_err(|e| corrupt("job", new.id, e))?;
     let now = new.now.as_millisecond();
-    let sql = "INSERT INTO jobs (id, owner, any_name, state, spec, threads, priority, created_at)
-               VALUES (?, ?, ?, 'queued', ?, ?, ?, ?)";
+    let NewJob { id, owner, any_name, spec: JobSpec { kind, name, labels, threads, priority, config }, .. } = new;
+    let labels = serde_json::to_string(labels).map_err(|e| corrupt("job", id, e))?;
+    let sql = "INSERT INTO jobs
+               (id, owner, any_name, state, spec, threads, priority, created_at, kind, name, labels, algorithm, preset, seed, steps)
+               VALUES (?, ?, ?, 'queued', ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)";
     let row_id = sqlx::query(sql)
-        .bind(new.id.to_string())
-        .bind(&new.owner)
-        .bind(new.any_name)
+        .bind(id.to_string())
+        .bind(owner)
+        .bind(any_name)
         .bind(spec)
-        .bind(new.spec.threads as i64)
-        .bind(new.spec.priority)
+        .bind(*threads as i64)
+        .bind(priority)
         .bind(now)
+        .bind(kind.as_str())
+        .bind(name)
+        .bind(labels)
+        .bind(text_of(&config.algorithm))
+        .bind(text_of(&config.preset))
+        .bind(config.seed.to_string())
+        .bind(config.training.steps as i64)
         .execute(&mut *tx)
         .await?
         .last_insert_rowid();
@@ -533,6 +490,11 @@ async fn insert(tx: &mut SqliteConnection, new: &NewJob) -> Result<Job> {
         sqlx::query(sql).bind(new.owner()).bind(key).bind(body.as_slice()).bind(row_id).bind(now).execute(&mut *tx).await?;
     }
     get_existing(tx, new.id).await
+}
+
+/// The name of a value in documents.
+fn text_of(value: &impl Serialize) -> Option<String> {
+    serde_json::to_value(value).ok()?.as_str().map(str::to_owned)
 }
 
 async fn transition_now(tx: &mut SqliteConnection, job: &Job, to: JobState, now: Timestamp) -> Result<()> {

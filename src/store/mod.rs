@@ -19,6 +19,7 @@ macro_rules! from_row {
 
 mod aliases;
 mod attempts;
+mod backup;
 mod checkpoints;
 mod events;
 mod jobs;
@@ -27,21 +28,21 @@ mod metrics;
 mod named_enum;
 mod policies;
 mod snapshots;
+mod specs;
 mod upkeep;
 mod writes;
 
 pub use aliases::{AliasHistoryEntry, AliasHistoryFilter, AliasMove, PolicyAlias};
 pub use attempts::{Attempt, AttemptOutcome, EndedAttempt, Lease, LeaseRecord, WorkerResult};
+pub use backup::{BackupError, backup, restore};
 pub use checkpoints::{Checkpoint, CheckpointKind, NewCheckpoint};
 pub use events::{JobEvent, JobEventKind};
-pub use jobs::{
-    ActionResult, Job, JobAction, JobFilter, JobId, JobKind, JobSpec, JobState, JobSummary, NewJob, PendingAction, SpecSummary,
-    SubmitResult,
-};
+pub use jobs::{ActionResult, Job, JobAction, JobFilter, JobId, JobKind, JobState, NewJob, PendingAction, SubmitResult};
 pub use keys::KeyRecord;
 pub use metrics::{Metric, MetricCursor, MetricRow, is_metric_name};
 pub use policies::{NewPolicyVersion, PolicyVersion, PublishedPolicy};
 pub use snapshots::{PartialSnapshot, Snapshot};
+pub use specs::{JobSpec, StoredSpec, UnreadableSpec};
 pub use writes::WriteFailure;
 
 use std::path::{Path, PathBuf};
@@ -49,7 +50,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use sqlx::migrate::{Migration, MigrationType, Migrator};
+use sqlx::migrate::{MigrateError, Migration, MigrationType, Migrator};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
 use sqlx::{Connection, SqlSafeStr, SqliteConnection, SqlitePool};
 
@@ -66,6 +67,7 @@ const MIGRATIONS: &[(&str, &str)] = &migrations![
     "0003_promotions.sql",
     "0004_events.sql",
     "0005_api_keys.sql",
+    "0006_job_specifications.sql",
     "0008_owners.sql",
     "0009_consecutive_failures.sql",
 ];
@@ -87,9 +89,21 @@ pub enum Error {
     /// The database cannot be written at present, so nothing was tried.
     #[error("{}; nothing was stored", .0.reason())]
     Write(WriteFailure),
-    /// The file cannot be migrated, for example because a newer version has written it.
+    /// A newer version of the program has written the database.
+    #[error(
+        "qedgix {written_by} has written this database (migration {migration}), and this program is qedgix {}: start the newer \
+         program, or restore a backup that this one has made (qedgix restore)",
+        env!("CARGO_PKG_VERSION")
+    )]
+    Newer {
+        /// The newest migration in the database.
+        migration: i64,
+        /// The version that wrote the database last.
+        written_by: String,
+    },
+    /// The file cannot be migrated.
     #[error("database migration: {0}")]
-    Migrate(#[from] sqlx::migrate::MigrateError),
+    Migrate(#[from] MigrateError),
     /// A stored record cannot be parsed.
     #[error("database holds an unreadable {what}: {reason}")]
     Corrupt {
@@ -106,7 +120,8 @@ impl Error {
         match self {
             Self::Write(failure) => Some(*failure),
             Self::Sqlx(error) => WriteFailure::of(error),
-            Self::Migrate(_) | Self::Corrupt { .. } => None,
+            Self::Migrate(MigrateError::Execute(error) | MigrateError::ExecuteMigration(error, _)) => WriteFailure::of(error),
+            Self::Migrate(_) | Self::Newer { .. } | Self::Corrupt { .. } => None,
         }
     }
 }
@@ -126,7 +141,7 @@ impl Store {
     /// Opens the database in the existing directory `data_dir`. Creates and migrates it when needed.
     ///
     /// # Errors
-    /// [`Error::Sqlx`] when the file cannot be opened; [`Error::Migrate`] when a newer version has migrated it.
+    /// [`Error::Sqlx`] when the file cannot be opened; [`Error::Newer`] when a newer version has written it.
     pub async fn open(data_dir: &Path) -> Result<Self, Error> {
         let path = data_dir.join(FILE);
         let options = SqliteConnectOptions::new()
@@ -143,7 +158,9 @@ impl Store {
         let pool = SqlitePoolOptions::new().acquire_timeout(ACQUIRE_TIMEOUT).idle_timeout(None).max_lifetime(None);
         let write = pool.clone().max_connections(1).after_release(|connection, _| Box::pin(writes::is_reusable(connection)));
         let write = write.connect_with(options.clone()).await?;
+        check_version(&mut *write.acquire().await?).await?;
         migrator().run(&write).await?;
+        record_version(&mut *write.acquire().await?).await?;
         let read = pool.max_connections(4).min_connections(1).connect_with(options.read_only(true)).await?;
         let condition = Arc::new(writes::Condition::of(&path));
         Ok(Self { read, write, condition, notifier: Arc::new(events::Notifier::new()) })
@@ -155,6 +172,39 @@ fn with_suffix(database: &Path, suffix: &str) -> PathBuf {
     let mut name = database.as_os_str().to_owned();
     name.push(suffix);
     name.into()
+}
+
+/// Checks that no newer version has written the database.
+async fn check_version(database: &mut SqliteConnection) -> Result<()> {
+    if !has_table(database, "_sqlx_migrations").await? {
+        return Ok(());
+    }
+    let sql = "SELECT version FROM _sqlx_migrations ORDER BY version DESC";
+    let versions: Vec<i64> = sqlx::query_scalar(sql).fetch_all(&mut *database).await?;
+    let known = migrator();
+    let Some(migration) = versions.into_iter().find(|version| !known.version_exists(*version)) else { return Ok(()) };
+    let written_by = if has_table(database, "written_by").await? { written_by(database).await? } else { None };
+    Err(Error::Newer { migration, written_by: written_by.unwrap_or_else(|| "of an unknown version".into()) })
+}
+
+async fn has_table(database: &mut SqliteConnection, name: &str) -> Result<bool> {
+    let sql = "SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = ?";
+    Ok(sqlx::query(sql).bind(name).fetch_optional(database).await?.is_some())
+}
+
+/// The version of the program that wrote the database last.
+async fn written_by(database: &mut SqliteConnection) -> Result<Option<String>> {
+    Ok(sqlx::query_scalar("SELECT version FROM written_by").fetch_optional(database).await?)
+}
+
+/// Records that this version writes the database.
+async fn record_version(database: &mut SqliteConnection) -> Result<()> {
+    let version = env!("CARGO_PKG_VERSION");
+    if written_by(database).await?.as_deref() != Some(version) {
+        let sql = "REPLACE INTO written_by (id, version) VALUES (1, ?)";
+        sqlx::query(sql).bind(version).execute(database).await?;
+    }
+    Ok(())
 }
 
 fn migrator() -> Migrator {
@@ -174,15 +224,25 @@ fn corrupt(what: &str, id: impl std::fmt::Display, reason: impl std::fmt::Displa
     Error::Corrupt { what: format!("{what} {id}"), reason: reason.to_string() }
 }
 
+/// A stored time. One that cannot be represented becomes the nearest one, so that it affects no other row.
 fn timestamp(milliseconds: i64) -> Result<Timestamp> {
-    Timestamp::from_millisecond(milliseconds).map_err(|e| corrupt("time", milliseconds, e))
+    let nearest = if milliseconds < 0 { Timestamp::MIN } else { Timestamp::MAX };
+    Timestamp::from_millisecond(milliseconds).or(Ok(nearest))
 }
 
 #[cfg(test)]
 mod tests {
-    use std::path::{Path, PathBuf};
+    use std::path::Path;
 
     use sqlx::migrate::Migrator;
+    use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
+    use sqlx::{ConnectOptions, Connection};
+
+    use super::{Error, FILE, JobFilter, Store};
+
+    async fn raw(dir: &Path) -> SqliteConnection {
+        SqliteConnectOptions::new().filename(dir.join(FILE)).create_if_missing(true).connect().await.unwrap()
+    }
 
     #[tokio::test]
     async fn every_migration_of_the_folder_is_embedded() {
@@ -193,5 +253,49 @@ mod tests {
             all.collect::<Vec<_>>()
         };
         assert_eq!(read(&super::migrator()), read(&Migrator::new(folder).await.unwrap()));
+    }
+
+    #[tokio::test]
+    async fn columns_of_old_jobs_are_filled_where_their_documents_are_readable() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut old = raw(dir.path()).await;
+        let before = super::migrator().iter().filter(|migration| migration.version < 6).cloned().collect();
+        Migrator::with_migrations(before).run(&mut old).await.unwrap();
+        let documents = [
+            r#"{"kind": "train", "name": "n", "labels": {"a": "b"}, "config": {"algorithm": "vdn", "preset": "practical",
+                "seed": 18446744073709551615, "training": {"steps": 7}}}"#,
+            r#"{"kind": 3, "config": {"training": {"steps": "many"}, "seed": []}}"#,
+            "no JSON",
+        ];
+        for (i, document) in documents.into_iter().enumerate() {
+            let sql = "INSERT INTO jobs (id, state, spec, threads, priority, created_at) VALUES (?, 'queued', ?, 1, 0, 0)";
+            let id = uuid::Uuid::from_u128(i as u128).to_string();
+            sqlx::query(sql).bind(id).bind(document).execute(&mut old).await.unwrap();
+        }
+        old.close().await.unwrap();
+
+        let store = Store::open(dir.path()).await.unwrap();
+        let (jobs, _) = store.jobs(JobFilter::default(), 10, usize::MAX).await.unwrap();
+        let specs: Vec<_> = jobs.into_iter().rev().map(|job| job.spec).collect();
+        assert_eq!((specs[0].seed, specs[0].steps, specs[0].labels["a"].as_str()), (Some(u64::MAX), 7, "b"));
+        assert_eq!((specs[0].algorithm.as_deref(), specs[0].name.as_deref()), (Some("vdn"), Some("n")));
+        assert_eq!((specs[1].seed, specs[1].steps, specs[1].kind.as_deref()), (None, 0, Some("3")));
+        assert_eq!((specs[2].kind.as_deref(), specs[2].document.as_str()), (None, "no JSON"));
+        assert!(specs.iter().all(|spec| spec.decode().is_err()));
+    }
+
+    #[tokio::test]
+    async fn a_database_of_a_newer_version_is_refused_by_name() {
+        let dir = tempfile::tempdir().unwrap();
+        Store::open(dir.path()).await.unwrap().close().await;
+        let mut database = raw(dir.path()).await;
+        let sql = "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
+                   VALUES (9999, 'later', TRUE, x'00', 0)";
+        sqlx::query(sql).execute(&mut database).await.unwrap();
+        sqlx::query("UPDATE written_by SET version = '99.1.0'").execute(&mut database).await.unwrap();
+        database.close().await.unwrap();
+        let refused = Store::open(dir.path()).await.unwrap_err();
+        let Error::Newer { migration, written_by } = refused else { panic!("{refused}") };
+        assert_eq!((migration, written_by.as_str()), (9999, "99.1.0"));
     }
 }

@@ -9,3 +9,4 @@ mod protocol;
 mod publishing;
 mod scheduling;
 mod submission;
+mod unreadable;

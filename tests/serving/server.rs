@@ -95,6 +95,15 @@ async fn a_data_directory_is_locked_by_one_server() {
     assert!(second.to_string().contains("--data-dir"), "{second}");
     let file = server.dir.path().join("lock");
     assert!(matches!(DataDir::lock(&file), Err(server::Error::File { .. })), "a file is not a directory");
+    // Neither a deleted lock file nor another path of the directory lets a second server in.
+    std::fs::remove_file(&file).unwrap();
+    let link = tempfile::tempdir().unwrap().path().join("link");
+    std::fs::create_dir_all(link.parent().unwrap()).unwrap();
+    std::os::unix::fs::symlink(server.dir.path(), &link).unwrap();
+    for path in [server.dir.path(), &link] {
+        assert!(matches!(DataDir::lock(path), Err(server::Error::InUse(_))), "{}", path.display());
+    }
+    std::fs::remove_dir_all(link.parent().unwrap()).unwrap();
 }
 
 #[test]

@@ -1,13 +1,13 @@
 //! Messages of `JobService` and `WorkerService`.
 
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::response::timestamp;
 use super::structs::to_struct;
 use crate::invalid::Invalid;
 use crate::jobs::Directive;
 use crate::store::{
-    CheckpointKind, Job, JobEvent, JobEventKind, JobState, JobSummary, Metric, MetricRow, NewCheckpoint, WorkerResult,
+    CheckpointKind, Job, JobEvent, JobEventKind, JobState, Metric, MetricRow, NewCheckpoint, StoredSpec, WorkerResult,
 };
 use crate::train_config::TrainConfig;
 use crate::wire::v1;
@@ -42,36 +42,51 @@ pub fn state_filter(state: i32) -> Result<Option<JobState>, Invalid> {
     }))
 }
 
-impl From<JobSummary> for v1::Job {
-    fn from(job: JobSummary) -> Self {
-        let spec = serde_json::to_value(&job.spec).expect("a specification is plain data");
-        Self {
-            id: job.id.to_string(),
-            state: v1::JobState::from(job.state).into(),
-            reason: job.reason.unwrap_or_default(),
-            spec: to_struct(&spec),
-            step: job.step,
-            steps: job.spec.steps,
-            attempts: job.attempts,
-            failures: job.failures,
-            wanted: job.pending_action.map(|action| action.to_string()).unwrap_or_default(),
-            policy: job.policy.unwrap_or_default(),
-            created_at: Some(timestamp(job.created_at)),
-            started_at: job.started_at.map(timestamp),
-            ended_at: job.ended_at.map(timestamp),
-            last_event_id: job.last_event,
-            owner: job.owner.unwrap_or_default(),
-        }
-    }
+/// A job as `ListJobs` returns it: without environment and training configuration.
+pub fn job_summary(job: Job) -> v1::Job {
+    job_message(job, |_| json!({}))
 }
 
 impl From<Job> for v1::Job {
     fn from(job: Job) -> Self {
-        let (summary, TrainConfig { environment, training, .. }) = job.split();
-        let configuration = json!({"environment": environment, "training": training});
-        let mut job = Self::from(summary);
-        job.spec.get_or_insert_default().fields.extend(to_struct(&configuration).unwrap_or_default().fields);
-        job
+        job_message(job, |TrainConfig { environment, training, .. }| json!({"environment": environment, "training": training}))
+    }
+}
+
+/// The message of a job, whose `spec` also has the fields that `details` selects.
+fn job_message(job: Job, details: impl Fn(&TrainConfig) -> Value) -> v1::Job {
+    let decoded = job.spec.decode();
+    let StoredSpec { kind, name, labels, threads, priority, algorithm, preset, seed, steps, document } = job.spec;
+    let mut spec = json!({
+        "kind": kind, "name": name, "labels": labels, "threads": threads, "priority": priority, "algorithm": algorithm,
+        "preset": preset, "seed": seed,
+    });
+    let unreadable = match decoded {
+        Ok(decoded) => {
+            if let (Value::Object(all), Value::Object(more)) = (&mut spec, details(&decoded.config)) {
+                all.extend(more);
+            }
+            None
+        }
+        Err(reason) => Some(v1::UnreadableSpec { reason: reason.to_string(), document }),
+    };
+    v1::Job {
+        id: job.id.to_string(),
+        state: v1::JobState::from(job.state).into(),
+        reason: job.reason.unwrap_or_default(),
+        spec: to_struct(&spec),
+        step: job.step,
+        steps,
+        attempts: job.attempts,
+        failures: job.failures,
+        wanted: job.pending_action.map(|action| action.to_string()).unwrap_or_default(),
+        policy: job.policy.unwrap_or_default(),
+        created_at: Some(timestamp(job.created_at)),
+        started_at: job.started_at.map(timestamp),
+        ended_at: job.ended_at.map(timestamp),
+        last_event_id: job.last_event,
+        owner: job.owner.unwrap_or_default(),
+        unreadable,
     }
 }
 

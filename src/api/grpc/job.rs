@@ -8,7 +8,7 @@ use tonic::{Request, Response, Status};
 
 use super::GrpcResult;
 use crate::api::auth::caller;
-use crate::api::convert::jobs::state_filter;
+use crate::api::convert::jobs::{job_summary, state_filter};
 use crate::api::convert::structs::from_struct;
 use crate::api::errors::stream_status;
 use crate::jobs::spec::JobRequest;
@@ -58,7 +58,7 @@ impl JobService for Service {
         let v1::ListJobsRequest { state, page_size, page_token } = request.into_inner();
         let state = state_filter(state).map_err(Error::from)?;
         let page =
-            jobs::list(&self.0, &caller, state, &PageRequest { size: page_size, token: page_token }).await?.map(Into::into);
+            jobs::list(&self.0, &caller, state, &PageRequest { size: page_size, token: page_token }).await?.map(job_summary);
         Ok(Response::new(v1::ListJobsResponse { jobs: page.items, next_page_token: page.next_token }))
     }
 

@@ -14,7 +14,7 @@ use crate::api::rest::config_schemas::{partial_training, schema};
 use crate::api::rest::json;
 use crate::env::EnvConfig;
 use crate::jobs::spec;
-use crate::store::{self, AttemptOutcome, CheckpointKind, JobId, JobKind, JobState, PendingAction, SpecSummary};
+use crate::store::{self, AttemptOutcome, CheckpointKind, JobId, JobKind, JobState, PendingAction, StoredSpec};
 use crate::train_config::{Algorithm, Preset, Training};
 
 /// A job to submit. All fields are optional.
@@ -61,10 +61,6 @@ impl From<JobRequest> for spec::JobRequest {
 }
 
 /// The only kind of jobs that this version runs.
-fn kind() -> RefOr<Schema> {
-    schema(json!({"type": "string", "enum": [JobKind::Train]}))
-}
-
 fn optional_kind() -> RefOr<Schema> {
     schema(json!({"type": ["string", "null"], "enum": [JobKind::Train, null]}))
 }
@@ -106,16 +102,32 @@ pub(super) struct JobSummary {
     started_at: Option<Timestamp>,
     #[schema(required = true)]
     ended_at: Option<Timestamp>,
-    #[schema(schema_with = kind)]
-    kind: JobKind,
+    #[schema(schema_with = optional_kind)]
+    kind: Option<String>,
     #[schema(required = true)]
     name: Option<String>,
     labels: BTreeMap<String, String>,
     threads: usize,
     priority: i64,
-    algorithm: Algorithm,
-    preset: Preset,
-    seed: u64,
+    /// Null, like `kind`, `preset` and `seed`, only if the specification is unreadable.
+    #[schema(value_type = Option<Algorithm>, required = true)]
+    algorithm: Option<String>,
+    #[schema(value_type = Option<Preset>, required = true)]
+    preset: Option<String>,
+    #[schema(required = true)]
+    seed: Option<u64>,
+    /// Null, unless this version of the server cannot read the specification.
+    #[schema(required = true)]
+    unreadable: Option<UnreadableSpec>,
+}
+
+/// A specification that this version of the server cannot read, because another version has written it.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct UnreadableSpec {
+    /// Why: the first field that is unknown or malformed.
+    reason: String,
+    /// The specification as stored.
+    document: String,
 }
 
 #[derive(Debug, Serialize, ToSchema)]
@@ -131,14 +143,29 @@ struct Progress {
 pub(super) struct Job {
     #[serde(flatten)]
     summary: JobSummary,
-    environment: EnvConfig,
-    training: Training,
+    /// Null, like `training`, only if the specification is unreadable.
+    #[schema(required = true)]
+    environment: Option<EnvConfig>,
+    #[schema(required = true)]
+    training: Option<Training>,
 }
 
-impl From<store::JobSummary> for JobSummary {
-    fn from(job: store::JobSummary) -> Self {
-        let SpecSummary { kind, name, labels, threads, priority, algorithm, preset, seed, steps } = job.spec;
-        Self {
+impl From<store::Job> for JobSummary {
+    fn from(job: store::Job) -> Self {
+        Job::from(job).summary
+    }
+}
+
+impl From<store::Job> for Job {
+    fn from(job: store::Job) -> Self {
+        let decoded = job.spec.decode();
+        let StoredSpec { kind, name, labels, threads, priority, algorithm, preset, seed, steps, document } = job.spec;
+        let (config, unreadable) = match decoded {
+            Ok(spec) => (Some(spec.config), None),
+            Err(reason) => (None, Some(UnreadableSpec { reason: reason.to_string(), document })),
+        };
+        let (environment, training) = config.map(|config| (config.environment, config.training)).unzip();
+        let summary = JobSummary {
             id: job.id,
             owner: job.owner,
             state: job.state,
@@ -160,14 +187,9 @@ impl From<store::JobSummary> for JobSummary {
             algorithm,
             preset,
             seed,
-        }
-    }
-}
-
-impl From<store::Job> for Job {
-    fn from(job: store::Job) -> Self {
-        let (summary, config) = job.split();
-        Self { summary: summary.into(), environment: config.environment, training: config.training }
+            unreadable,
+        };
+        Self { summary, environment, training }
     }
 }
 
