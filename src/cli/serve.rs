@@ -8,10 +8,10 @@ use std::time::Duration;
 use clap::{Args, ValueEnum};
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::output::outln;
+use super::output::{OutputError, outln};
 use crate::clock::Clock;
 use crate::config::{Config, TlsFiles};
-use crate::server::{self, DataDir, Listeners, Tls};
+use crate::server::{self, DataDir, Endpoints, Listeners, Tls};
 use crate::serving::EngineConfig;
 use crate::telemetry::{self, LogConfig, TraceExporter};
 
@@ -181,10 +181,10 @@ pub async fn run(args: ServeArgs) -> anyhow::Result<()> {
     reload_on_hangup(listeners.tls())?;
     let app = server::open(&config, &data, Clock::system()).await?;
     let endpoints = listeners.endpoints()?;
-    outln!("qedgix {}", env!("CARGO_PKG_VERSION"))?;
-    outln!("gRPC  {}", endpoints.grpc)?;
-    outln!("REST  {}://{}", if config.tls.is_some() { "https" } else { "http" }, endpoints.http)?;
-    outln!("data  {}", config.data_dir.display())?;
+    // The server works without its standard output, for instance while the disk of a file behind it is full.
+    if let Err(error) = print_start(&config, endpoints) {
+        tracing::warn!(%error, grpc = %endpoints.grpc, http = %endpoints.http, "the addresses cannot be printed");
+    }
     let served = server::run(&config, &data, app, listeners, shutdown).await;
     if let Some(traces) = traces {
         traces.shutdown(config.drain_timeout.min(SPAN_FLUSH_TIMEOUT)).await;
@@ -199,6 +199,13 @@ fn refuse_huge_pages() {
     if let Err(error) = rustix::thread::disable_transparent_huge_pages(true) {
         tracing::debug!(%error, "cannot switch off transparent huge pages");
     }
+}
+
+fn print_start(config: &Config, endpoints: Endpoints) -> Result<(), OutputError> {
+    outln!("qedgix {}", env!("CARGO_PKG_VERSION"))?;
+    outln!("gRPC  {}", endpoints.grpc)?;
+    outln!("REST  {}://{}", if config.tls.is_some() { "https" } else { "http" }, endpoints.http)?;
+    outln!("data  {}", config.data_dir.display())
 }
 
 /// Maximum time to send the last spans to the collector.

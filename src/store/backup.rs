@@ -201,6 +201,7 @@ mod tests {
         KeyRecord {
             id: id.into(),
             name: "backup".into(),
+            owner: None,
             digest: [7; 32],
             scopes: "read".into(),
             rate: None,

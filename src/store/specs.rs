@@ -55,7 +55,7 @@ pub struct StoredSpec {
 #[error("this version cannot read the specification of the job: {0}")]
 pub struct UnreadableSpec(String);
 
-/// Longest reason of an [`UnreadableSpec`], in characters. The parser lists every field that it knows.
+/// Longest reason of an [`UnreadableSpec`], in characters.
 const MAX_REASON: usize = 300;
 
 impl StoredSpec {
@@ -65,8 +65,11 @@ impl StoredSpec {
     /// [`UnreadableSpec`] names the field that this version does not know or cannot read.
     pub fn decode(&self) -> Result<JobSpec, UnreadableSpec> {
         let mut parser = serde_json::Deserializer::from_str(&self.document);
-        serde_path_to_error::deserialize(&mut parser)
-            .map_err(|error| UnreadableSpec(error.to_string().chars().take(MAX_REASON).collect()))
+        serde_path_to_error::deserialize(&mut parser).map_err(|error| {
+            let reason = error.to_string();
+            // The parser goes on with every field that it knows.
+            UnreadableSpec(reason.split(", expected").next().unwrap_or(&reason).chars().take(MAX_REASON).collect())
+        })
     }
 
     /// Bytes of the texts that a list shows.
