@@ -144,8 +144,17 @@ impl Store {
     /// [`Error::Sqlx`] when the file cannot be opened; [`Error::Newer`] when a newer version has written it.
     pub async fn open(data_dir: &Path) -> Result<Self, Error> {
         let path = data_dir.join(FILE);
+        Self::open_file(&path).await.map_err(|error| match error.write_failure() {
+            // SQLite reports some effects of a full disk as errors of the disk.
+            Some(WriteFailure::Failed) => upkeep::examine_file_system(data_dir).map_or(error, Error::Write),
+            Some(failure) => Error::Write(failure),
+            None => error,
+        })
+    }
+
+    async fn open_file(path: &Path) -> Result<Self, Error> {
         let options = SqliteConnectOptions::new()
-            .filename(&path)
+            .filename(path)
             .journal_mode(SqliteJournalMode::Wal)
             .pragma("journal_size_limit", upkeep::LOG_LIMIT.to_string())
             // FULL: a commit is on the disk when it returns.
@@ -162,7 +171,7 @@ impl Store {
         migrator().run(&write).await?;
         record_version(&mut *write.acquire().await?).await?;
         let read = pool.max_connections(4).min_connections(1).connect_with(options.read_only(true)).await?;
-        let condition = Arc::new(writes::Condition::of(&path));
+        let condition = Arc::new(writes::Condition::of(path));
         Ok(Self { read, write, condition, notifier: Arc::new(events::Notifier::new()) })
     }
 }

@@ -52,7 +52,7 @@ impl Store {
             return Some(WriteFailure::Lost);
         }
         let needed = if known == Some(WriteFailure::Full) { NO_LONGER_FULL } else { FULL };
-        if let Some(failure) = examine_file_system(self.condition.database(), needed) {
+        if let Some(failure) = examine_space(self.condition.database(), needed) {
             return Some(failure);
         }
         if !suspected && known.is_none() {
@@ -123,7 +123,12 @@ async fn set_busy_timeout(connection: &mut SqliteConnection, time: Duration) -> 
 }
 
 /// Why nothing can be written to the file system of `path`, as far as the file system knows.
-fn examine_file_system(path: &Path, needed: u64) -> Option<WriteFailure> {
+pub(super) fn examine_file_system(path: &Path) -> Option<WriteFailure> {
+    examine_space(path, FULL)
+}
+
+/// As [`examine_file_system`], with the free space below which the disk counts as full.
+fn examine_space(path: &Path, needed: u64) -> Option<WriteFailure> {
     let system = rustix::fs::statvfs(path).ok()?;
     if system.f_flag.contains(rustix::fs::StatVfsMountFlags::RDONLY) {
         return Some(WriteFailure::ReadOnly);
