@@ -201,7 +201,7 @@ mod tests {
         KeyRecord {
             id: id.into(),
             name: "backup".into(),
-            owner: None,
+            owner: id.into(),
             digest: [7; 32],
             scopes: "read".into(),
             rate: None,
