@@ -1,6 +1,6 @@
 //! Settings of a server: defaults and validation.
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -51,6 +51,8 @@ pub struct Config {
     pub drain_timeout: Duration,
     /// Allow non-loopback addresses although no API key exists.
     pub insecure: bool,
+    /// Names of hosts that requests may name while there is no API key, besides those of loopback and the address of REST.
+    pub allow_hosts: Vec<String>,
     /// TLS certificates of both addresses; `None`: no TLS.
     pub tls: Option<TlsFiles>,
     /// Maximum connections of both addresses together.
@@ -113,6 +115,7 @@ impl Config {
             engine: EngineConfig { threads: cores.min(4), queue: 4096, max_batch: 64, max_batch_delay: Duration::ZERO },
             drain_timeout: Duration::from_secs(20),
             insecure: false,
+            allow_hosts: Vec::new(),
             tls: None,
             max_connections: 10_000,
             max_connections_per_peer: 1000,
@@ -160,6 +163,12 @@ impl Config {
         in_seconds("--connection-idle", self.connection_idle, 0.001..=1e9)?;
         in_seconds("--connection-age", self.connection_age, 0.001..=1e9)?;
         in_seconds("--connection-grace", self.connection_grace, 0.001..=1e9)?;
+        for host in &self.allow_hosts {
+            let name = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+            if host.is_empty() || !(host.chars().all(name) || host.parse::<IpAddr>().is_ok()) {
+                return Err(Invalid::new("--allow-host", format!("{host:?}"), "the name of a host, without scheme and port"));
+            }
+        }
         if let Some(rate) = self.key_rate {
             in_range("--key-rate", rate, Rate::PER_SECOND)?;
         }

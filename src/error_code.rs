@@ -33,6 +33,8 @@ error_codes! {
     AlreadyExists = "already_exists",
     /// The attempt that a worker reports to has ended.
     AttemptOver = "attempt_over",
+    /// The request comes from a page of another site, or names a host that the server does not go by.
+    CrossSite = "cross_site",
     /// The caller's deadline passed.
     DeadlineExceeded = "deadline_exceeded",
     /// The server is shutting down.

@@ -1,7 +1,9 @@
-//! Atomic writes of files: after a crash, a file has its old or its new content, never a part of it.
+//! Atomic writes of files: after a crash, a file has its old or its new content, never a part of it. Directories and files that
+//! only their owner may read.
 
-use std::fs::{self, File};
+use std::fs::{self, DirBuilder, File, OpenOptions, Permissions};
 use std::io::{self, Write};
+use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 /// The file beside `path` that [`write_atomic`] writes first. It is left behind when the process is killed during a write.
@@ -16,8 +18,20 @@ pub fn partial_path(path: &Path) -> PathBuf {
 /// # Errors
 /// The directory is missing or not writable, or the disk is full.
 pub fn write_atomic(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    replace(path, bytes, OpenOptions::new().create(true).truncate(true).write(true))
+}
+
+/// As [`write_atomic`], for a file that only its owner may read.
+///
+/// # Errors
+/// As [`write_atomic`].
+pub fn write_private(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    replace(path, bytes, private_file().truncate(true))
+}
+
+fn replace(path: &Path, bytes: &[u8], options: &OpenOptions) -> io::Result<()> {
     let partial = partial_path(path);
-    let written = write_synced(&partial, bytes).and_then(|()| fs::rename(&partial, path));
+    let written = write_synced(&partial, bytes, options).and_then(|()| fs::rename(&partial, path));
     if written.is_err() {
         let _ = fs::remove_file(&partial);
     }
@@ -34,10 +48,41 @@ pub fn replace(partial: &Path, path: &Path) -> io::Result<()> {
 }
 
 /// Writes `bytes` and waits until they are on disk. Renamed without this, a file can be empty after a power failure.
-fn write_synced(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let mut file = File::create(path)?;
+fn write_synced(path: &Path, bytes: &[u8], options: &OpenOptions) -> io::Result<()> {
+    let mut file = options.open(path)?;
     file.write_all(bytes)?;
     file.sync_all()
+}
+
+/// Options that create a file which only its owner may read and write.
+pub fn private_file() -> OpenOptions {
+    let mut options = OpenOptions::new();
+    options.create(true).write(true).mode(0o600);
+    options
+}
+
+/// Creates a directory that only its owner may enter, and its parents, unless it exists.
+///
+/// # Errors
+/// A parent is not writable, or no directory.
+pub fn create_private_dir(path: &Path) -> io::Result<()> {
+    DirBuilder::new().recursive(true).mode(0o700).create(path)
+}
+
+/// Takes the permissions of a file or directory from all but its owner. Returns whether others had any; false if it is missing.
+///
+/// # Errors
+/// It belongs to another user.
+pub fn make_private(path: &Path) -> io::Result<bool> {
+    let mode = match fs::metadata(path) {
+        Ok(metadata) => metadata.permissions().mode() & 0o777,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(false),
+        Err(error) => return Err(error),
+    };
+    if mode & 0o077 == 0 {
+        return Ok(false);
+    }
+    fs::set_permissions(path, Permissions::from_mode(mode & 0o700)).map(|()| true)
 }
 
 /// Waits until the directory entry of `path` is on disk.
@@ -65,6 +110,22 @@ mod tests {
         write_atomic(&path, b"third").unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"third");
         assert_eq!(fs::read_dir(directory.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn private_files_are_for_their_owner() {
+        let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode() & 0o777;
+        let directory = tempfile::tempdir().unwrap();
+        let (inner, file) = (directory.path().join("a/b"), directory.path().join("a/b/file"));
+        create_private_dir(&inner).unwrap();
+        create_private_dir(&inner).unwrap();
+        write_private(&file, b"secret").unwrap();
+        assert_eq!([mode(&inner), mode(&file)], [0o700, 0o600]);
+        assert!(!make_private(&file).unwrap() && !make_private(&inner.join("missing")).unwrap());
+        fs::set_permissions(&file, Permissions::from_mode(0o644)).unwrap();
+        fs::set_permissions(&inner, Permissions::from_mode(0o755)).unwrap();
+        assert!(make_private(&file).unwrap() && make_private(&inner).unwrap());
+        assert_eq!([mode(&inner), mode(&file)], [0o700, 0o600]);
     }
 
     #[test]

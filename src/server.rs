@@ -29,7 +29,7 @@ use self::lifetime::LifeLimits;
 use self::places::Places;
 pub use self::tls::Tls;
 use crate::api::body::{IncomingBody, TimeLimits};
-use crate::api::{grpc, rest};
+use crate::api::{AllowedHosts, grpc, rest};
 use crate::clock::Clock;
 use crate::config::Config;
 use crate::draining::Draining;
@@ -158,7 +158,7 @@ impl DataDir {
             let path = path.to_owned();
             move |cause| Error::File { path, cause }
         };
-        std::fs::create_dir_all(path).map_err(failed(path))?;
+        files::create_private_dir(path).map_err(failed(path))?;
         let directory = File::open(path).map_err(failed(path))?;
         match directory.try_lock() {
             Err(TryLockError::WouldBlock) => return Err(Error::InUse(path.to_owned())),
@@ -167,7 +167,7 @@ impl DataDir {
             Ok(()) => {}
         }
         let file = path.join("lock");
-        let lock = File::options().create(true).truncate(false).write(true).open(&file).map_err(failed(&file))?;
+        let lock = files::private_file().truncate(false).open(&file).map_err(failed(&file))?;
         match lock.try_lock() {
             Ok(()) => Ok(Self { path: path.to_owned(), _locks: [directory, lock] }),
             Err(TryLockError::WouldBlock) => Err(Error::InUse(path.to_owned())),
@@ -179,7 +179,19 @@ impl DataDir {
     fn write_endpoints(&self, endpoints: Endpoints) -> Result<(), Error> {
         let path = self.path.join(ENDPOINTS);
         let text = serde_json::to_string(&endpoints).expect("addresses are plain data") + "\n";
-        files::write_atomic(&path, text.as_bytes()).map_err(|cause| Error::File { path, cause })
+        files::write_private(&path, text.as_bytes()).map_err(|cause| Error::File { path, cause })
+    }
+
+    /// Takes access from other users of the machine, which earlier versions left them.
+    fn make_private(&self) {
+        let files = store::FILES.iter().chain([&"lock", &ENDPOINTS]).map(|name| self.path.join(name));
+        for path in std::iter::once(self.path.clone()).chain(files) {
+            match files::make_private(&path) {
+                Ok(false) => {}
+                Ok(true) => tracing::info!(path = %path.display(), "other users could read this; now only its owner can"),
+                Err(error) => tracing::warn!(path = %path.display(), %error, "other users can read this"),
+            }
+        }
     }
 
     fn remove_endpoints(&self) {
@@ -200,6 +212,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
     let sessions = Limits { ttl: config.session_ttl, max: config.max_sessions };
     let limits = Limits { ttl: config.environment_ttl, max: config.max_environments };
     let environments = EnvironmentsConfig { limits, memory: config.environment_memory };
+    data.make_private();
     let store = Store::open(&data.path).await?;
     let executor = match &config.worker {
         Some(program) => LocalProcess { program: program.clone() },
@@ -263,7 +276,8 @@ pub async fn run(
         ..connections.clone()
     };
     let services = grpc::services(&app, &health, config.max_message_size, stop.clone());
-    let router = rest::router(app.clone(), telemetry::render_metrics, config.max_message_size);
+    let hosts = AllowedHosts::new(endpoints.http.ip(), &config.allow_hosts);
+    let router = rest::router(app.clone(), telemetry::render_metrics, config.max_message_size, hosts);
     let router = router.map_request(|mut request: Request<IncomingBody>| {
         let exchange = request.body().exchange().clone();
         request.extensions_mut().insert(exchange);

@@ -48,6 +48,7 @@ const LAYERS: &[(&str, &[&str])] = &[
             "clock",
             "draining",
             "inflight",
+            "files",
             "jobs",
             "serving",
             "store",

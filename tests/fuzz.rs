@@ -14,6 +14,7 @@ mod secured;
 
 use std::collections::BTreeMap;
 use std::convert::Infallible;
+use std::net::Ipv4Addr;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -21,7 +22,7 @@ use axum::body::Body;
 use axum::http::{Request, Response, header};
 use prost::Message;
 use qedgix::api::body::{Exchange, IncomingBody};
-use qedgix::api::{grpc, rest};
+use qedgix::api::{AllowedHosts, grpc, rest};
 use qedgix::checkpoint::{Checkpoint, parameter_layout};
 use qedgix::clock::Clock;
 use qedgix::config::Config;
@@ -303,7 +304,12 @@ impl Subject {
                     .map_request(move |request: Request<Body>| request.map(&incoming))
                     .map_response(|r: Response<_>| r.map(Body::new))
                     .service(services);
-                let rest = rest::router(app.clone(), telemetry::render_metrics, LARGEST);
+                let rest = rest::router(
+                    app.clone(),
+                    telemetry::render_metrics,
+                    LARGEST,
+                    AllowedHosts::new(Ipv4Addr::LOCALHOST.into(), &[]),
+                );
                 (app, BoxCloneSyncService::new(rest), BoxCloneSyncService::new(grpc), None)
             }
             Access::KeysAndTls => {
@@ -347,7 +353,11 @@ impl Subject {
     }
 
     async fn send(&self, (verb, path, content_type, _): &(&str, &str, &str, Vec<u8>), body: Vec<u8>) -> String {
-        let request = Request::builder().method(*verb).uri(*path).header(header::CONTENT_TYPE, *content_type);
+        let request = Request::builder()
+            .method(*verb)
+            .uri(*path)
+            .header(header::HOST, "localhost")
+            .header(header::CONTENT_TYPE, *content_type);
         let response = self.rest.clone().oneshot(request.body(Body::from(body)).unwrap()).await.unwrap();
         let status = response.status().as_u16();
         axum::body::to_bytes(response.into_body(), usize::MAX).await.unwrap();
@@ -356,7 +366,9 @@ impl Subject {
 
     /// Sends a document followed by tensors; sometimes the length that tells them apart is wrong.
     async fn send_binary(&self, body: Vec<u8>, length: usize) -> String {
-        let request = Request::post("/v2/models/qedgix/infer").header("inference-header-content-length", length);
+        let request = Request::post("/v2/models/qedgix/infer")
+            .header(header::HOST, "localhost")
+            .header("inference-header-content-length", length);
         let response = self.rest.clone().oneshot(request.body(Body::from(body)).unwrap()).await.unwrap();
         let status = response.status().as_u16();
         axum::body::to_bytes(response.into_body(), usize::MAX).await.unwrap();

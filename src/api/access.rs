@@ -33,8 +33,8 @@ const GRPC: &[(&str, &str, Requirement)] = &[
     ("qedgix.v1.JobService", "SubmitJob CancelJob PauseJob ResumeJob RetryJob", JOBS),
     ("qedgix.v1.JobService", "GetJob ListJobs GetJobMetrics WatchJob", READ),
     ("qedgix.v1.WorkerService", "*", OPEN),
-    ("inference.GRPCInferenceService", "ServerLive", OPEN),
-    ("inference.GRPCInferenceService", "ServerReady ServerMetadata ModelReady ModelMetadata ModelConfig", READ),
+    ("inference.GRPCInferenceService", "ServerLive ServerReady", OPEN),
+    ("inference.GRPCInferenceService", "ServerMetadata ModelReady ModelMetadata ModelConfig", READ),
     ("inference.GRPCInferenceService", "RepositoryIndex", READ),
     ("inference.GRPCInferenceService", "ModelInfer ModelStreamInfer", ACT),
     ("inference.GRPCInferenceService", "RepositoryModelLoad RepositoryModelUnload", ADMIN),
@@ -45,7 +45,7 @@ const GRPC: &[(&str, &str, Requirement)] = &[
 
 /// HTTP method, routes as they are registered and their requirement. `HEAD` counts as `GET`.
 const REST: &[(&str, &str, Requirement)] = &[
-    ("GET", "/livez /readyz /openapi.json /docs /docs/{file} /v2/health/live", OPEN),
+    ("GET", "/livez /readyz /openapi.json /docs /docs/{file} /v2/health/live /v2/health/ready", OPEN),
     ("GET", "/ /metrics", READ),
     ("POST", "/v1/act /v1/sessions", ACT),
     ("GET", "/v1/sessions /v1/sessions/{id}", READ),
@@ -62,7 +62,7 @@ const REST: &[(&str, &str, Requirement)] = &[
     ("GET", "/v1/jobs/{id}/events /v1/checkpoints/{id}", READ),
     ("POST", "/v1/jobs /v1/jobs/{id}/cancel /v1/jobs/{id}/pause /v1/jobs/{id}/resume /v1/jobs/{id}/retry", JOBS),
     ("DELETE", "/v1/jobs/{id}", JOBS),
-    ("GET", "/v2 /v2/health/ready /v2/models/{model} /v2/models/{model}/ready /v2/models/{model}/config", READ),
+    ("GET", "/v2 /v2/models/{model} /v2/models/{model}/ready /v2/models/{model}/config", READ),
     ("GET", "/v2/models/{model}/versions/{version} /v2/models/{model}/versions/{version}/ready", READ),
     ("GET", "/v2/models/{model}/versions/{version}/config", READ),
     ("POST", "/v2/models/{model}/infer /v2/models/{model}/versions/{version}/infer", ACT),

@@ -17,6 +17,7 @@ use tonic::body::Body;
 use tower::Service;
 
 use super::access::{self, Requirement};
+use super::browser::{self, AllowedHosts};
 use crate::service::keys::Caller;
 use crate::service::{App, Error};
 
@@ -47,7 +48,9 @@ where
     }
 
     fn call(&mut self, mut request: Request<Body>) -> Self::Future {
-        match authorize(&self.app, &mut request, |request| access::grpc_requirement(request.uri().path())) {
+        let requirement = |request: &Request<Body>| access::grpc_requirement(request.uri().path());
+        let foreign = |request: &Request<Body>| browser::check_grpc(request.headers());
+        match authorize(&self.app, &mut request, requirement, foreign) {
             Ok(()) => Either::Left(self.inner.call(request)),
             Err(error) => Either::Right(ready(Ok(Status::from(error).into_http()))),
         }
@@ -55,22 +58,33 @@ where
 }
 
 /// Middleware that authorizes REST requests. It runs after routing.
-pub(super) async fn authorize_rest(app: Arc<App>, mut request: axum::extract::Request, next: Next) -> axum::response::Response {
+pub(super) async fn authorize_rest(
+    app: Arc<App>,
+    hosts: Arc<AllowedHosts>,
+    mut request: axum::extract::Request,
+    next: Next,
+) -> axum::response::Response {
     let requirement = |request: &axum::extract::Request| {
         access::rest_requirement(request.method(), request.extensions().get::<MatchedPath>().map(MatchedPath::as_str))
     };
-    match authorize(&app, &mut request, requirement) {
+    let authorized = authorize(&app, &mut request, requirement, |request| hosts.check(request));
+    match authorized.and_then(|()| browser::check_media_type(&request)) {
         Ok(()) => next.run(request).await,
         Err(error) => error.into_response(),
     }
 }
 
 /// Authenticates the caller, counts the request against the rate of the key and checks the scope, in this order: a request
-/// without the required scope counts like any other. Moves the key from the headers to a [`Caller`] in the extensions.
-fn authorize<B>(app: &App, request: &mut Request<B>, requirement: impl FnOnce(&Request<B>) -> Requirement) -> Result<(), Error> {
-    // The only cost on a server without keys.
+/// without the required scope counts like any other. Moves the key from the headers to a [`Caller`] in the extensions. On a server
+/// without keys, `check_foreign` refuses what pages of other sites send.
+fn authorize<B>(
+    app: &App,
+    request: &mut Request<B>,
+    requirement: impl FnOnce(&Request<B>) -> Requirement,
+    check_foreign: impl FnOnce(&Request<B>) -> Result<(), Error>,
+) -> Result<(), Error> {
     if !app.keys.required() {
-        return Ok(());
+        return check_foreign(request);
     }
     let requirement = requirement(request);
     if requirement == Requirement::NoKey {

@@ -35,6 +35,7 @@ fn statuses(error: &Error) -> (Code, StatusCode) {
         Error::TooLarge { .. } => (Code::ResourceExhausted, StatusCode::PAYLOAD_TOO_LARGE),
         Error::Overloaded => (Code::ResourceExhausted, StatusCode::SERVICE_UNAVAILABLE),
         Error::MediaType(_) => (Code::Unimplemented, StatusCode::UNSUPPORTED_MEDIA_TYPE),
+        Error::CrossSite(_) => (Code::PermissionDenied, StatusCode::FORBIDDEN),
         Error::Deadline(_) => (Code::DeadlineExceeded, StatusCode::GATEWAY_TIMEOUT),
         Error::Draining | Error::Unavailable(_) => (Code::Unavailable, StatusCode::SERVICE_UNAVAILABLE),
         Error::Storage(WriteFailure::Full) => (Code::ResourceExhausted, StatusCode::INSUFFICIENT_STORAGE),

@@ -3,13 +3,16 @@
 pub mod access;
 mod auth;
 pub mod body;
+mod browser;
 pub mod convert;
 mod errors;
 pub mod grpc;
+mod media_type;
 mod oip;
 mod request_log;
 pub mod rest;
 
+pub use browser::AllowedHosts;
 pub use errors::{Problem, retry_after_seconds};
 
 use crate::service::Error;

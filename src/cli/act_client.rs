@@ -42,7 +42,7 @@ pub async fn connect(address: &str, args: &ConnectArgs) -> anyhow::Result<Policy
             value
         })
     };
-    let api_key = args.authorization()?.map(metadata).transpose()?;
+    let api_key = args.authorization(&url)?.map(metadata).transpose()?;
     let endpoint = Endpoint::from(url.clone());
     let channel = endpoint.connect_with_connector(args.connector(&url)?).await;
     let channel = channel.with_context(|| format!("cannot reach {address}"))?;

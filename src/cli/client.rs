@@ -30,7 +30,7 @@ impl Client {
     /// The address, the API key or a certificate is invalid.
     pub fn new(address: &str, args: &ConnectArgs) -> anyhow::Result<Self> {
         let url = args.url(address)?;
-        let headers: HeaderMap = args.authorization()?.map(|value| (header::AUTHORIZATION, value)).into_iter().collect();
+        let headers: HeaderMap = args.authorization(&url)?.map(|value| (header::AUTHORIZATION, value)).into_iter().collect();
         let http = reqwest::Client::builder()
             .tls_backend_preconfigured(args.tls(&url)?)
             .default_headers(headers)

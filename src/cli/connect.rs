@@ -1,8 +1,10 @@
 //! Connection flags of commands that use a server: address, certificates and API key.
 
 use std::fmt;
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, bail};
 use axum::http::{HeaderValue, Uri};
@@ -13,6 +15,8 @@ use rustls::crypto::ring;
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::{ClientConfig, RootCertStore};
+
+use super::output::errln;
 
 /// Heading of these flags in the help.
 const CONNECTION: &str = "Connection";
@@ -32,6 +36,16 @@ pub struct ConnectArgs {
     /// Private key of the client certificate (PEM)
     #[arg(long, help_heading = CONNECTION, env = "QEDGIX_CLIENT_KEY", value_name = "FILE", requires = "client_cert")]
     client_key: Option<PathBuf>,
+    /// Whether the warning about a key without encryption was printed.
+    #[arg(skip)]
+    warned: Arc<AtomicBool>,
+}
+
+/// Whether a connection to `url` is neither encrypted nor within this machine.
+fn is_readable_by_others(url: &Uri) -> bool {
+    let host = url.host().unwrap_or_default().trim_matches(['[', ']']);
+    let local = host.eq_ignore_ascii_case("localhost") || host.parse::<IpAddr>().is_ok_and(|ip| ip.to_canonical().is_loopback());
+    url.scheme_str() != Some("https") && !local
 }
 
 /// Text that `Debug` hides.
@@ -71,12 +85,16 @@ impl ConnectArgs {
         Ok(url)
     }
 
-    /// The value of the `authorization` header, if there is an API key.
+    /// The value of the `authorization` header for `url`, if there is an API key. Warns once if others could read the key on its
+    /// way.
     ///
     /// # Errors
     /// The API key contains characters that a header cannot contain.
-    pub fn authorization(&self) -> anyhow::Result<Option<HeaderValue>> {
+    pub fn authorization(&self, url: &Uri) -> anyhow::Result<Option<HeaderValue>> {
         let Some(Secret(key)) = &self.api_key else { return Ok(None) };
+        if is_readable_by_others(url) && !self.warned.swap(true, Ordering::Relaxed) {
+            errln!("warning: the API key is sent to {url} without encryption; use https://");
+        }
         // The error of the conversion is dropped, because it could contain the key.
         let value = HeaderValue::try_from(format!("Bearer {}", key.trim()));
         let Ok(mut value) = value else { bail!("--api-key: not an API key; expected a key that qedgix keys create printed") };
@@ -153,14 +171,34 @@ mod tests {
     fn debug_output_and_errors_do_not_contain_the_key() {
         let line = Line::try_parse_from(["x", "--api-key", "qdx_id_SECRET"]).unwrap();
         assert!(!format!("{line:?}").contains("SECRET"));
-        let value = line.connect.authorization().unwrap().unwrap();
+        let value = line.connect.authorization(&Uri::from_static("http://localhost")).unwrap().unwrap();
         assert_eq!(value, "Bearer qdx_id_SECRET");
         assert!(!format!("{value:?}").contains("SECRET"));
-        let broken = Line::try_parse_from(["x", "--api-key", "SECRET\n1"]).unwrap().connect.authorization().unwrap_err();
+        let broken = Line::try_parse_from(["x", "--api-key", "SECRET\n1"])
+            .unwrap()
+            .connect
+            .authorization(&Uri::from_static("http://localhost"))
+            .unwrap_err();
         assert!(!format!("{broken:?}").contains("SECRET"), "{broken:?}");
         let command = Line::command();
         let key = command.get_arguments().find(|a| a.get_id() == "api_key").unwrap();
         assert!(key.is_hide_env_values_set());
+    }
+
+    #[test]
+    fn a_key_that_others_can_read_is_warned_about_once() {
+        let connect = Line::try_parse_from(["x", "--api-key", "k"]).unwrap().connect;
+        let again = connect.clone();
+        for (url, warned) in [
+            ("http://127.0.0.1:8080", false),
+            ("http://[::1]:8080", false),
+            ("http://localhost", false),
+            ("https://server", false),
+            ("http://10.0.0.1:8080", true),
+        ] {
+            connect.authorization(&url.parse().unwrap()).unwrap();
+            assert_eq!(again.warned.load(Ordering::Relaxed), warned, "{url}");
+        }
     }
 
     #[test]

@@ -92,6 +92,9 @@ pub struct ServeArgs {
     /// Allow addresses other than loopback without any API key. Does not switch off existing keys
     #[arg(long, help_heading = SECURITY, env = "QEDGIX_INSECURE")]
     insecure: bool,
+    /// Host name by which callers reach this server, besides loopback names and its address, such as that of a proxy; repeatable. Needed only without API keys, when requests that name another host are refused [default: none]
+    #[arg(long = "allow-host", help_heading = SECURITY, env = "QEDGIX_ALLOW_HOST", value_delimiter = ',', value_name = "HOST")]
+    allow_hosts: Vec<String>,
     #[command(flatten)]
     security: SecurityArgs,
     /// Format of the logs on standard error
@@ -269,6 +272,7 @@ impl ServeArgs {
             },
             drain_timeout: self.drain_timeout,
             insecure: self.insecure,
+            allow_hosts: self.allow_hosts.clone(),
             tls: self.security.tls_files(),
             max_connections: self.security.max_connections,
             max_connections_per_peer: self.security.max_connections_per_peer,

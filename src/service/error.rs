@@ -59,6 +59,9 @@ pub enum Error {
     /// The body has a media type that the server does not read.
     #[error(transparent)]
     MediaType(Invalid),
+    /// The request comes from a page of another site, or names a host that the server does not go by.
+    #[error(transparent)]
+    CrossSite(Invalid),
     /// The caller's deadline passed.
     #[error("the deadline passed {0}")]
     Deadline(&'static str),
@@ -99,6 +102,7 @@ impl Error {
             Self::Overloaded => ErrorCode::Overloaded,
             Self::TooLarge { .. } => ErrorCode::TooLarge,
             Self::MediaType(_) => ErrorCode::UnsupportedMediaType,
+            Self::CrossSite(_) => ErrorCode::CrossSite,
             Self::Deadline(_) => ErrorCode::DeadlineExceeded,
             Self::Draining => ErrorCode::Draining,
             Self::Unavailable(_) => ErrorCode::Unavailable,
@@ -113,7 +117,7 @@ impl Error {
     /// The field that is not accepted, if the error is about one.
     pub fn invalid(&self) -> Option<&Invalid> {
         match self {
-            Self::Invalid(invalid) | Self::MediaType(invalid) => Some(invalid),
+            Self::Invalid(invalid) | Self::MediaType(invalid) | Self::CrossSite(invalid) => Some(invalid),
             _ => None,
         }
     }

@@ -54,6 +54,8 @@ use sqlx::migrate::{MigrateError, Migration, MigrationType, Migrator};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
 use sqlx::{Connection, SqlSafeStr, SqliteConnection, SqlitePool};
 
+use crate::files;
+
 macro_rules! migrations {
     ($($file:literal),+ $(,)?) => {
         [$(($file, include_str!(concat!("../../migrations/", $file)))),+]
@@ -74,6 +76,9 @@ const MIGRATIONS: &[(&str, &str)] = &migrations![
 
 /// Name of the database file inside the data directory.
 pub const FILE: &str = "qedgix.sqlite";
+
+/// Names of the files of the database; all but the first exist only while it is open, or after a crash.
+pub const FILES: [&str; 3] = [FILE, "qedgix.sqlite-wal", "qedgix.sqlite-shm"];
 
 /// Longest time that a write waits for another process that writes.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(2);
@@ -161,6 +166,11 @@ impl Store {
             .synchronous(SqliteSynchronous::Full)
             .foreign_keys(true)
             .busy_timeout(BUSY_TIMEOUT);
+        // SQLite gives the other files of the database the permissions of this one.
+        match files::private_file().create_new(true).open(&path) {
+            Err(error) if error.kind() != std::io::ErrorKind::AlreadyExists => return Err(sqlx::Error::Io(error).into()),
+            _ => {}
+        }
         SqliteConnection::connect_with(&options.clone().create_if_missing(true)).await?.close().await?;
         // From here on a missing file is an error: a new, empty one would hide that the data is lost. Connections do not age,
         // because the last one to be closed would delete the write-ahead log.

@@ -284,3 +284,8 @@ pub fn assert_invalid<T>(response: Result<tonic::Response<T>, Status>, field: &s
 pub async fn with_timeout<T>(future: impl Future<Output = T>) -> T {
     tokio::time::timeout(Duration::from_secs(60), future).await.expect("completes within a minute")
 }
+
+/// The hosts of a server on loopback.
+pub fn localhost() -> qedgix::api::AllowedHosts {
+    qedgix::api::AllowedHosts::new(std::net::Ipv4Addr::LOCALHOST.into(), &[])
+}

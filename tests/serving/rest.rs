@@ -16,7 +16,8 @@ impl<'a> Rest<'a> {
     }
 
     pub async fn send(&self, method: Method, path: &str, body: impl Into<reqwest::Body>) -> (StatusCode, Value) {
-        let answer = self.http.request(method, self.server.url(path)).body(body).send().await.unwrap();
+        let request = self.http.request(method, self.server.url(path)).header("content-type", "application/json").body(body);
+        let answer = request.send().await.unwrap();
         let (status, kind) = (answer.status(), answer.headers().get("content-type").cloned());
         assert!(answer.headers().contains_key("x-request-id"));
         let text = answer.text().await.unwrap();
@@ -201,7 +202,7 @@ async fn a_body_that_does_not_say_its_size_is_bounded_too() {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
     let server = Server::start().await;
     let mut stream = tokio::net::TcpStream::connect(server.endpoints.http).await.unwrap();
-    let head = "POST /v1/act HTTP/1.1\r\nhost: here\r\nconnection: close\r\ntransfer-encoding: chunked\r\n\r\n";
+    let head = "POST /v1/act HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\ncontent-type: application/json\r\ntransfer-encoding: chunked\r\n\r\n";
     stream.write_all(head.as_bytes()).await.unwrap();
     let chunk = format!("{:x}\r\n{}\r\n", 100_000, " ".repeat(100_000));
     for _ in 0..200 {

@@ -96,7 +96,7 @@ pub async fn infer(app: &App, caller: &Caller, request: InferRequest, deadline: 
     let timeout = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
     let deadline = deadline.into_iter().chain(timeout).min();
     let request = act::Request { policy: Some(spec.clone()), input, memory, step, run_id: None, seed };
-    let response = act::act(app, caller, request, deadline).await.map_err(|error| model_error(&spec, error))?;
+    let response = act::act(app, caller, request, deadline).await.map_err(model_error)?;
     let reference = &response.policy.reference;
     let (version, digest, step) = (reference.version, reference.digest_hex(), response.decision.step);
     Ok(InferResponse { model, version, id, step, digest, outputs: outputs.tensors(response) })

@@ -46,28 +46,28 @@ pub(super) fn policy_spec(name: &str, version: &str) -> Result<PolicySpec, Inval
 }
 
 /// The error of a policy as the error of a model.
-pub(super) fn model_error(spec: &PolicySpec, error: Error) -> Error {
+pub(super) fn model_error(error: Error) -> Error {
     match error {
         Error::NotFound { what: "policy", id } => Error::NotFound { what: "model", id },
-        Error::Precondition { code: ErrorCode::PolicyUnloaded, .. } => not_loaded(spec),
         Error::Invalid(e) if e.field == "policy" => Invalid { field: "model_name".into(), ..e }.into(),
         other => other,
     }
 }
 
-fn not_loaded(spec: &PolicySpec) -> Error {
-    Error::NotFound { what: "loaded model", id: spec.to_string() }
+fn unloaded(spec: &PolicySpec) -> Error {
+    let message = format!("policy {spec} is unloaded; load it first");
+    Error::Precondition { code: ErrorCode::PolicyUnloaded, message }
 }
 
 /// Describes a model.
 ///
 /// # Errors
-/// [`Error::NotFound`] if the model does not exist or is not loaded.
+/// [`Error::NotFound`] if the model does not exist, `policy_unloaded` if it is not loaded.
 pub fn describe(app: &App, name: &str, version: &str) -> Result<Model, Error> {
     let spec = policy_spec(name, version)?;
-    let described = policies::get(app, &spec).map_err(|error| model_error(&spec, error))?;
+    let described = policies::get(app, &spec).map_err(model_error)?;
     if !described.loaded {
-        return Err(not_loaded(&spec));
+        return Err(unloaded(&spec));
     }
     let policy = &described.info;
     let loaded = || described.versions.iter().filter(|(_, loaded)| *loaded).map(|(version, _)| *version).collect();

@@ -49,7 +49,7 @@ struct EnvironmentPath {
 #[schema(example = json!({"environment_id": "env-1", "environment": {"uavs": 2, "users": 4}}))]
 struct CreateEnvironmentRequest {
     /// Fields that differ from the defaults. The symbols `M`, `N`, `K`, `v`, `t` and `d` are accepted, too.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "json::object")]
     #[schema(value_type = EnvConfig)]
     environment: Map<String, Value>,
     /// The first episode of copy b has the seed `seed` + b.

@@ -12,6 +12,7 @@ use serde::de::DeserializeOwned;
 
 use super::json::ObjectOnly;
 use crate::api::body::Exchange;
+pub use crate::api::media_type::{media_type, unsupported};
 use crate::api::offload;
 use crate::invalid::Invalid;
 use crate::service::Error;
@@ -36,8 +37,6 @@ impl<S: Sync, T: DeserializeOwned + Send + 'static> FromRequest<S> for Json<T> {
 
     async fn from_request(request: Request, _: &S) -> Result<Self, Error> {
         match media_type(request.headers()) {
-            // A missing content-type is treated as JSON.
-            None => {}
             Some(kind) if kind == "application/json" => {}
             kind => return Err(unsupported(kind, "application/json")),
         }
@@ -62,20 +61,6 @@ impl<S: Sync> FromRequest<S> for Raw {
 
 fn limit(request: &Request) -> usize {
     request.extensions().get().map_or(4 << 20, |&MaxBody(limit)| limit)
-}
-
-/// The content type of a body, in lower case and without parameters.
-pub fn media_type(headers: &HeaderMap) -> Option<String> {
-    let kind = headers.get(header::CONTENT_TYPE)?.to_str().unwrap_or("unreadable");
-    Some(kind.split(';').next().unwrap_or_default().trim().to_ascii_lowercase())
-}
-
-/// The error for a body of another content type than `expected`.
-pub fn unsupported(kind: Option<String>, expected: &str) -> Error {
-    Error::MediaType(match kind {
-        Some(kind) => Invalid::new("content-type", kind, expected),
-        None => Invalid::missing("content-type", expected),
-    })
 }
 
 /// Reads a body of at most `limit` bytes.
@@ -210,7 +195,8 @@ mod tests {
     async fn large_bodies_are_parsed_on_another_thread_than_the_connection_s() {
         for (bytes, large) in [(LARGE_BODY, false), (LARGE_BODY + 1, true)] {
             let body = format!("{{{}}}", " ".repeat(bytes - 2));
-            let Json(ParsedOn(thread)) = Json::from_request(Request::new(body.into()), &()).await.unwrap();
+            let request = Request::post("/").header(header::CONTENT_TYPE, "application/json").body(body.into()).unwrap();
+            let Json(ParsedOn(thread)) = Json::from_request(request, &()).await.unwrap();
             assert_eq!(thread != thread::current().id(), large, "{bytes}");
         }
     }

@@ -1,11 +1,13 @@
 //! Reads JSON by the rules of JSON Schema. Derived `Deserialize` differs in two points: it accepts an array for an object, and
-//! rejects `3.0` for an integer.
+//! rejects `3.0` for an integer. Maps differ from structs in a third: of a key that occurs twice, they keep the last value.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::marker::PhantomData;
 
-use serde::de::{Deserializer, Error, Unexpected, Visitor};
+use serde::de::{Deserializer, Error, MapAccess, SeqAccess, Unexpected, Visitor};
 use serde::{Deserialize, forward_to_deserialize_any};
+use serde_json::{Map, Value};
 
 /// A deserializer that reads structs from objects only, not from arrays of their fields.
 pub(super) struct ObjectOnly<D>(pub(super) D);
@@ -100,6 +102,117 @@ pub(super) fn integers<'de, D: Deserializer<'de>, T: TryFrom<i128>>(deserializer
     Vec::deserialize(deserializer).map(|values| values.into_iter().map(|Integer(value)| value).collect())
 }
 
+/// A map in which every key occurs once.
+struct Object<V>(BTreeMap<String, V>);
+
+impl<'de, V: Deserialize<'de>> Deserialize<'de> for Object<V> {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct ObjectVisitor<V>(PhantomData<V>);
+
+        impl<'de, V: Deserialize<'de>> Visitor<'de> for ObjectVisitor<V> {
+            type Value = Object<V>;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("a map")
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<Object<V>, A::Error> {
+                distinct_entries(map).map(Object)
+            }
+        }
+
+        deserializer.deserialize_map(ObjectVisitor(PhantomData))
+    }
+}
+
+fn distinct_entries<'de, V: Deserialize<'de>, A: MapAccess<'de>>(mut map: A) -> Result<BTreeMap<String, V>, A::Error> {
+    let mut entries = BTreeMap::new();
+    while let Some(key) = map.next_key::<String>()? {
+        if entries.contains_key(&key) {
+            return Err(A::Error::custom(format_args!("duplicate field `{key}`")));
+        }
+        entries.insert(key, map.next_value()?);
+    }
+    Ok(entries)
+}
+
+/// A JSON value in whose objects every key occurs once.
+struct Distinct(Value);
+
+impl<'de> Deserialize<'de> for Distinct {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct ValueVisitor;
+
+        impl<'de> Visitor<'de> for ValueVisitor {
+            type Value = Distinct;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("a JSON value")
+            }
+
+            fn visit_unit<E: Error>(self) -> Result<Distinct, E> {
+                Ok(Distinct(Value::Null))
+            }
+
+            fn visit_bool<E: Error>(self, value: bool) -> Result<Distinct, E> {
+                Ok(Distinct(value.into()))
+            }
+
+            fn visit_i64<E: Error>(self, value: i64) -> Result<Distinct, E> {
+                Ok(Distinct(value.into()))
+            }
+
+            fn visit_u64<E: Error>(self, value: u64) -> Result<Distinct, E> {
+                Ok(Distinct(value.into()))
+            }
+
+            fn visit_f64<E: Error>(self, value: f64) -> Result<Distinct, E> {
+                Ok(Distinct(value.into()))
+            }
+
+            fn visit_str<E: Error>(self, value: &str) -> Result<Distinct, E> {
+                Ok(Distinct(value.into()))
+            }
+
+            fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Distinct, A::Error> {
+                let mut values = Vec::new();
+                while let Some(Distinct(value)) = items.next_element()? {
+                    values.push(value);
+                }
+                Ok(Distinct(values.into()))
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<Distinct, A::Error> {
+                Ok(Distinct(values(distinct_entries(map)?).into()))
+            }
+        }
+
+        deserializer.deserialize_any(ValueVisitor)
+    }
+}
+
+fn values(entries: BTreeMap<String, Distinct>) -> Map<String, Value> {
+    entries.into_iter().map(|(key, Distinct(value))| (key, value)).collect()
+}
+
+/// For `deserialize_with`: an object of any values, in which every key occurs once, at any depth.
+pub(super) fn object<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Map<String, Value>, D::Error> {
+    Object::deserialize(deserializer).map(|Object(entries)| values(entries))
+}
+
+/// For `deserialize_with`: as [`object`], or null.
+pub(super) fn optional_object<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Map<String, Value>>, D::Error> {
+    Option::deserialize(deserializer).map(|object| object.map(|Object(entries)| values(entries)))
+}
+
+/// For `deserialize_with`: an object of texts, in which every key occurs once, or null.
+pub(super) fn optional_texts<'de, D>(deserializer: D) -> Result<Option<BTreeMap<String, String>>, D::Error>
+where
+    D: Deserializer<'de>,
+{
+    Option::deserialize(deserializer).map(|object| object.map(|Object(entries)| entries))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -135,6 +248,34 @@ mod tests {
         assert_eq!(read(r#"{"count": null}"#).unwrap().count, None);
         for wrong in ["3.5", "-1", "-1.0", "4294967296", "4294967296.0", "1e300", "\"3\"", "[3]"] {
             assert!(read(&format!(r#"{{"count": {wrong}}}"#)).unwrap_err().contains("expected u32"), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn keys_of_maps_occur_once_at_any_depth() {
+        #[derive(Debug, Deserialize)]
+        struct Free {
+            #[serde(deserialize_with = "object")]
+            any: Map<String, Value>,
+            #[serde(default, deserialize_with = "optional_texts")]
+            labels: Option<BTreeMap<String, String>>,
+            #[serde(default, deserialize_with = "optional_object")]
+            some: Option<Map<String, Value>>,
+        }
+        let text =
+            r#"{"any": {"a": [1, -2, 0.5, "x", null, true, {"b": 18446744073709551615}]}, "labels": {"k": "v"}, "some": null}"#;
+        let free: Free = serde_json::from_str(text).unwrap();
+        assert_eq!(Value::Object(free.any), serde_json::from_str::<Value>(text).unwrap()["any"]);
+        assert_eq!((free.labels.unwrap()["k"].as_str(), free.some), ("v", None));
+        for twice in [
+            r#"{"any": {"a": 1, "a": 1}}"#,
+            r#"{"any": {"b": [{"a": 1, "a": 2}]}}"#,
+            r#"{"any": {"b": {"a": {}, "a": {}}}}"#,
+            r#"{"any": {}, "labels": {"a": "1", "a": "2"}}"#,
+            r#"{"any": {}, "some": {"a": null, "\u0061": null}}"#,
+        ] {
+            let error = serde_json::from_str::<Free>(twice).unwrap_err();
+            assert!(error.to_string().starts_with("duplicate field `a`"), "{twice}: {error}");
         }
     }
 

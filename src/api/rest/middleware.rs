@@ -22,6 +22,7 @@ use tracing::Instrument;
 use super::v2;
 use crate::api::access::{Requirement, rest_requirement};
 use crate::api::body::Exchange;
+use crate::api::browser;
 use crate::api::errors::LogDetail;
 use crate::api::is_probe;
 use crate::api::request_log::{Completion, LogLimiter, REQUEST_ID, RequestIds, Severity, has_debug_span, log_request, span};
@@ -71,7 +72,9 @@ impl Middleware {
         let (code, severity) = (status.as_str(), severity(status));
         let completion = Completion { method: &method, id: &id, code, seconds, severity, detail: &detail };
         log_request(&completion, &span, &self.log_limiter);
-        if is_v2 { v2::convert_problem(response) } else { response }
+        let mut response = if is_v2 { v2::convert_problem(response) } else { response };
+        browser::add_headers(route, response.headers_mut());
+        response
     }
 }
 

@@ -26,14 +26,16 @@ use axum::{Extension, Router};
 use utoipa_axum::router::OpenApiRouter;
 
 use super::auth::authorize_rest;
+use super::browser::AllowedHosts;
 use super::errors::problem;
 use crate::error_code::ErrorCode;
 use crate::service::{App, Error};
 use middleware::Middleware;
 
 /// The router with all routes. Refuses bodies larger than `max_body` bytes. `metrics` renders the Prometheus text.
-pub fn router(app: Arc<App>, metrics: fn() -> String, max_body: usize) -> Router {
-    let (auth_app, middleware) = (app.clone(), Arc::new(Middleware::new()));
+/// `hosts`: the hosts that requests may name while the server has no keys.
+pub fn router(app: Arc<App>, metrics: fn() -> String, max_body: usize, hosts: AllowedHosts) -> Router {
+    let (auth_app, hosts, middleware) = (app.clone(), Arc::new(hosts), Arc::new(Middleware::new()));
     // The OpenAPI document contains the routes that are merged here.
     let (router, document) = OpenApiRouter::with_openapi(openapi::document())
         .merge(ops::router())
@@ -56,7 +58,7 @@ pub fn router(app: Arc<App>, metrics: fn() -> String, max_body: usize) -> Router
         .layer(Extension(extract::MaxBody(max_body)))
         .layer(Extension(metrics))
         .layer(Extension(description))
-        .layer(axum::middleware::from_fn(move |request, next| authorize_rest(auth_app.clone(), request, next)))
+        .layer(axum::middleware::from_fn(move |request, next| authorize_rest(auth_app.clone(), hosts.clone(), request, next)))
         .layer(axum::middleware::from_fn(move |request, next| middleware.clone().handle(request, next)))
         .with_state(app)
 }

@@ -20,6 +20,7 @@ pub use scope::{Scope, Scopes};
 
 use super::Error;
 use crate::error_code::ErrorCode;
+use crate::files;
 use crate::invalid::{Invalid, in_range};
 use crate::store::{self, KeyRecord, Store};
 
@@ -81,7 +82,7 @@ pub struct CreatedKey {
 /// [`Error::Invalid`] when the database is missing and `create` is false, [`Error::Internal`] when it cannot be read.
 pub async fn open_store(data_dir: &Path, create: bool) -> Result<Store, Error> {
     if create {
-        std::fs::create_dir_all(data_dir)
+        files::create_private_dir(data_dir)
             .map_err(|e| Invalid::new("--data-dir", data_dir.display(), format!("a directory that can be created ({e})")))?;
     } else if !data_dir.join(store::FILE).exists() {
         return Err(Invalid::new("--data-dir", data_dir.display(), "a data directory of a server").into());

@@ -183,9 +183,11 @@ async fn the_server_and_its_models() {
         server.app.registry.len()
     );
     let (status, code, _) = http.refused(INFER, &slot(json!({}))).await;
-    assert_eq!((status, code.as_str()), (404, "not_found"));
-    let (status, problem) = get("/v2/models/count/ready").await;
-    assert_eq!((status, &problem["code"]), (404, &json!("not_found")));
+    assert_eq!((status, code.as_str()), (409, "policy_unloaded"));
+    for path in ["/v2/models/count/ready", "/v2/models/count", "/v2/models/count/config", "/v2/models/count/versions/1"] {
+        let (status, problem) = get(path).await;
+        assert_eq!((status, &problem["code"]), (409, &json!("policy_unloaded")), "{path}");
+    }
     server.add("count", 1, Arc::new(TestPolicy::Count));
     assert_eq!(post("/v2/repository/models/sweep/unload", Value::Null).await.0, 200);
     assert_eq!(states().await, (json!("UNAVAILABLE"), json!("READY")));
@@ -274,7 +276,7 @@ async fn damaged_bodies_are_no_fault() {
     use tower::ServiceExt;
     let server = server().await;
     let app = server.app.clone();
-    let router = qedgix::api::rest::router(app, qedgix::telemetry::render_metrics, 1 << 20);
+    let router = qedgix::api::rest::router(app, qedgix::telemetry::render_metrics, 1 << 20, localhost());
     let mut ask = slot(json!({"sequence_id": 3, "sequence_start": true}));
     ask["inputs"][2].as_object_mut().unwrap().remove("data");
     ask["inputs"][2]["parameters"] = json!({"binary_data_size": 4});
@@ -295,7 +297,10 @@ async fn damaged_bodies_are_no_fault() {
         let mut damaged = body.clone();
         changes.into_iter().for_each(|(at, byte)| damaged[at] = byte);
         damaged.truncate(cut);
-        let request = axum::http::Request::post(INFER).header(LENGTH, length).body(axum::body::Body::from(damaged.clone()));
+        let request = axum::http::Request::post(INFER)
+            .header("host", "localhost")
+            .header(LENGTH, length)
+            .body(axum::body::Body::from(damaged.clone()));
         let status = router.clone().oneshot(request.unwrap()).await.unwrap().status();
         answered += usize::from(status == 200);
         assert!(!status.is_server_error(), "{status}: {}", String::from_utf8_lossy(&damaged));

@@ -208,7 +208,8 @@ async fn an_unloaded_model_is_refused_and_its_sequences_go_on() {
     let load = |name: &str| oip::RepositoryModelLoadRequest { model_name: name.into(), ..Default::default() };
     client.repository_model_unload(unload("count")).await.unwrap();
     for ask in [start("count", 6, 0), start("count:1", 5, 0), slot("count", 0)] {
-        assert_eq!(fails(&mut client, ask).await.0, Code::NotFound);
+        let (code, reason, _) = fails(&mut client, ask).await;
+        assert_eq!((code, reason.as_str()), (Code::FailedPrecondition, "policy_unloaded"));
     }
     let ready = |name: &str| oip::ModelReadyRequest { name: name.into(), version: String::new() };
     assert!(!client.model_ready(ready("count")).await.unwrap().into_inner().ready);

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use bytes::BufMut;
 use futures::StreamExt;
 use qedgix::wire::v1;
+use serde_json::json;
 use tonic::Code;
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_client::HealthClient;
@@ -120,7 +121,7 @@ async fn the_exposition_is_valid_and_contains_every_family() {
     let dir = tempfile::tempdir().unwrap();
     let binary = Binary::start(dir.path(), &[]).await;
     fly(&binary, "s", 0).await;
-    let job = reqwest::Client::new().post(format!("{}/v1/jobs", binary.http)).body("{\"threads\": 1, \"priority\": -1}");
+    let job = reqwest::Client::new().post(format!("{}/v1/jobs", binary.http)).json(&json!({"threads": 1, "priority": -1}));
     assert_eq!(job.send().await.unwrap().status(), 201);
     let families = parse(&binary.metrics().await);
     // The second exposition counts the request of the first.

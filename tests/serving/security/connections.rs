@@ -77,7 +77,7 @@ async fn silent_connections_and_bodies_time_out() {
     let said = closed(after(http, b"GET /livez HTTP/1.1\r\nhost: x\r\n\r\n").await).await;
     assert!(said.starts_with(b"HTTP/1.1 200 OK"), "{said:?}");
     // An incomplete body is an error of the caller.
-    let head = b"POST /v1/act HTTP/1.1\r\nhost: x\r\nconnection: close\r\ncontent-length: 100\r\n\r\n{\"polic";
+    let head = b"POST /v1/act HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\ncontent-type: application/json\r\ncontent-length: 100\r\n\r\n{\"polic";
     let said = String::from_utf8(closed(after(http, head).await).await).unwrap();
     assert!(said.starts_with("HTTP/1.1 400 "), "{said}");
     // After the preface, a gRPC connection may be silent for longer, because it answers pings.

@@ -2,6 +2,7 @@
 
 mod access;
 mod binary;
+mod browser;
 mod clocks;
 mod connections;
 mod keys;

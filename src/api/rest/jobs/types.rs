@@ -28,6 +28,7 @@ pub(super) struct JobRequest {
     #[schema(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$")]
     name: Option<String>,
     /// Labels, which the server does not interpret.
+    #[serde(default, deserialize_with = "json::optional_texts")]
     #[schema(schema_with = labels)]
     labels: Option<BTreeMap<String, String>>,
     /// Threads that the job may use.
@@ -43,9 +44,11 @@ pub(super) struct JobRequest {
     /// The configuration that `environment` and `training` start from; default: `practical`.
     preset: Option<Preset>,
     /// Fields that replace those of the preset; the symbols `M`, `N`, `K`, `v`, `t` and `d` are accepted, too.
+    #[serde(default, deserialize_with = "json::optional_object")]
     #[schema(value_type = Option<EnvConfig>)]
     environment: Option<Map<String, Value>>,
     /// Fields that replace those of the preset.
+    #[serde(default, deserialize_with = "json::optional_object")]
     #[schema(schema_with = partial_training)]
     training: Option<Map<String, Value>>,
     /// Seed of the training. Configuration and seed determine every metric and weight. Default: 1.

@@ -15,6 +15,7 @@ use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
 use super::extract::{Path, Raw, parse};
+use super::json::object;
 use crate::api::convert::tensors::TensorShape;
 use crate::api::errors::Problem;
 use crate::api::oip;
@@ -170,7 +171,7 @@ async fn index(State(app): Shared, Raw(body): Raw) -> Result<Json<Value>, Error>
 #[derive(Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct RepositoryRequest {
-    #[serde(default)]
+    #[serde(default, deserialize_with = "object")]
     parameters: Map<String, Value>,
 }
 

@@ -19,7 +19,7 @@ use crate::service::Error;
 struct Body {
     #[serde(default)]
     id: String,
-    #[serde(default)]
+    #[serde(default, deserialize_with = "json::object")]
     parameters: Map<String, Value>,
     inputs: Vec<Input>,
     #[serde(default)]
@@ -33,7 +33,7 @@ struct Input {
     #[serde(deserialize_with = "json::integers")]
     shape: Vec<i64>,
     datatype: String,
-    #[serde(default)]
+    #[serde(default, deserialize_with = "json::object")]
     parameters: Map<String, Value>,
     data: Option<Values>,
 }
@@ -42,7 +42,7 @@ struct Input {
 #[serde(deny_unknown_fields, remote = "Self")]
 struct Output {
     name: String,
-    #[serde(default)]
+    #[serde(default, deserialize_with = "json::object")]
     parameters: Map<String, Value>,
 }
 
