@@ -18,7 +18,7 @@ pub fn partial_path(path: &Path) -> PathBuf {
 /// # Errors
 /// The directory is missing or not writable, or the disk is full.
 pub fn write_atomic(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    replace(path, bytes, OpenOptions::new().create(true).truncate(true).write(true))
+    write_with(path, bytes, OpenOptions::new().create(true).truncate(true).write(true))
 }
 
 /// As [`write_atomic`], for a file that only its owner may read.
@@ -26,10 +26,10 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> io::Result<()> {
 /// # Errors
 /// As [`write_atomic`].
 pub fn write_private(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    replace(path, bytes, private_file().truncate(true))
+    write_with(path, bytes, private_file().truncate(true))
 }
 
-fn replace(path: &Path, bytes: &[u8], options: &OpenOptions) -> io::Result<()> {
+fn write_with(path: &Path, bytes: &[u8], options: &OpenOptions) -> io::Result<()> {
     let partial = partial_path(path);
     let written = write_synced(&partial, bytes, options).and_then(|()| fs::rename(&partial, path));
     if written.is_err() {
