@@ -68,30 +68,35 @@ impl Budget {
     }
 }
 
-/// What the requests of one peer hold. One peer may hold half of the budget.
+/// What the requests of one peer hold. One peer may hold half of the budget of a class.
 #[derive(Debug)]
 pub struct Purse {
     budget: Arc<Budget>,
-    used: AtomicUsize,
+    main: AtomicUsize,
+    open: AtomicUsize,
 }
 
 impl Purse {
     /// A peer without requests.
     pub fn new(budget: Arc<Budget>) -> Arc<Self> {
-        Arc::new(Self { budget, used: AtomicUsize::new(0) })
+        Arc::new(Self { budget, main: AtomicUsize::new(0), open: AtomicUsize::new(0) })
     }
 
     /// Takes bytes. Returns whether they fit; if not, they have to be given back.
     fn take(&self, class: u8, bytes: usize, large: bool) -> bool {
         let share = self.budget.share(class);
         let of_all = share.used.fetch_add(bytes, Ordering::Relaxed) + bytes;
-        let of_peer = self.used.fetch_add(bytes, Ordering::Relaxed) + bytes;
+        let of_peer = self.used(class).fetch_add(bytes, Ordering::Relaxed) + bytes;
         of_all <= if large { share.max_large } else { share.max } && of_peer <= share.max / 2
     }
 
     fn give_back(&self, class: u8, bytes: usize) {
         self.budget.share(class).used.fetch_sub(bytes, Ordering::Relaxed);
-        self.used.fetch_sub(bytes, Ordering::Relaxed);
+        self.used(class).fetch_sub(bytes, Ordering::Relaxed);
+    }
+
+    fn used(&self, class: u8) -> &AtomicUsize {
+        if class == Class::Open as u8 { &self.open } else { &self.main }
     }
 }
 
@@ -201,6 +206,8 @@ mod tests {
         other.admit(Class::Main).unwrap();
         one.grow(3 << 20).unwrap();
         assert_eq!((one.grow(1 << 20), other.grow(1 << 20)), (Err(Exhausted), Err(Exhausted)));
+        let probe = Holding::new(one.purse.clone());
+        assert_eq!(probe.admit(Class::Open), Ok(()));
         let of_another = holding(&budget);
         of_another.admit(Class::Main).unwrap();
         of_another.grow(2 << 20).unwrap();

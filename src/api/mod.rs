@@ -31,7 +31,21 @@ fn is_probe(path: &str) -> bool {
     PROBES.contains(&path)
 }
 
-/// Runs `work` here, or, if it is `large`, on a thread of its own: threads of connections serve many callers.
+/// Runs `work` here, or, if it is `large`, on a thread of its own: threads of connections serve many callers. Work that has not
+/// begun when the caller goes away is dropped.
 async fn offload<T: Send + 'static>(large: bool, work: impl FnOnce() -> T + Send + 'static) -> Result<T, Error> {
-    if large { tokio::task::spawn_blocking(work).await.map_err(Error::internal) } else { Ok(work()) }
+    if !large {
+        return Ok(work());
+    }
+    let task = tokio::task::spawn_blocking(work);
+    let _dropped_with_the_call = AbortOnDrop(task.abort_handle());
+    task.await.map_err(Error::internal)
+}
+
+struct AbortOnDrop(tokio::task::AbortHandle);
+
+impl Drop for AbortOnDrop {
+    fn drop(&mut self) {
+        self.0.abort();
+    }
 }

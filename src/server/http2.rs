@@ -117,6 +117,10 @@ where
         let mut stopped = pin!(stop.cancelled());
         loop {
             let event = poll_fn(|context| {
+                // First, so that a flood of requests does not put off the checks.
+                if self.ticks.poll_tick(context).is_ready() {
+                    return Poll::Ready(Event::Tick);
+                }
                 if let Poll::Ready(accepted) = self.connection.poll_accept(context) {
                     return Poll::Ready(Event::Accepted(accepted));
                 }
@@ -126,7 +130,7 @@ where
                 if !self.lifetime.is_closing() && stopped.as_mut().poll(context).is_ready() {
                     return Poll::Ready(Event::Stop);
                 }
-                self.ticks.poll_tick(context).map(|_| Event::Tick)
+                Poll::Pending
             });
             match event.await {
                 Event::Accepted(Some(accepted)) => {

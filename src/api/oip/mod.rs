@@ -18,6 +18,7 @@ use self::model::{model_error, policy_spec};
 use self::outputs::OutputSelection;
 use self::parameters::Parameters;
 use super::convert::tensors::{INPUTS, Tensor, element_count, fleet_input};
+use crate::api::offload;
 use crate::invalid::Invalid;
 use crate::service::act::{self, MemoryLocation};
 use crate::service::keys::Caller;
@@ -80,11 +81,7 @@ pub async fn infer(app: &App, caller: &Caller, request: InferRequest, deadline: 
     let Parameters { sequence, step, seed, timeout } = Parameters::read(parameters)?;
     let outputs = OutputSelection::new(outputs, sequence.is_none())?;
     check_names(&inputs)?;
-    let (state, input) = if element_count(&inputs) < LARGE {
-        read(inputs)?
-    } else {
-        tokio::task::spawn_blocking(|| read(inputs)).await.map_err(Error::internal)??
-    };
+    let (state, input) = offload(element_count(&inputs) >= LARGE, || read(inputs)).await??;
     let memory = match (sequence, state) {
         (None, state) => MemoryLocation::RecurrentState(state.unwrap_or_default()),
         (Some(sequence), None) => MemoryLocation::Sequence(sequence),

@@ -96,7 +96,7 @@ pub async fn read(request: Request, limit: usize) -> Result<Bytes, Error> {
 }
 
 /// Size of the buffer for a body, before it grows.
-const FIRST_BUFFER: usize = 64 << 10;
+const FIRST_BUFFER: usize = 8 << 10;
 
 /// Refuses compressed bodies.
 fn check_encoding(headers: &HeaderMap) -> Result<(), Error> {

@@ -18,7 +18,7 @@ use super::extract::{Path, Raw, parse};
 use super::json::object;
 use crate::api::convert::tensors::TensorShape;
 use crate::api::errors::Problem;
-use crate::api::oip;
+use crate::api::{offload, oip};
 use crate::service::keys::Caller;
 use crate::service::{App, Error};
 
@@ -144,7 +144,7 @@ async fn infer(
     let ModelPath { model, version } = path;
     let large = body.len() > LARGE;
     let decode = move || request::decode(&headers, body, model, version);
-    let (request, binary) = if large { tokio::task::spawn_blocking(decode).await.map_err(Error::internal)?? } else { decode()? };
+    let (request, binary) = offload(large, decode).await??;
     Ok(response::encode(oip::infer(&app, &caller, request, None).await?, &binary))
 }
 
