@@ -1,6 +1,6 @@
 //! Inference requests: JSON, followed by the binary data of the inputs that have a `binary_data_size`, in their order.
 
-use axum::http::{HeaderMap, header};
+use axum::http::HeaderMap;
 use bytes::Bytes;
 use serde::Deserialize;
 use serde_json::{Map, Value};
@@ -67,9 +67,6 @@ pub(super) fn decode(
     model: String,
     version: String,
 ) -> Result<(InferRequest, BinaryOutputs), Error> {
-    if let Some(encoding) = headers.get(header::CONTENT_ENCODING).filter(|encoding| *encoding != "identity") {
-        return Err(Invalid::new("Content-Encoding", format!("{encoding:?}"), "identity").into());
-    }
     let text = body.split_to(json_length(headers, body.len())?);
     let json: Body = parse(&text)?;
     let mut parameters = json.parameters;
