@@ -131,6 +131,10 @@ fn train(args: &TrainArgs, mut trainer: Trainer, threads: usize) -> anyhow::Resu
                     write_atomic(path, &trainer.snapshot())?;
                 }
             }
+            Event::Evaluating { layouts, .. } => {
+                bar.set_message(format!("evaluated on {layouts} of {} layouts", config.training.eval_episodes));
+            }
+            Event::Report(_) => {}
             Event::Diverged { env_steps } => {
                 bail!("training diverged at step {env_steps}: a parameter is no longer finite; try a smaller learning rate")
             }

@@ -3,6 +3,9 @@
 //! Checkpoints and baselines run through the same [`Policy`] trait. The episodes of a thread are stepped together. Layouts are
 //! independent, so the number of threads changes no bit.
 
+use std::ops::ControlFlow;
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use super::disturbance::Disturbance;
 use crate::env::{BatchEnv, EnvConfig, EpisodeMetrics, Point, points};
 use crate::invalid::{Invalid, in_range};
@@ -16,6 +19,23 @@ use crate::policy::{EnvParams, FleetGraph, FleetStep, Policy};
 pub fn evaluate(policy: &dyn Policy, env: &EnvConfig, seeds: &[u64], threads: usize) -> Result<Vec<EpisodeMetrics>, Invalid> {
     let parts = run_parallel(policy, env, seeds, threads, &Disturbance::default(), |_| ())?;
     Ok(parts.into_iter().flat_map(|(metrics, ())| metrics).collect())
+}
+
+/// As [`evaluate`], unless `stop` is set before the last slot: then `None`, within a slot.
+///
+/// # Errors
+/// As [`evaluate`].
+pub(super) fn evaluate_until(
+    policy: &dyn Policy,
+    env: &EnvConfig,
+    seeds: &[u64],
+    threads: usize,
+    stop: &AtomicBool,
+) -> Result<Option<Vec<EpisodeMetrics>>, Invalid> {
+    let observer = |_| StopObserver { stop, stopped: false };
+    let parts = run_parallel(policy, env, seeds, threads, &Disturbance::default(), observer)?;
+    let stopped = parts.iter().any(|(_, observer)| observer.stopped);
+    Ok((!stopped).then(|| parts.into_iter().flat_map(|(metrics, _)| metrics).collect()))
 }
 
 /// Metrics of a policy on layouts, with the curve and the trajectory that a report shows.
@@ -76,13 +96,29 @@ pub fn evaluate_traced(
     Ok(evaluation)
 }
 
-/// Is called with a batch of episodes in each of the slots 0..=K.
+/// Is called with a batch of episodes in each of the slots 0..=K, and may end them early.
 trait Observer {
-    fn observe(&mut self, env: &BatchEnv);
+    fn observe(&mut self, env: &BatchEnv) -> ControlFlow<()>;
 }
 
 impl Observer for () {
-    fn observe(&mut self, _env: &BatchEnv) {}
+    fn observe(&mut self, _env: &BatchEnv) -> ControlFlow<()> {
+        ControlFlow::Continue(())
+    }
+}
+
+/// Ends one thread's episodes when `stop` is set.
+struct StopObserver<'a> {
+    stop: &'a AtomicBool,
+    /// Whether it has ended them.
+    stopped: bool,
+}
+
+impl Observer for StopObserver<'_> {
+    fn observe(&mut self, env: &BatchEnv) -> ControlFlow<()> {
+        self.stopped = !env.done() && self.stop.load(Ordering::Acquire);
+        if self.stopped { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    }
 }
 
 /// Records one thread's episodes.
@@ -96,10 +132,10 @@ struct Recorder {
 }
 
 impl Observer for Recorder {
-    fn observe(&mut self, env: &BatchEnv) {
+    fn observe(&mut self, env: &BatchEnv) -> ControlFlow<()> {
         self.aoi.push((0..env.copies()).map(|b| env.mean_aoi(b)).collect());
         let (m, n) = (env.config().uavs, env.config().users);
-        let Some(b) = self.traced.filter(|&b| b < env.copies()) else { return };
+        let Some(b) = self.traced.filter(|&b| b < env.copies()) else { return ControlFlow::Continue(()) };
         let trajectory = &mut self.trajectory;
         trajectory.uavs.resize(m, Vec::new());
         trajectory.users.resize(n, Vec::new());
@@ -113,6 +149,7 @@ impl Observer for Recorder {
         for (ages, &age) in trajectory.aoi.iter_mut().zip(&env.aoi()[b * n..(b + 1) * n]) {
             ages.push(age);
         }
+        ControlFlow::Continue(())
     }
 }
 
@@ -168,8 +205,8 @@ fn run(
     let mut graphs = vec![FleetGraph::default(); seeds.len()];
     let mut headings = vec![0; seeds.len() * m];
     let (mut uavs, mut users): (Vec<Point>, Vec<Point>) = (Vec::with_capacity(m), Vec::with_capacity(n));
-    observer.observe(&env);
-    while !env.done() {
+    let mut flow = observer.observe(&env);
+    while flow.is_continue() && !env.done() {
         let step = env.slot();
         if let Some(uav) = disturbance.lost(step) {
             env.lose_uav(uav);
@@ -197,7 +234,7 @@ fn run(
             .collect();
         policy.act(&mut steps);
         env.step(&headings);
-        observer.observe(&env);
+        flow = observer.observe(&env);
     }
     Ok((0..seeds.len()).map(|b| env.metrics(b)).collect())
 }

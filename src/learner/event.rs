@@ -9,8 +9,17 @@ use crate::env::EpisodeMetrics;
 pub enum Event {
     /// Episodes were collected and the networks updated.
     Iteration(Iteration),
+    /// A part of the layouts of an evaluation in progress is done.
+    Evaluating {
+        /// Environment steps made.
+        env_steps: u64,
+        /// Layouts done.
+        layouts: usize,
+    },
     /// The greedy policy was evaluated on the validation layouts.
     Evaluation(Evaluation),
+    /// The policy that a report compares was evaluated on the layouts of reports, see [`super::Trainer::add_reports`].
+    Report(Evaluation),
     /// A parameter is not finite or too large. The run has ended; the best parameters so far remain available.
     Diverged {
         /// Environment steps made.
@@ -23,7 +32,7 @@ pub enum Event {
     },
 }
 
-/// Metrics of the greedy policy on the validation layouts.
+/// Metrics of a greedy policy on layouts.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Evaluation {
@@ -72,7 +81,8 @@ impl Event {
                 (*env_steps, "eval/coverage", m.coverage),
                 (*env_steps, "eval/fairness", m.fairness),
             ],
-            Self::Diverged { .. } | Self::Finished { .. } => Vec::new(),
+            Self::Report(Evaluation { env_steps, metrics }) => vec![(*env_steps, "eval-v1/mean_aoi", metrics.mean_aoi)],
+            Self::Evaluating { .. } | Self::Diverged { .. } | Self::Finished { .. } => Vec::new(),
         }
     }
 }

@@ -11,10 +11,14 @@ use super::replay::{EpisodeShape, Replay, ReplayArrays};
 use super::state::{Counters, RunState};
 use super::{Evaluation, LearnerState, TrainConfig};
 use crate::checkpoint;
+use crate::env::EpisodeMetrics;
 use crate::invalid::Invalid;
 
 const MAGIC: &[u8; 8] = b"qedgixss";
-const VERSION: u32 = 2;
+/// The version that is written.
+const VERSION: u32 = 3;
+/// The oldest version that is read. Version 2 had no evaluations in progress and no reports.
+const OLDEST_VERSION: u32 = 2;
 /// Magic and version.
 const PREFIX: usize = 12;
 const CHECKSUM: usize = 32;
@@ -26,7 +30,7 @@ pub enum SnapshotError {
     #[error("not a snapshot of a training run")]
     Foreign,
     /// The snapshot was written by another version of this program.
-    #[error("snapshot version {found} cannot be read; expected {VERSION}")]
+    #[error("snapshot version {found} cannot be read; expected {OLDEST_VERSION} to {VERSION}")]
     Version {
         /// The version found.
         found: u32,
@@ -60,6 +64,10 @@ struct Head {
     counters: Counters,
     latest: Option<Evaluation>,
     best: Option<Evaluation>,
+    #[serde(default)]
+    layouts: Vec<EpisodeMetrics>,
+    #[serde(default)]
+    reports: bool,
     adam_steps: u64,
     replay_next: usize,
 }
@@ -70,6 +78,8 @@ pub(super) fn encode(config: &TrainConfig, run: &RunState, learner: &LearnerStat
         counters: run.counters,
         latest: run.latest,
         best: run.best.as_ref().map(|(evaluation, _)| *evaluation),
+        layouts: run.layouts.clone(),
+        reports: run.reports,
         adam_steps: learner.adam_steps,
         replay_next: replay.next(),
     };
@@ -102,7 +112,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<Snapshot, SnapshotError> {
         return Err(SnapshotError::Checksum);
     }
     let found = u32::from_le_bytes([content[8], content[9], content[10], content[11]]);
-    if found != VERSION {
+    if !(OLDEST_VERSION..=VERSION).contains(&found) {
         return Err(SnapshotError::Version { found });
     }
     let mut sections = Sections(&content[PREFIX..]);
@@ -137,7 +147,16 @@ pub(super) fn decode(bytes: &[u8]) -> Result<Snapshot, SnapshotError> {
     if !head.counters.is_consistent(&head.config, replay.len()) {
         return Err(inconsistent("the counters contradict each other"));
     }
-    let run = RunState { counters: head.counters, latest: head.latest, best: head.best.map(|e| (e, parameters)) };
+    if head.layouts.len() > head.config.training.eval_episodes {
+        return Err(inconsistent("an evaluation has more layouts than configured"));
+    }
+    let run = RunState {
+        counters: head.counters,
+        latest: head.latest,
+        best: head.best.map(|e| (e, parameters)),
+        layouts: head.layouts,
+        reports: head.reports,
+    };
     Ok(Snapshot { config: head.config, run, learner, replay })
 }
 

@@ -3,12 +3,15 @@
 use serde::{Deserialize, Serialize};
 
 use super::{Evaluation, TrainConfig};
+use crate::env::EpisodeMetrics;
 
 /// What the next call of [`super::Trainer::next`] does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(super) enum Phase {
     Evaluate,
+    /// Evaluates for a report.
+    Report,
     Iterate,
     /// Yields [`super::Event::Finished`].
     #[serde(rename = "finish")]
@@ -45,6 +48,10 @@ pub(super) struct RunState {
     pub latest: Option<Evaluation>,
     /// The evaluation with the lowest mean AoI, and the parameters that reached it.
     pub best: Option<(Evaluation, Vec<f32>)>,
+    /// Metrics of the layouts done in the evaluation in progress.
+    pub layouts: Vec<EpisodeMetrics>,
+    /// Whether reports are evaluated.
+    pub reports: bool,
 }
 
 impl Counters {
@@ -71,6 +78,6 @@ impl RunState {
             targets_copied_at_episode: 0,
             next_evaluation: 0,
         };
-        Self { counters, latest: None, best: None }
+        Self { counters, latest: None, best: None, layouts: Vec::new(), reports: false }
     }
 }

@@ -1,9 +1,12 @@
 //! A training run as an iterator of events (docs/model.md, "Learner").
 //!
 //! An iteration collects `envs` episodes, makes its updates, and copies the target networks when due. The greedy policy is evaluated
-//! at step 0, every `eval_every` steps and at the end, on `valid-v1`; training never uses `eval-v1`. (configuration, seed) fixes
-//! every event and parameter, whatever the number of threads. A run restored from a snapshot yields the same events and parameters
-//! as a run without interruption.
+//! at step 0, every `eval_every` steps and at the end, on `eval_episodes` layouts of `valid-v1`; training never uses `eval-v1`.
+//! (configuration, seed) fixes every event and parameter, whatever the number of threads. A run restored from a snapshot yields the
+//! same events and parameters as a run without interruption.
+//!
+//! An event is a unit of work: between two events the run can be stopped and a snapshot taken. An evaluation has several if it has
+//! many layouts or large ones.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -14,8 +17,9 @@ use super::episodes::Symmetry;
 use super::replay::{EpisodeShape, Replay};
 use super::rollout::Rollout;
 use super::snapshot::{self, SnapshotError};
-use super::state::{Phase, RunState};
-use super::{Episodes, Evaluation, Event, Iteration, Learner, TrainConfig, Training, evaluate, layout_list};
+use super::state::{Counters, Phase, RunState};
+use super::evaluation::evaluate_until;
+use super::{Episodes, Evaluation, Event, Iteration, Learner, TrainConfig, Training, layout_list};
 use crate::checkpoint::{self, Checkpoint};
 use crate::env::EpisodeMetrics;
 use crate::invalid::Invalid;
@@ -73,7 +77,27 @@ impl Trainer {
         snapshot::encode(&self.config, &self.run, &self.learner.state(), &self.replay)
     }
 
-    /// A flag that stops the run: while it is set, [`Iterator::next`] returns `None`. The event in progress is still returned.
+    /// Adds reports: evaluations on `eval_episodes` layouts of `eval-v1` (at most all of them), of the initial parameters before the
+    /// first step and of the best ones after the last. A run that has them already stays as it is.
+    pub fn add_reports(&mut self) {
+        let Counters { phase, env_steps, .. } = self.run.counters;
+        if std::mem::replace(&mut self.run.reports, true) {
+            return;
+        }
+        let begun = self.run.latest.is_some() || !self.run.layouts.is_empty();
+        let all_steps = env_steps >= self.config.training.steps && matches!(phase, Phase::YieldFinished | Phase::Done);
+        if !begun || all_steps {
+            self.run.counters.phase = Phase::Report;
+        }
+    }
+
+    /// Uses `stop` as the stop flag, see [`Trainer::stop_flag`].
+    pub fn stop_with(&mut self, stop: Arc<AtomicBool>) {
+        self.stop = stop;
+    }
+
+    /// A flag that stops the run: while it is set, [`Iterator::next`] returns `None`. An iteration in progress is completed and
+    /// returned; a part of an evaluation is not, and is repeated later.
     pub fn stop_flag(&self) -> Arc<AtomicBool> {
         Arc::clone(&self.stop)
     }
@@ -118,22 +142,47 @@ impl Trainer {
         self.run.best.as_ref().map(|(e, _)| *e)
     }
 
-    fn evaluate(&mut self) -> Event {
-        let t = &self.config.training;
-        let parameters = self.learner.published_parameters()[..self.learner.agent().layout().len()].to_vec();
-        let policy = LearnedPolicy::new(self.config.agent(), self.config.dims(), parameters)
+    /// Evaluates the next part of the layouts: of the validation layouts in [`Phase::Evaluate`], of the layouts of reports in
+    /// [`Phase::Report`]. `None` if the stop flag is set meanwhile.
+    fn evaluate(&mut self) -> Option<Event> {
+        let (config, run) = (&self.config, &mut self.run);
+        let reporting = run.counters.phase == Phase::Report;
+        let trained = run.counters.env_steps > 0;
+        let published = self.learner.published_parameters();
+        let parameters = match &run.best {
+            Some((_, best)) if reporting && trained => best,
+            _ => published,
+        };
+        let list = layout_list(if reporting { "eval-v1" } else { "valid-v1" }).expect("both lists exist");
+        let seeds = list.seeds(config.training.eval_episodes);
+        let rest = &seeds[run.layouts.len().min(seeds.len())..];
+        let part = &rest[..rest.len().min(layouts_per_part(config))];
+        let agent_parameters = parameters[..self.learner.agent().layout().len()].to_vec();
+        let policy = LearnedPolicy::new(config.agent(), config.dims(), agent_parameters)
             .expect("the parameters have the length of the agent's layout");
-        let seeds = layout_list("valid-v1").expect("valid-v1 exists").seeds(t.eval_episodes);
-        let metrics = evaluate(&policy, &self.config.environment, &seeds, self.threads).expect("an agent fits its environment");
-        let now = Evaluation { env_steps: self.run.counters.env_steps, metrics: EpisodeMetrics::mean(&metrics) };
-        self.run.latest = Some(now);
-        if self.run.best.as_ref().is_none_or(|(best, _)| now.metrics.mean_aoi < best.metrics.mean_aoi) {
-            self.run.best = Some((now, self.learner.published_parameters().to_vec()));
+        let metrics = evaluate_until(&policy, &config.environment, part, self.threads, &self.stop);
+        run.layouts.extend(metrics.expect("an agent fits its environment")?);
+        let env_steps = run.counters.env_steps;
+        if run.layouts.len() < seeds.len() {
+            return Some(Event::Evaluating { env_steps, layouts: run.layouts.len() });
         }
-        let counters = &mut self.run.counters;
-        counters.next_evaluation = (counters.env_steps / t.eval_every + 1) * t.eval_every;
-        counters.phase = if counters.env_steps >= t.steps { Phase::YieldFinished } else { Phase::Iterate };
-        Event::Evaluation(now)
+        let now = Evaluation { env_steps, metrics: EpisodeMetrics::mean(&std::mem::take(&mut run.layouts)) };
+        if reporting {
+            run.counters.phase = if env_steps >= config.training.steps { Phase::YieldFinished } else { Phase::Evaluate };
+            return Some(Event::Report(now));
+        }
+        run.latest = Some(now);
+        if run.best.as_ref().is_none_or(|(best, _)| now.metrics.mean_aoi < best.metrics.mean_aoi) {
+            run.best = Some((now, published.to_vec()));
+        }
+        let t = &config.training;
+        run.counters.next_evaluation = (env_steps / t.eval_every + 1) * t.eval_every;
+        run.counters.phase = match run.reports {
+            _ if env_steps < t.steps => Phase::Iterate,
+            true => Phase::Report,
+            false => Phase::YieldFinished,
+        };
+        Some(Event::Evaluation(now))
     }
 
     fn iterate(&mut self) -> Event {
@@ -194,19 +243,28 @@ impl Iterator for Trainer {
     type Item = Event;
 
     fn next(&mut self) -> Option<Event> {
-        if self.stop.load(Ordering::Relaxed) {
+        if self.stop.load(Ordering::Acquire) {
             return None;
         }
-        Some(match self.run.counters.phase {
-            Phase::Evaluate => self.evaluate(),
-            Phase::Iterate => self.iterate(),
+        match self.run.counters.phase {
+            Phase::Evaluate | Phase::Report => self.evaluate(),
+            Phase::Iterate => Some(self.iterate()),
             Phase::YieldFinished => {
                 self.run.counters.phase = Phase::Done;
-                Event::Finished { env_steps: self.run.counters.env_steps }
+                Some(Event::Finished { env_steps: self.run.counters.env_steps })
             }
-            Phase::Done => return None,
-        })
+            Phase::Done => None,
+        }
     }
+}
+
+/// Layouts that an evaluation computes together, so that a part of it takes seconds at most. The number does not depend on the
+/// threads, because it determines the events.
+fn layouts_per_part(config: &TrainConfig) -> usize {
+    /// Pairs of a UAV and another node, over all slots and layouts of a part.
+    const PAIRS: usize = 1 << 22;
+    let env = &config.environment;
+    (PAIRS / (env.slots * env.uavs * (env.uavs + env.users))).clamp(8, 64)
 }
 
 /// The learning rate after `env_steps` environment steps. It falls linearly to `learning_rate_decay` of its start value.

@@ -58,7 +58,7 @@ fn uninterrupted(spec: &Value) -> (Rows, Checkpoint) {
     let seed = spec["seed"].as_u64().unwrap();
     let config = TrainConfig::resolve(algorithm, Preset::default(), &environment, &training, seed).unwrap();
     let reference = |checkpoint: &Checkpoint| {
-        let seeds = layout_list("eval-v1").unwrap().seeds(256);
+        let seeds = layout_list("eval-v1").unwrap().seeds(config.training.eval_episodes);
         EpisodeMetrics::mean(&evaluate(&checkpoint.policy(), &config.environment, &seeds, 1).unwrap()).mean_aoi
     };
     let mut trainer = Trainer::new(config.clone(), 1).unwrap();

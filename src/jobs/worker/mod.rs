@@ -12,7 +12,7 @@ use std::any::Any;
 use std::io::{Read, Write};
 use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::time::Duration;
 
 use tokio::sync::{mpsc, oneshot};
@@ -70,7 +70,11 @@ pub enum Error {
 
 /// The directive for the training thread. Initially it is [`Directive::Continue`].
 #[derive(Debug, Default)]
-pub(crate) struct StopSignal(AtomicU8);
+pub(crate) struct StopSignal {
+    directive: AtomicU8,
+    /// Set with the first directive to stop: the stop flag of the trainer.
+    stop: Arc<AtomicBool>,
+}
 
 impl StopSignal {
     const CONTINUE: u8 = 0;
@@ -84,11 +88,19 @@ impl StopSignal {
             Directive::Cancel => Self::CANCEL,
         };
         // A cancel is final. A pause can only be replaced by a cancel.
-        self.0.fetch_max(value, Ordering::Relaxed);
+        self.directive.fetch_max(value, Ordering::Relaxed);
+        if directive != Directive::Continue {
+            self.stop.store(true, Ordering::Release);
+        }
+    }
+
+    /// A flag that is set when the training thread has to stop.
+    fn flag(&self) -> Arc<AtomicBool> {
+        Arc::clone(&self.stop)
     }
 
     fn directive(&self) -> Directive {
-        match self.0.load(Ordering::Relaxed) {
+        match self.directive.load(Ordering::Relaxed) {
             Self::CONTINUE => Directive::Continue,
             Self::PAUSE => Directive::Pause,
             _ => Directive::Cancel,

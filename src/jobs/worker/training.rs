@@ -8,16 +8,11 @@ use tokio::sync::mpsc::Sender;
 
 use super::StopSignal;
 use crate::checkpoint::Checkpoint;
-use crate::env::EpisodeMetrics;
 use crate::jobs::Directive;
-use crate::learner::{Evaluation, Event, TrainConfig, Trainer, evaluate, layout_list};
+use crate::learner::{Evaluation, Event, TrainConfig, Trainer};
 use crate::store::WorkerResult;
 use crate::wire::v1::CheckpointKind;
 
-/// The layouts on which the initial and the published policy of a job are evaluated. Training never uses them.
-const EVAL_LAYOUTS: &str = "eval-v1";
-/// The metric of that evaluation.
-const EVAL_METRIC: &str = "eval-v1/mean_aoi";
 /// Maximum number of points of a curve. Longer runs skip iterations, the same ones in every run.
 const MAX_POINTS: u64 = 4000;
 
@@ -94,15 +89,11 @@ fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Re
         None => Trainer::new(config, threads)?,
     };
     drop(snapshot);
-    if trainer.env_steps() == 0 {
-        let untrained = eval_mean_aoi(&trainer.checkpoint()?, threads)?;
-        reports.push(Report::Metrics { step: 0, rows: vec![(0, EVAL_METRIC, untrained)] });
-    }
+    trainer.add_reports();
+    trainer.stop_with(stop.flag());
     let mut curve = CurveSampler::new(trainer.config(), trainer.env_steps());
     let mut last_snapshot = Instant::now();
-    while stop.directive() == Directive::Continue
-        && let Some(event) = trainer.next()
-    {
+    while let Some(event) = trainer.next() {
         let rows = curve.rows(&event);
         if !rows.is_empty() {
             reports.push(Report::Metrics { step: trainer.env_steps(), rows });
@@ -119,7 +110,7 @@ fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Re
                 let reason = format!("training diverged at step {env_steps}: a parameter is not finite or too large");
                 return Ok(WorkerResult::Failed { reason, permanent: true });
             }
-            Event::Iteration(_) | Event::Evaluation(_) | Event::Finished { .. } => {}
+            _ => {}
         }
         if last_snapshot.elapsed() >= snapshot_every && !reports.snapshot_pending.load(Ordering::Acquire) {
             reports.snapshot(&trainer);
@@ -134,19 +125,9 @@ fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Re
         }
         Directive::Pause | Directive::Continue => {
             reports.checkpoint(CheckpointKind::Last, &trainer.checkpoint()?);
-            let best = trainer.best()?.ok_or("no policy has been evaluated")?;
-            let step = trainer.env_steps();
-            reports.push(Report::Metrics { step, rows: vec![(step, EVAL_METRIC, eval_mean_aoi(&best, threads)?)] });
             Ok(WorkerResult::Succeeded)
         }
     }
-}
-
-/// Mean AoI of a policy on [`EVAL_LAYOUTS`].
-fn eval_mean_aoi(checkpoint: &Checkpoint, threads: usize) -> Result<f64, Box<dyn std::error::Error>> {
-    let seeds = layout_list(EVAL_LAYOUTS)?.seeds(usize::MAX);
-    let episodes = evaluate(&checkpoint.policy(), &checkpoint.config().environment, &seeds, threads)?;
-    Ok(EpisodeMetrics::mean(&episodes).mean_aoi)
 }
 
 /// Selects the iterations that become points of a training curve, and adds the training speed to them.
