@@ -127,7 +127,7 @@ pub struct Training {
     pub teacher_share: f64,
     /// Environment steps between evaluations.
     pub eval_every: u64,
-    /// Episodes per evaluation.
+    /// Layouts per evaluation.
     pub eval_episodes: usize,
 }
 

@@ -210,6 +210,100 @@ fn a_stopped_run_continues_when_the_flag_is_cleared() {
     assert_eq!(events, expected);
 }
 
+/// A run whose evaluations have several parts.
+fn many_layouts() -> TrainConfig {
+    let mut config = small_config(Algorithm::Vdn);
+    config.training.steps = 300;
+    config.training.eval_episodes = 150;
+    config
+}
+
+#[test]
+fn a_run_resumes_within_an_evaluation() {
+    let mut whole = Trainer::new(many_layouts(), 2).unwrap();
+    whole.add_reports();
+    let expected = collect_events(&mut whole);
+    let layouts: Vec<_> = expected
+        .iter()
+        .filter_map(|e| if let Event::Evaluating { env_steps, layouts } = e { Some((*env_steps, *layouts)) } else { None })
+        .collect();
+    let parts = |steps| [(steps, 64), (steps, 128)];
+    assert_eq!(layouts, [parts(0), parts(0), parts(280), parts(320), parts(320)].concat(), "with a report at both ends");
+    // Interrupted after every event.
+    let mut trainer = Trainer::new(many_layouts(), 1).unwrap();
+    trainer.add_reports();
+    let mut events = Vec::new();
+    while let Some(event) = trainer.next() {
+        events.push(event);
+        let saved = trainer.snapshot();
+        trainer = Trainer::restore(&saved, 1 + events.len() % 2).unwrap();
+        trainer.add_reports();
+        assert!(trainer.snapshot() == saved);
+    }
+    assert_eq!(events, expected);
+    assert!(trainer.snapshot() == whole.snapshot());
+}
+
+#[test]
+fn reports_evaluate_the_initial_and_the_best_weights_and_change_nothing_else() {
+    let mut plain = Trainer::new(many_layouts(), 1).unwrap();
+    let initial = plain.checkpoint().unwrap();
+    let without = collect_events(&mut plain);
+    let mut trainer = Trainer::new(many_layouts(), 1).unwrap();
+    trainer.add_reports();
+    let with = collect_events(&mut trainer);
+    assert_eq!(trainer.checkpoint().unwrap().to_bytes(), plain.checkpoint().unwrap().to_bytes());
+    let best = trainer.best().unwrap().unwrap();
+    assert_eq!(Some(&best), plain.best().unwrap().as_ref());
+    let evaluated = |events: &[Event]| -> Vec<Event> {
+        events.iter().filter(|e| !matches!(e, Event::Evaluating { .. } | Event::Report(_))).cloned().collect()
+    };
+    assert_eq!(evaluated(&with), evaluated(&without));
+    let seeds = layout_list("eval-v1").unwrap().seeds(150);
+    let reports: Vec<_> =
+        with.iter().filter_map(|e| if let Event::Report(e) = e { Some((e.env_steps, e.metrics)) } else { None }).collect();
+    let expected = [(0, &initial), (320, &best)].map(|(step, checkpoint)| {
+        let metrics = evaluate(&checkpoint.policy(), &checkpoint.config().environment, &seeds, 1).unwrap();
+        (step, EpisodeMetrics::mean(&metrics))
+    });
+    assert_eq!(reports, expected);
+}
+
+#[test]
+fn a_stop_within_an_evaluation_repeats_only_its_part() {
+    let expected = collect_events(&mut Trainer::new(many_layouts(), 1).unwrap());
+    let mut trainer = Trainer::new(many_layouts(), 1).unwrap();
+    let stop = trainer.stop_flag();
+    assert_eq!(trainer.next(), Some(expected[0].clone()));
+    // A thread that may set the flag before, within or after the next part: the events are the same in any case.
+    let mut events = vec![expected[0].clone()];
+    let setter = std::thread::spawn(move || stop.store(true, Ordering::Release));
+    events.extend(trainer.by_ref());
+    setter.join().unwrap();
+    let saved = trainer.snapshot();
+    events.extend(Trainer::restore(&saved, 1).unwrap());
+    assert_eq!(events, expected);
+}
+
+#[test]
+fn snapshots_of_format_version_2_are_read() {
+    let mut trainer = Trainer::new(small_config(Algorithm::Vdn), 1).unwrap();
+    trainer.by_ref().take(6).for_each(drop);
+    let new = trainer.snapshot();
+    // The same snapshot as version 2 wrote it: its first section has no fields of evaluations in progress and of reports.
+    let len = u64::from_le_bytes(new[12..20].try_into().unwrap()) as usize;
+    let head = std::str::from_utf8(&new[20..20 + len]).unwrap();
+    let old_head = head.replace(r#""layouts":[],"reports":false,"#, "");
+    assert!(old_head.len() < head.len(), "{head}");
+    let mut old = [&new[..8], &2_u32.to_le_bytes(), &(old_head.len() as u64).to_le_bytes(), old_head.as_bytes()].concat();
+    old.extend(&new[20 + len..new.len() - 32]);
+    let checksum = <sha2::Sha256 as sha2::Digest>::digest(&old);
+    old.extend(checksum);
+    let restored = Trainer::restore(&old, 1).unwrap();
+    assert!(restored.snapshot() == new);
+    assert_eq!(restored.collect::<Vec<_>>(), trainer.collect::<Vec<_>>());
+}
+
 #[test]
 fn a_damaged_snapshot_is_an_error() {
     let mut trainer = Trainer::new(small_config(Algorithm::Vdn), 1).unwrap();

@@ -16,6 +16,7 @@ use super::output::{errln, outln};
 use super::run_args::{RunArgs, all_cores};
 use super::{progress, table};
 use crate::checkpoint::Checkpoint;
+use crate::jobs::memory;
 use crate::learner::{Evaluation, Event, Summary, TrainConfig, Trainer, evaluate, layout_list, summarize};
 
 /// Flags of `train`.
@@ -68,6 +69,7 @@ pub async fn run(args: TrainArgs) -> anyhow::Result<()> {
         return Ok(());
     }
     let trainer = start(&args, threads)?;
+    memory::check(trainer.config(), threads, memory::available())?;
     let stop = trainer.stop_flag();
     tokio::spawn(async move {
         if tokio::signal::ctrl_c().await.is_ok() {

@@ -5,6 +5,7 @@
 
 mod executor;
 mod local;
+pub mod memory;
 mod scheduler;
 pub mod spec;
 pub mod worker;
@@ -39,6 +40,8 @@ pub struct SchedulerConfig {
     pub cancel_grace: Duration,
     /// Time after a pause after which the worker is killed. The worker uploads a snapshot first, which may be large.
     pub pause_grace: Duration,
+    /// Memory in bytes that a job can use at most. A job whose configuration needs more is refused.
+    pub memory: u64,
 }
 
 impl SchedulerConfig {
@@ -51,6 +54,7 @@ impl SchedulerConfig {
             heartbeat_timeout: Duration::from_secs(30),
             cancel_grace: Duration::from_secs(3),
             pause_grace: Duration::from_secs(30),
+            memory: memory::available(),
         }
     }
 }

@@ -62,6 +62,12 @@ impl EpisodeShape {
         [(k + 1) * m * 2, position_slots * n * 2, (k + 1) * n, k * m, k, m * crate::policy::TOKEN]
     }
 
+    /// Bytes of an episode in replay.
+    pub fn bytes(&self) -> usize {
+        let [uavs, users, aoi, actions, reward, identity_token] = self.widths();
+        4 * (uavs + users + reward + identity_token) + 2 * aoi + actions
+    }
+
     /// An empty batch of this shape.
     pub fn episodes(&self) -> Episodes {
         let &Self { uavs, users, slots, users_move } = self;

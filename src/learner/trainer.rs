@@ -14,11 +14,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use rand::RngExt;
 
 use super::episodes::Symmetry;
+use super::evaluation::evaluate_until;
 use super::replay::{EpisodeShape, Replay};
 use super::rollout::Rollout;
 use super::snapshot::{self, SnapshotError};
 use super::state::{Counters, Phase, RunState};
-use super::evaluation::evaluate_until;
 use super::{Episodes, Evaluation, Event, Iteration, Learner, TrainConfig, Training, layout_list};
 use crate::checkpoint::{self, Checkpoint};
 use crate::env::EpisodeMetrics;

@@ -8,6 +8,8 @@ use super::policies::{self, Publisher};
 use super::{App, Error, Page, PageRequest};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
+use crate::jobs::SchedulerConfig;
+use crate::jobs::memory::check as check_memory;
 use crate::jobs::spec::JobRequest;
 use crate::serving::Owner;
 use crate::store::{
@@ -34,19 +36,29 @@ pub async fn submit(
             return Err(Invalid::new("idempotency_key", format!("{key:?}"), "1 to 255 printable ASCII characters").into());
         }
     }
-    let digest = request.digest();
-    let spec = request.resolve(app.scheduler.config().cpu_budget)?;
+    let idempotency = idempotency_key.map(|key| (key, request.digest()));
+    // A repeated request returns its job, even if the server would not accept that job today.
+    if let Some((key, body)) = &idempotency
+        && let Some(result) = app.store.submitted_job(caller.owner().id(), key, body).await?
+    {
+        return submitted(app, result);
+    }
+    let SchedulerConfig { cpu_budget, memory, .. } = app.scheduler.config();
+    let spec = request.resolve(*cpu_budget)?;
+    check_memory(&spec.config, spec.threads, *memory)?;
     if let Some(name) = &spec.name {
         // Reported now instead of after training.
         policies::check_publishable(name)?;
         policies::check_owner(app, &Publisher::from(caller), name).await?;
     }
     app.admit()?;
-    let id = JobId(Uuid::now_v7());
-    let idempotency = idempotency_key.map(|key| (key, digest));
     let Publisher { owner, any_name, .. } = caller.into();
-    let new = NewJob { id, owner, any_name, spec, now: app.clock.now(), idempotency };
-    match app.store.submit_job(new).await? {
+    let new = NewJob { id: JobId(Uuid::now_v7()), owner, any_name, spec, now: app.clock.now(), idempotency };
+    submitted(app, app.store.submit_job(new).await?)
+}
+
+fn submitted(app: &App, result: SubmitResult) -> Result<(Job, bool), Error> {
+    match result {
         SubmitResult::Created(job) => {
             tracing::info!(job = %job.id, algorithm = job.spec.algorithm, threads = job.spec.threads, "job submitted");
             metrics::counter!("qedgix_jobs_submitted_total").increment(1);

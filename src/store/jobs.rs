@@ -297,6 +297,23 @@ async fn get_existing(db: &mut SqliteConnection, id: JobId) -> Result<Job> {
     find(db, id).await?.ok_or_else(|| corrupt("job", id, "deleted within a transaction"))
 }
 
+async fn find_submitted(
+    db: &mut SqliteConnection,
+    owner: Option<&str>,
+    key: &str,
+    body: &[u8; 32],
+) -> Result<Option<SubmitResult>> {
+    let sql = "SELECT k.body, j.id FROM idempotency_keys k JOIN jobs j ON j.number = k.job WHERE k.owner = ? AND k.key = ?";
+    let query = sqlx::query_as(sql).bind(owner.unwrap_or_default()).bind(key);
+    let first: Option<(Vec<u8>, String)> = query.fetch_optional(&mut *db).await?;
+    let Some((first, id)) = first else { return Ok(None) };
+    if first != body {
+        return Ok(Some(SubmitResult::Conflict));
+    }
+    let id = JobId::parse(&id).ok_or_else(|| corrupt("job", &id, "not an id"))?;
+    Ok(find(db, id).await?.map(SubmitResult::Existing))
+}
+
 impl Store {
     /// Queues a job.
     ///
@@ -304,21 +321,23 @@ impl Store {
     /// [`Error`](super::Error) when the database fails.
     pub async fn submit_job(&self, new: NewJob) -> Result<SubmitResult> {
         let mut tx = self.begin().await?;
-        if let Some((key, body)) = &new.idempotency {
-            let sql =
-                "SELECT k.body, j.id FROM idempotency_keys k JOIN jobs j ON j.number = k.job WHERE k.owner = ? AND k.key = ?";
-            let first: Option<(Vec<u8>, String)> =
-                sqlx::query_as(sql).bind(new.owner()).bind(key).fetch_optional(&mut *tx).await?;
-            if let Some((first, id)) = first {
-                let id = JobId::parse(&id).ok_or_else(|| corrupt("job", &id, "not an id"))?;
-                let job = get_existing(&mut tx, id).await?;
-                tx.abandon().await?;
-                return Ok(if first == body { SubmitResult::Existing(job) } else { SubmitResult::Conflict });
-            }
+        if let Some((key, body)) = &new.idempotency
+            && let Some(first) = find_submitted(&mut tx, new.owner.as_deref(), key, body).await?
+        {
+            tx.abandon().await?;
+            return Ok(first);
         }
         let job = insert(&mut tx, &new).await?;
         tx.commit().await?;
         Ok(SubmitResult::Created(job))
+    }
+
+    /// The result of repeating a submission of `owner` with this idempotency key and SHA-256 of its body; `None` if the key is new.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn submitted_job(&self, owner: Option<&str>, key: &str, body: &[u8; 32]) -> Result<Option<SubmitResult>> {
+        find_submitted(&mut *self.read.acquire().await?, owner, key, body).await
     }
 
     /// The job `id`.

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use prost_types::value::Kind;
 use qedgix::api::convert::structs::to_struct;
+use qedgix::jobs::SchedulerConfig;
 use qedgix::wire::v1;
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
@@ -113,6 +114,49 @@ async fn idempotency_key_creates_one_job() {
     assert_eq!(first["id"], same.id);
     let status = grpc.submit_job(request(with(&json!({"seed": 2})))).await.unwrap_err();
     assert_eq!(status.code(), Code::AlreadyExists);
+}
+
+#[tokio::test]
+async fn a_repeated_request_returns_its_job_whatever_the_server_accepts_now() {
+    let dir = tempfile::tempdir().unwrap();
+    let wide = with(&json!({"threads": 2}));
+    let submit = |server: &Server, spec: &Value, key: &str| {
+        server.request(Method::POST, "/v1/jobs").header("idempotency-key", key).json(spec)
+    };
+    let mut server = Server::start(dir.path(), 2).await;
+    let first = expect(submit(&server, &wide, "k1"), StatusCode::CREATED).await;
+    server.crash().await;
+
+    // The new server has a smaller CPU budget and less memory.
+    let shrink = |s: &mut SchedulerConfig| s.memory = 1 << 10;
+    let server = Server::start_with(dir.path(), 1, shrink).await;
+    let again = expect(submit(&server, &wide, "k1"), StatusCode::CREATED).await;
+    assert_eq!(first["id"], again["id"]);
+    let refused = expect(submit(&server, &wide, "k2"), StatusCode::BAD_REQUEST).await;
+    assert_eq!(refused["field"], "threads");
+    // The same key with another body is a conflict, also when the server would refuse that body.
+    let other = with(&json!({"threads": 9}));
+    let conflict = expect(submit(&server, &other, "k1"), StatusCode::CONFLICT).await;
+    assert_eq!(conflict["code"], "idempotency_conflict");
+}
+
+#[tokio::test]
+async fn a_job_that_needs_more_memory_than_there_is_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = Server::start_with(dir.path(), 2, |s| s.memory = 1 << 30).await;
+    for (field, fields) in [
+        ("training.buffer", json!({"training": {"buffer": 1_000_000, "steps": 1_000_000_000}})),
+        ("environment.uavs", json!({"environment": {"uavs": 1000, "users": 900}})),
+    ] {
+        let refused = server.request(Method::POST, "/v1/jobs").json(&fields);
+        let refused = expect(refused, StatusCode::BAD_REQUEST).await;
+        assert_eq!((&refused["code"], &refused["field"]), (&json!("invalid_argument"), &json!(field)), "{refused}");
+        assert!(refused["expected"].as_str().unwrap().contains("1024 MiB"), "{refused}");
+        let mut grpc = server.jobs().await;
+        let request = v1::SubmitJobRequest { spec: to_struct(&fields), ..Default::default() };
+        assert_eq!(grpc.submit_job(request).await.unwrap_err().code(), Code::InvalidArgument);
+    }
+    server.submit(&tiny()).await;
 }
 
 #[tokio::test]

@@ -155,7 +155,7 @@ fn training() -> Map<String, Value> {
         ),
         ("teacher_share", number(0.0, 1.0), "Smallest probability that the teacher flies a UAV for an episode."),
         ("eval_every", integer(1, STEPS), "Environment steps between evaluations."),
-        ("eval_episodes", integer(1, 4096), "Episodes of an evaluation."),
+        ("eval_episodes", integer(1, 4096), "Layouts per evaluation."),
     ];
     object(&fields, &Value::Null)
 }

@@ -8,6 +8,7 @@ use tokio::sync::mpsc::Sender;
 
 use super::StopSignal;
 use crate::checkpoint::Checkpoint;
+use crate::invalid::Invalid;
 use crate::jobs::Directive;
 use crate::learner::{Evaluation, Event, TrainConfig, Trainer};
 use crate::store::WorkerResult;
@@ -77,8 +78,11 @@ impl ReportQueue {
 pub(super) fn train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> WorkerResult {
     match try_train(task, reports, stop) {
         Ok(end) => end,
-        // Another attempt would fail with the same configuration, snapshot or weights.
-        Err(e) => WorkerResult::Failed { reason: e.to_string(), permanent: true },
+        Err(e) => {
+            // Another attempt would fail with the same configuration, snapshot or weights, but the host may have threads again.
+            let permanent = e.downcast_ref::<Invalid>().is_none_or(|e| e.field != "threads");
+            WorkerResult::Failed { reason: e.to_string(), permanent }
+        }
     }
 }
 

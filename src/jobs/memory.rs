@@ -1,0 +1,95 @@
+//! The memory of this machine, and whether a training run can fit into it.
+
+use std::path::{Path, PathBuf};
+
+use crate::invalid::Invalid;
+use crate::learner::{MemoryEstimate, TrainConfig};
+
+/// Memory in bytes that this process can use at most: that of the machine, or less if a control group limits it. `u64::MAX` if the
+/// system does not say.
+pub fn available() -> u64 {
+    let read = |path: &Path| std::fs::read_to_string(path).ok();
+    let machine = read(Path::new("/proc/meminfo")).and_then(|text| machine_memory(&text));
+    let groups = read(Path::new("/proc/self/cgroup")).unwrap_or_default();
+    let limits = limit_files(&groups).into_iter().filter_map(|path| read(&path)?.trim().parse().ok());
+    limits.chain(machine).min().unwrap_or(u64::MAX)
+}
+
+/// `MemTotal` of `/proc/meminfo`, in bytes.
+fn machine_memory(text: &str) -> Option<u64> {
+    let kib: u64 =
+        text.lines().find_map(|line| line.strip_prefix("MemTotal:"))?.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    Some(kib << 10)
+}
+
+/// The files that limit the memory of the control groups in `/proc/self/cgroup`, and of the groups that contain them.
+fn limit_files(groups: &str) -> Vec<PathBuf> {
+    let mut files = Vec::new();
+    for line in groups.lines() {
+        let mut parts = line.splitn(3, ':').skip(1);
+        let (Some(controllers), Some(path)) = (parts.next(), parts.next()) else { continue };
+        let (root, file) = match controllers {
+            "" => ("/sys/fs/cgroup", "memory.max"),
+            _ if controllers.split(',').any(|name| name == "memory") => ("/sys/fs/cgroup/memory", "memory.limit_in_bytes"),
+            _ => continue,
+        };
+        let group = Path::new(path.trim_start_matches('/'));
+        files.extend(group.ancestors().map(|group| Path::new(root).join(group).join(file)));
+    }
+    files
+}
+
+/// Checks that a run of `config` can fit into `available` bytes.
+///
+/// # Errors
+/// [`Invalid`] with the field that causes most of the estimate, the estimate, and the limit.
+pub fn check(config: &TrainConfig, threads: usize, available: u64) -> Result<(), Invalid> {
+    let estimate = MemoryEstimate::of(config, threads);
+    if estimate.total() <= available {
+        return Ok(());
+    }
+    let mib = |bytes: u64| bytes.div_ceil(1 << 20);
+    let MemoryEstimate { replay, parameters, activations } = estimate;
+    let value = format!(
+        "about {} MiB of memory (replay {}, parameters {}, activations {})",
+        mib(estimate.total()),
+        mib(replay),
+        mib(parameters),
+        mib(activations)
+    );
+    let expected = format!("a configuration that needs at most {} MiB, the memory of this machine", available >> 20);
+    Err(Invalid::new(estimate.largest_field(config), value, expected))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::train_config::{Algorithm, Preset};
+
+    #[test]
+    fn limits_of_control_groups_are_found() {
+        assert_eq!(machine_memory("MemFree: 1 kB\nMemTotal:       16 kB\n"), Some(16 << 10));
+        assert_eq!(machine_memory("nonsense"), None);
+        let files = limit_files("12:cpu,memory:/a\n3:pids:/b\n0::/user/run\nnonsense\n");
+        let files: Vec<_> = files.iter().map(|path| path.to_str().unwrap()).collect();
+        let expected = [
+            "/sys/fs/cgroup/memory/a/memory.limit_in_bytes",
+            "/sys/fs/cgroup/memory/memory.limit_in_bytes",
+            "/sys/fs/cgroup/user/run/memory.max",
+            "/sys/fs/cgroup/user/memory.max",
+            "/sys/fs/cgroup/memory.max",
+        ];
+        assert_eq!(files, expected);
+        assert!(available() > 1 << 20);
+    }
+
+    #[test]
+    fn a_run_that_cannot_fit_is_refused() {
+        let mut config = TrainConfig::preset(Algorithm::Qedgix, Preset::Practical);
+        check(&config, 1, 1 << 30).unwrap();
+        config.training.buffer = 1_000_000;
+        let error = check(&config, 1, 1 << 30).unwrap_err();
+        assert_eq!(error.field, "training.buffer");
+        assert!(error.expected.contains("1024 MiB"), "{error}");
+    }
+}
