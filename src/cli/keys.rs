@@ -87,24 +87,30 @@ enum What {
 /// The data directory has no database, a value is invalid, or the key is unknown.
 pub async fn run(args: KeysArgs) -> anyhow::Result<()> {
     let store = keys::open_store(&args.data_dir, matches!(args.what, What::Create { .. })).await?;
-    let now = Timestamp::now();
-    match args.what {
-        What::Create { name, scopes, owner, expires, rate, burst } => {
-            let new = NewKey { name, scopes, owner, lifetime: expires, rate, burst };
-            print_created(&keys::create(&store, new, now).await?, args.json)?;
-        }
-        What::Rotate { id, grace } => print_created(&keys::rotate(&store, &id, grace, now).await?, args.json)?,
-        What::Revoke { id } => keys::revoke(&store, &id, now).await?,
-        What::List => {
-            let list = keys::list(&store, now).await?;
-            if args.json {
-                outln!("{}", serde_json::to_string_pretty(&json!({"keys": list}))?)?;
-            } else {
-                outln!("{}", table(&list))?;
+    let done = async {
+        let now = Timestamp::now();
+        match args.what {
+            What::Create { name, scopes, owner, expires, rate, burst } => {
+                let new = NewKey { name, scopes, owner, lifetime: expires, rate, burst };
+                print_created(&keys::create(&store, new, now).await?, args.json)?;
+            }
+            What::Rotate { id, grace } => print_created(&keys::rotate(&store, &id, grace, now).await?, args.json)?,
+            What::Revoke { id } => keys::revoke(&store, &id, now).await?,
+            What::List => {
+                let list = keys::list(&store, now).await?;
+                if args.json {
+                    outln!("{}", serde_json::to_string_pretty(&json!({"keys": list}))?)?;
+                } else {
+                    outln!("{}", table(&list))?;
+                }
             }
         }
-    }
-    Ok(())
+        anyhow::Ok(())
+    };
+    let done = done.await;
+    // Without a server, the database is one file again.
+    store.close().await;
+    done
 }
 
 /// Prints the key alone to standard output, so that scripts can capture it, and everything else to standard error.

@@ -55,9 +55,8 @@ impl From<sqlx::Error> for BackupError {
 
 type Result<T, E = BackupError> = std::result::Result<T, E>;
 
-fn failed(path: &Path) -> impl FnOnce(io::Error) -> BackupError + use<> {
-    let path = path.to_owned();
-    move |cause| BackupError::File { path, cause }
+fn failed(path: &Path) -> impl FnOnce(io::Error) -> BackupError {
+    move |cause| BackupError::File { path: path.to_owned(), cause }
 }
 
 /// Copies the database in `data_dir`, which a server may use meanwhile, to `target`, which it replaces at the end and only if the

@@ -32,18 +32,6 @@ impl fmt::Display for JobId {
 }
 
 named_enum! {
-    /// What a job does.
-    JobKind {
-        /// Trains a policy.
-        Train = "train",
-        /// Evaluates policies.
-        Evaluate = "evaluate",
-        /// Trains many policies.
-        Sweep = "sweep",
-    }
-}
-
-named_enum! {
     /// The state of a job.
     JobState {
         /// Waits to be started.

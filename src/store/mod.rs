@@ -37,12 +37,12 @@ pub use attempts::{Attempt, AttemptOutcome, EndedAttempt, Lease, LeaseRecord, Wo
 pub use backup::{BackupError, backup, restore};
 pub use checkpoints::{Checkpoint, CheckpointKind, NewCheckpoint};
 pub use events::{JobEvent, JobEventKind};
-pub use jobs::{ActionResult, Job, JobAction, JobFilter, JobId, JobKind, JobState, NewJob, PendingAction, SubmitResult};
+pub use jobs::{ActionResult, Job, JobAction, JobFilter, JobId, JobState, NewJob, PendingAction, SubmitResult};
 pub use keys::KeyRecord;
 pub use metrics::{Metric, MetricCursor, MetricRow, is_metric_name};
 pub use policies::{NewPolicyVersion, PolicyVersion, PublishedPolicy};
 pub use snapshots::{PartialSnapshot, Snapshot};
-pub use specs::{JobSpec, StoredSpec, UnreadableSpec};
+pub use specs::{JobKind, JobSpec, StoredSpec, UnreadableSpec};
 pub use writes::WriteFailure;
 
 use std::path::{Path, PathBuf};

@@ -5,8 +5,20 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::JobKind;
+use super::named_enum::named_enum;
 use crate::train_config::TrainConfig;
+
+named_enum! {
+    /// What a job does.
+    JobKind {
+        /// Trains a policy.
+        Train = "train",
+        /// Evaluates policies.
+        Evaluate = "evaluate",
+        /// Trains many policies.
+        Sweep = "sweep",
+    }
+}
 
 /// The specification of a job, with all defaults filled in.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -105,7 +105,7 @@ impl Store {
             self.write.close().await;
         };
         if tokio::time::timeout(CLOSE_TIMEOUT, close).await.is_err() {
-            tracing::warn!("the database is still in use; its write-ahead log remains, and the next start reads it");
+            tracing::warn!("the database is still open; its write-ahead log remains, and the next start reads it");
         }
     }
 }

@@ -97,7 +97,7 @@ impl Server {
     }
 
     /// Waits until the server has stopped, and keeps its data directory.
-    pub async fn running(&mut self) {
+    pub async fn ended(&mut self) {
         (&mut self.running).await.unwrap().unwrap();
     }
 

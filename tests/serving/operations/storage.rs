@@ -168,7 +168,7 @@ async fn a_stopped_server_leaves_one_file_that_can_be_copied() {
     let (dir, copy) = (server.dir.path().to_owned(), tempfile::tempdir().unwrap());
     let file = database(&server);
     server.begin_stop();
-    with_timeout(server.running()).await;
+    with_timeout(server.ended()).await;
     let left: Vec<_> = std::fs::read_dir(&dir).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     assert!(!left.iter().any(|name| name.to_string_lossy().ends_with("-wal")), "{left:?}");
     let copied = copy.path().join("copy");
