@@ -8,7 +8,8 @@ use std::time::Duration;
 use crate::inflight::Budget;
 use crate::invalid::{Invalid, in_range};
 use crate::service::keys::Rate;
-use crate::serving::EngineConfig;
+use crate::service::policies::Retention;
+use crate::serving::{DEFAULT_MEMORY, EngineConfig};
 
 /// Settings of a server. Every field has a flag of `qedgix serve`.
 #[derive(Clone, Debug)]
@@ -39,6 +40,10 @@ pub struct Config {
     pub max_environments: usize,
     /// Memory of all hosted environments together, in bytes.
     pub environment_memory: usize,
+    /// Memory of all policies together, in bytes.
+    pub policy_memory: usize,
+    /// What the server keeps of old versions and checkpoints.
+    pub retention: Retention,
     /// Maximum size of a gRPC message or HTTP body, in bytes.
     pub max_message_size: usize,
     /// Maximum open streams of job events.
@@ -109,6 +114,8 @@ impl Config {
             environment_ttl: Duration::from_secs(600),
             max_environments: 1024,
             environment_memory: 1 << 30,
+            policy_memory: DEFAULT_MEMORY,
+            retention: Retention::default(),
             max_message_size: 16 << 20,
             max_watchers: 256,
             event_heartbeat: Duration::from_secs(15),
@@ -146,6 +153,9 @@ impl Config {
         in_seconds("--environment-ttl", self.environment_ttl, 0.001..=1e9)?;
         in_range("--max-environments", self.max_environments, 1..=100_000_000)?;
         in_range("--environment-memory", self.environment_memory, 1 << 20..=1 << 40)?;
+        in_range("--policy-memory", self.policy_memory, 1 << 20..=1 << 40)?;
+        in_range("--keep-checkpoints", self.retention.checkpoints, 0..=1_000_000)?;
+        in_range("--keep-versions", self.retention.versions, 0..=1_000_000)?;
         in_range("--max-message-size", self.max_message_size, 1024..=1 << 30)?;
         in_range("--max-watchers", self.max_watchers, 1..=100_000)?;
         in_seconds("--event-heartbeat", self.event_heartbeat, 0.001..=3600.0)?;

@@ -4,6 +4,7 @@
 //! queue; streams end and requests in flight are answered; the listeners close and the data directory is unlocked.
 
 mod connections;
+mod housekeeping;
 mod http2;
 mod keys;
 mod lifetime;
@@ -38,9 +39,9 @@ use crate::inflight::Budget;
 use crate::invalid::Invalid;
 use crate::jobs::{LocalProcess, Scheduler, SchedulerConfig};
 use crate::service::keys::{Keyring, Rate};
-use crate::service::policies::UploadLimit;
+use crate::service::policies::{Loads, UploadLimit};
 use crate::service::{App, WatchLimit, operations, policies};
-use crate::serving::{Engine, Environments, EnvironmentsConfig, Limits, Sessions};
+use crate::serving::{Engine, Environments, EnvironmentsConfig, Limits, Registry, Sessions};
 use crate::store::{self, Store};
 use crate::telemetry;
 
@@ -214,6 +215,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
     let environments = EnvironmentsConfig { limits, memory: config.environment_memory };
     data.make_private();
     let store = Store::open(&data.path).await?;
+    housekeeping::prepare_file(&store, &data.path).await?;
     let executor = match &config.worker {
         Some(program) => LocalProcess { program: program.clone() },
         None => LocalProcess::same_program().map_err(Error::Worker)?,
@@ -237,7 +239,9 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         uploads: UploadLimit::default(),
         scheduler: Scheduler::open(store.clone(), scheduler, Arc::new(executor), clock.clone(), draining.clone()).await?,
         store,
-        registry: Arc::default(),
+        registry: Arc::new(Registry::new(config.policy_memory)),
+        loads: Loads::default(),
+        retention: config.retention,
         sessions: Sessions::new(sessions, clock.clone()),
         environments: Environments::new(environments, clock.clone()),
         engine: Engine::start(config.engine).map_err(Error::Engine)?,
@@ -294,7 +298,7 @@ pub async fn run(
 
     let upkeep = tokio::spawn(app.store.clone().upkeep());
     let scheduler = tokio::spawn(app.scheduler.clone().run(format!("http://{workers}")));
-    let housekeeper = tokio::spawn(housekeeping(app.clone(), config.session_ttl.min(config.environment_ttl), budget));
+    let housekeeper = tokio::spawn(housekeeping::run(app.clone(), config.session_ttl.min(config.environment_ttl), budget));
     let health_reporter = tokio::spawn(health.clone().follow(app.clone()));
     let key_follower = tokio::spawn(keys::follow(app.clone()));
     // The server works without the file, for instance while the disk is full.
@@ -353,23 +357,3 @@ fn connections(config: &Config, listeners: &Listeners, app: &App, stop: &Cancell
 const MAX_WORKER_CONNECTIONS: usize = 4096;
 /// Budget of bytes in flight of workers: chunks of all jobs.
 const WORKER_INFLIGHT_BYTES: usize = 1 << 30;
-
-/// Expires idle sessions and environments, and maintains metrics.
-async fn housekeeping(app: Arc<App>, ttl: Duration, budget: Arc<Budget>) {
-    let inflight = metrics::gauge!("qedgix_inflight_bytes");
-    let mut sweep = tokio::time::interval((ttl / 4).clamp(Duration::from_secs(1), Duration::from_secs(30)));
-    // Recorded durations stay in memory until this moves them into their histogram buckets.
-    let mut upkeep = tokio::time::interval(Duration::from_secs(5));
-    loop {
-        tokio::select! {
-            _ = sweep.tick() => {
-                app.sessions.remove_expired();
-                app.environments.table().remove_expired();
-            }
-            _ = upkeep.tick() => {
-                telemetry::install_metrics().run_upkeep();
-                inflight.set(budget.used() as f64);
-            }
-        }
-    }
-}

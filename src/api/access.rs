@@ -27,7 +27,8 @@ const ADMIN: Requirement = Requirement::Scope(Scope::Admin);
 /// Service, methods (`*`: all) and their requirement.
 const GRPC: &[(&str, &str, Requirement)] = &[
     ("qedgix.v1.PolicyService", "Act ActBatch ActStream OpenSession CloseSession", ACT),
-    ("qedgix.v1.PolicyService", "GetSession ListSessions GetPolicy ListPolicies", READ),
+    ("qedgix.v1.PolicyService", "GetSession ListSessions GetPolicy ListPolicies ListPolicyVersions", READ),
+    ("qedgix.v1.PolicyService", "DeletePolicy DeletePolicyVersion", ADMIN),
     ("qedgix.v1.EnvironmentService", "CreateEnvironment Reset Step DeleteEnvironment", ACT),
     ("qedgix.v1.EnvironmentService", "GetEnvironment", READ),
     ("qedgix.v1.JobService", "SubmitJob CancelJob PauseJob ResumeJob RetryJob", JOBS),
@@ -54,7 +55,8 @@ const REST: &[(&str, &str, Requirement)] = &[
     ("POST", "/v1/environments /v1/environments/{id}/reset /v1/environments/{id}/step", ACT),
     ("DELETE", "/v1/environments/{id}", ACT),
     ("GET", "/v1/policies /v1/policies/{policy} /v1/policies/{policy}/export", READ),
-    ("GET", "/v1/policies/{name}/aliases /v1/policies/{name}/history", READ),
+    ("GET", "/v1/policies/{name}/aliases /v1/policies/{name}/history /v1/policies/{name}/versions", READ),
+    ("DELETE", "/v1/policies/{policy} /v1/policies/{name}/versions/{version}", ADMIN),
     ("POST", "/v1/policies/{name}/versions /v1/policies/{policy}/load /v1/policies/{policy}/unload", ADMIN),
     ("PUT", "/v1/policies/{name}/aliases/{alias}", ADMIN),
     ("DELETE", "/v1/policies/{name}/aliases/{alias}", ADMIN),

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use clap::{Args, Subcommand};
 use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, PercentEncode, utf8_percent_encode};
 use serde_json::{Value, json};
@@ -22,6 +22,8 @@ use crate::checkpoint::digest;
   qedgix policies alias set my-policy live 3 --expected 2      # only if live points to version 2
   qedgix policies history my-policy
   qedgix policies unload my-policy:1                            # open sessions continue
+  qedgix policies versions my-policy
+  qedgix policies delete my-policy:1
   qedgix policies export my-policy@live --out live.safetensors
   qedgix policies list --server 192.0.2.7:8080 --json")]
 pub struct PoliciesArgs {
@@ -67,6 +69,22 @@ enum Command {
         /// Output file [default: NAME-VERSION.safetensors]
         #[arg(long)]
         out: Option<PathBuf>,
+    },
+    /// List the versions of a policy, newest first
+    Versions {
+        /// Name of the policy
+        name: String,
+        /// Maximum number of versions
+        #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=1000))]
+        limit: u32,
+    },
+    /// Delete a version of a policy, or all of them; refused while an alias points to it or a session uses it
+    Delete {
+        /// NAME:VERSION, or NAME with --all-versions
+        policy: String,
+        /// Delete all versions
+        #[arg(long)]
+        all_versions: bool,
     },
     /// List, set and delete aliases
     #[command(subcommand)]
@@ -142,6 +160,8 @@ pub async fn run(args: PoliciesArgs) -> anyhow::Result<()> {
             })
         }
         Command::Export { policy, out } => export(&client, &policy, out).await?,
+        Command::Versions { name, limit } => versions(&client, &name, limit).await?,
+        Command::Delete { policy, all_versions } => delete(&client, &policy, all_versions).await?,
         Command::Alias(Alias::List { name }) => {
             let response = client.get(&path(&[&name, "aliases"])).await?;
             let rows = items(&response, "aliases").map(|a| [text(&a["alias"]), text(&a["version"])]);
@@ -207,6 +227,27 @@ async fn list(client: &Client) -> anyhow::Result<(Value, String)> {
     Ok((json!({"policies": all}), table))
 }
 
+async fn versions(client: &Client, name: &str, limit: u32) -> anyhow::Result<(Value, String)> {
+    let filter = query(&[("page_size", Some(limit.to_string()))]);
+    let response = client.get(&(path(&[name, "versions"]) + &filter)).await?;
+    let rows = items(&response, "versions").map(|v| {
+        let loaded = if v["loaded"] == true { "yes" } else { "no" };
+        [text(&v["ref"]["version"]), loaded.to_owned(), text(&v["aliases"]), text(&v["ref"]["digest"])]
+    });
+    let table = table::text_table(["version", "loaded", "aliases", "digest"], rows);
+    Ok((response, table))
+}
+
+async fn delete(client: &Client, policy: &str, all_versions: bool) -> anyhow::Result<(Value, String)> {
+    let url = match (policy.split_once(':'), all_versions) {
+        (Some((name, version)), false) => path(&[name, "versions", version]),
+        (None, true) => path(&[policy]),
+        (Some(_), true) => bail!("--all-versions needs NAME without a version"),
+        (None, false) => bail!("expected NAME:VERSION; to delete all versions of {policy}, add --all-versions"),
+    };
+    Ok((client.delete(&url).await?, format!("deleted {policy}")))
+}
+
 /// A policy and a table of its fields.
 fn details(policy: Value) -> (Value, String) {
     let reference = format!("{}:{}", text(&policy["ref"]["name"]), text(&policy["ref"]["version"]));
@@ -215,7 +256,9 @@ fn details(policy: Value) -> (Value, String) {
         ["digest".to_owned(), text(&policy["ref"]["digest"])],
         ["kind".to_owned(), format!("{}. {}", kind(&policy), text(&policy["description"]))],
     ];
-    for field in ["loaded", "aliases", "versions", "loaded_versions", "headings", "detection_range", "created_at"] {
+    for field in
+        ["loaded", "aliases", "versions", "version_count", "loaded_versions", "headings", "detection_range", "created_at"]
+    {
         rows.push([field.to_owned(), text(&policy[field])]);
     }
     for (metric, value) in policy["metrics"].as_object().into_iter().flatten() {

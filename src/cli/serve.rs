@@ -12,7 +12,8 @@ use super::output::{OutputError, outln};
 use crate::clock::Clock;
 use crate::config::{Config, TlsFiles};
 use crate::server::{self, DataDir, Endpoints, Listeners, Tls};
-use crate::serving::EngineConfig;
+use crate::service::policies::Retention;
+use crate::serving::{DEFAULT_MEMORY, EngineConfig};
 use crate::telemetry::{self, LogConfig, TraceExporter};
 
 /// Flags of `serve`.
@@ -65,6 +66,16 @@ pub struct ServeArgs {
     /// Maximum memory of all hosted environments together, in bytes
     #[arg(long, env = "QEDGIX_ENVIRONMENT_MEMORY", default_value_t = 1 << 30, value_name = "BYTES")]
     environment_memory: usize,
+    /// Maximum memory of all policies together, in bytes. A policy version is read when it is asked for; those that were not used for
+    /// the longest time leave memory
+    #[arg(long, env = "QEDGIX_POLICY_MEMORY", default_value_t = DEFAULT_MEMORY, value_name = "BYTES")]
+    policy_memory: usize,
+    /// Checkpoints to keep of each job that has ended, the best one first; 0: all
+    #[arg(long, env = "QEDGIX_KEEP_CHECKPOINTS", default_value_t = 0, value_name = "CHECKPOINTS")]
+    keep_checkpoints: u32,
+    /// Newest versions to keep of each policy, besides those with an alias; older ones are deleted; 0: all
+    #[arg(long, env = "QEDGIX_KEEP_VERSIONS", default_value_t = 0, value_name = "VERSIONS")]
+    keep_versions: usize,
     /// Maximum size of a gRPC message or HTTP body, in bytes
     #[arg(long, env = "QEDGIX_MAX_MESSAGE_SIZE", default_value_t = 16 << 20, value_name = "BYTES")]
     max_message_size: usize,
@@ -261,6 +272,8 @@ impl ServeArgs {
             environment_ttl: self.environment_ttl,
             max_environments: self.max_environments,
             environment_memory: self.environment_memory,
+            policy_memory: self.policy_memory,
+            retention: Retention { checkpoints: self.keep_checkpoints, versions: self.keep_versions },
             max_message_size: self.max_message_size,
             max_watchers: self.max_watchers,
             event_heartbeat: self.event_heartbeat,

@@ -31,11 +31,13 @@ pub use learned::LearnedPolicy;
 pub use neighbor_search::Detection;
 pub use sight::Sight;
 
+use serde::{Deserialize, Serialize};
+
 use crate::env::Ranges;
 use crate::invalid::Invalid;
 
 /// The input that a policy requires.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum RequiredInput {
     /// The detections of all nodes.
     Detections,

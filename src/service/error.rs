@@ -114,6 +114,11 @@ impl Error {
         }
     }
 
+    /// Why the server failed, or the message of another error. For logs only.
+    pub fn reason(&self) -> String {
+        std::error::Error::source(self).map_or_else(|| self.to_string(), ToString::to_string)
+    }
+
     /// The field that is not accepted, if the error is about one.
     pub fn invalid(&self) -> Option<&Invalid> {
         match self {

@@ -43,6 +43,10 @@ pub struct App {
     pub engine: Engine,
     /// API keys.
     pub keys: keys::Keyring,
+    /// Versions of policies that are being loaded.
+    pub loads: policies::Loads,
+    /// What the server keeps of old versions and checkpoints.
+    pub retention: policies::Retention,
     /// The limit of uploads of checkpoints.
     pub uploads: policies::UploadLimit,
     /// Limits of watches of jobs.

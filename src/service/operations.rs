@@ -77,6 +77,10 @@ pub struct ServerMetrics {
     pub environments: usize,
     /// Policy versions, loaded or not.
     pub policy_versions: usize,
+    /// Bytes of the policies in memory.
+    pub policy_memory: usize,
+    /// Policy versions read into memory since the start.
+    pub policy_loads: u64,
     /// Fleets in the engine's queue.
     pub engine_queue: usize,
     /// Threads that running jobs use.
@@ -103,6 +107,8 @@ pub async fn server_metrics(app: &App) -> ServerMetrics {
         sessions: app.sessions.len(),
         environments: app.environments.table().len(),
         policy_versions: app.registry.len(),
+        policy_memory: app.registry.memory_used(),
+        policy_loads: app.loads.count(),
         engine_queue: app.engine.waiting(),
         threads_busy: app.scheduler.threads_busy(),
         threads: app.scheduler.config().cpu_budget,

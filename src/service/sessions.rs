@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::act::SEQUENCE_PREFIX;
 use super::keys::Caller;
-use super::{App, Error, Page, PageRequest};
+use super::{App, Error, Page, PageRequest, policies};
 use crate::invalid::Invalid;
 use crate::serving::{PolicySpec, Session, SessionInfo, SessionOptions, TableEntry};
 
@@ -20,7 +20,7 @@ pub async fn open(app: &App, caller: &Caller, policy: &PolicySpec, options: Sess
         let expected = format!("an id that does not start with {SEQUENCE_PREFIX:?}, which the Open Inference Protocol reserves");
         return Err(Invalid::new("session_id", format!("{id:?}"), expected).into());
     }
-    let policy = app.registry.resolve(policy)?;
+    let policy = policies::resolve(app, policy).await?;
     Ok(app.sessions.open(caller.owner(), policy, options).await?)
 }
 

@@ -178,7 +178,7 @@ async fn new_version(app: &App, lease: Lease) -> Result<Option<policies::NewVers
     let name = job.spec.name.unwrap_or_else(|| format!("job-{}", &id[id.len() - 8..]));
     // The name was checked at submission. Another owner may have made it since, so it is checked again when it is published.
     let publisher = Publisher { owner: job.owner, any_name: job.any_name, key: None };
-    policies::NewVersion::from_bytes(publisher, &name, checkpoint).await.map(Some)
+    policies::NewVersion::from_bytes(app, publisher, &name, checkpoint).await.map(Some)
 }
 
 /// Size and digest that an upload declares.

@@ -29,6 +29,9 @@ pub use nodes::{Node, NodeDetection};
 pub use owner::Owner;
 pub use recurrent_state::RecurrentState;
 pub use reference::{PolicyRef, PolicySpec, VersionSelector, check_name};
-pub use registry::{LoadedPolicy, PolicyDetails, PolicyInfo, PolicyKind, Registry};
+pub use registry::{
+    DEFAULT_MEMORY, LoadedPolicy, MAX_SIBLINGS, MemoryShare, PolicyInfo, PolicyKind, Registry, RemovedVersions, Resolved,
+    VersionDetails, VersionState,
+};
 pub use sessions::{PendingStep, Session, SessionInfo, SessionOptions, Sessions, StepStart};
 pub use table::{LastUse, Limits, Table, TableEntry};

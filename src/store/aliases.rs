@@ -85,7 +85,7 @@ pub(super) async fn move_alias(db: &mut SqliteConnection, m: AliasMove<'_>) -> R
             let sql = "DELETE FROM policy_aliases WHERE name = ? AND alias = ?";
             sqlx::query(sql).bind(m.name).bind(m.alias).execute(&mut *db).await?;
         }
-        let sql = "INSERT INTO policy_promotions (name, alias, version, previous, at, by) VALUES (?, ?, ?, ?, ?, ?)";
+        let sql = "INSERT INTO alias_moves (name, alias, version, previous, at, by) VALUES (?, ?, ?, ?, ?, ?)";
         sqlx::query(sql)
             .bind(m.name)
             .bind(m.alias)
@@ -126,11 +126,15 @@ impl Store {
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
     pub async fn alias_history(&self, filter: AliasHistoryFilter<'_>, limit: u32) -> Result<Vec<AliasHistoryEntry>> {
-        let sql = "SELECT id, alias, version, previous, at, by FROM policy_promotions
-                   WHERE name = ?1 AND (?2 IS NULL OR alias = ?2) AND (?3 IS NULL OR id < ?3) ORDER BY id DESC LIMIT ?4";
+        let all = "SELECT id, alias, version, previous, at, by FROM alias_moves
+                   WHERE name = ?1 AND id < ?2 ORDER BY id DESC LIMIT ?3";
+        let of_alias = "SELECT id, alias, version, previous, at, by FROM alias_moves
+                        WHERE name = ?1 AND id < ?2 AND alias = ?4 ORDER BY id DESC LIMIT ?3";
         let AliasHistoryFilter { name, alias, before } = filter;
-        let rows: Vec<AliasHistoryRow> =
-            sqlx::query_as(sql).bind(name).bind(alias).bind(before).bind(limit).fetch_all(&self.read).await?;
+        let query = sqlx::query_as(if alias.is_some() { of_alias } else { all });
+        let query = query.bind(name).bind(before.unwrap_or(i64::MAX)).bind(limit);
+        let query = if let Some(alias) = alias { query.bind(alias) } else { query };
+        let rows: Vec<AliasHistoryRow> = query.fetch_all(&self.read).await?;
         let read = |row: AliasHistoryRow| {
             let AliasHistoryRow { id, alias, version, previous, at, by } = row;
             let (version, previous) = (version.map(|v| v as u64), previous.map(|v| v as u64));

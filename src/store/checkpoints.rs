@@ -1,6 +1,7 @@
 //! Checkpoints that jobs produce: the best and the last policy of each job, as safetensors.
 
 use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
 
 use jiff::Timestamp;
 use uuid::Uuid;
@@ -94,11 +95,6 @@ impl TryFrom<CheckpointRow> for Checkpoint {
     }
 }
 
-/// Checkpoints of job `?1`, or checkpoint `?2`; of jobs of owner `?3`, or of all.
-const SELECT: &str = "SELECT c.id, j.id AS job, c.kind, c.attempt, c.step, c.sha256, c.size, c.metrics, c.config, c.created_at
-    FROM checkpoints c JOIN jobs j ON j.number = c.job
-    WHERE (?1 IS NULL OR j.id = ?1) AND (?2 IS NULL OR c.id = ?2) AND (?3 IS NULL OR j.owner = ?3) ORDER BY c.created_at, c.id";
-
 impl Store {
     /// Stores a checkpoint in place of the previous one of its kind. Returns its id, which is the previous one's if the two
     /// are the same, or `None` if the attempt has ended.
@@ -149,8 +145,9 @@ impl Store {
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
     pub async fn checkpoints(&self, job: JobId) -> Result<Vec<Checkpoint>> {
-        let rows: Vec<CheckpointRow> =
-            sqlx::query_as(SELECT).bind(job.to_string()).bind(None::<String>).bind(None::<String>).fetch_all(&self.read).await?;
+        let sql = "SELECT c.id, j.id AS job, c.kind, c.attempt, c.step, c.sha256, c.size, c.metrics, c.config, c.created_at
+                   FROM jobs j JOIN checkpoints c ON c.job = j.number WHERE j.id = ? ORDER BY c.created_at, c.id";
+        let rows: Vec<CheckpointRow> = sqlx::query_as(sql).bind(job.to_string()).fetch_all(&self.read).await?;
         let read =
             |row| Checkpoint::try_from(row).inspect_err(|error| tracing::error!(%error, "a checkpoint is left out of a list"));
         Ok(rows.into_iter().filter_map(|row| read(row).ok()).collect())
@@ -172,11 +169,35 @@ impl Store {
     /// [`Error`](super::Error) when the database fails.
     pub async fn checkpoint(&self, id: Uuid, owner: Option<&str>) -> Result<Option<(Checkpoint, Vec<u8>)>> {
         let mut tx = self.read.begin().await?;
-        let row: Option<CheckpointRow> =
-            sqlx::query_as(SELECT).bind(None::<String>).bind(id.to_string()).bind(owner).fetch_optional(&mut *tx).await?;
+        let sql = "SELECT c.id, j.id AS job, c.kind, c.attempt, c.step, c.sha256, c.size, c.metrics, c.config, c.created_at
+                   FROM checkpoints c JOIN jobs j ON j.number = c.job WHERE c.id = ?1 AND (?2 IS NULL OR j.owner = ?2)";
+        let row: Option<CheckpointRow> = sqlx::query_as(sql).bind(id.to_string()).bind(owner).fetch_optional(&mut *tx).await?;
         let Some(row) = row else { return Ok(None) };
         let sql = "SELECT bytes FROM checkpoints WHERE id = ?";
         let bytes = sqlx::query_scalar(sql).bind(id.to_string()).fetch_one(&mut *tx).await?;
         Ok(Some((row.try_into()?, bytes)))
+    }
+
+    /// Deletes the checkpoints of ended jobs beyond the first `keep` of each, in the order best, last: of the jobs with row ids
+    /// in `jobs`.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn trim_checkpoints(&self, jobs: RangeInclusive<i64>, keep: u32) -> Result<u64> {
+        let sql = "DELETE FROM checkpoints WHERE job BETWEEN ?1 AND ?2
+                   AND (SELECT state FROM jobs WHERE number = checkpoints.job) IN ('cancelled', 'succeeded', 'failed')
+                   AND (SELECT count(*) FROM checkpoints c WHERE c.job = checkpoints.job AND c.kind < checkpoints.kind) >= ?3";
+        let mut tx = self.begin().await?;
+        let deleted = sqlx::query(sql).bind(*jobs.start()).bind(*jobs.end()).bind(keep).execute(&mut *tx).await?;
+        tx.commit().await?;
+        Ok(deleted.rows_affected())
+    }
+
+    /// The largest row id of a job; 0 without jobs.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn last_job(&self) -> Result<i64> {
+        Ok(sqlx::query_scalar("SELECT coalesce(max(number), 0) FROM jobs").fetch_one(&self.read).await?)
     }
 }

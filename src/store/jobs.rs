@@ -344,20 +344,35 @@ impl Store {
     pub async fn jobs(&self, filter: JobFilter<'_>, limit: usize, max_bytes: usize) -> Result<(Vec<Job>, bool)> {
         /// Bytes of a summary besides its texts.
         const FIXED: usize = 512;
-        /// SQL of the jobs with a condition on the owner.
-        macro_rules! jobs {
-            ($owner:literal) => {
-                concat!(
-                    "SELECT * FROM jobs WHERE (?1 IS NULL OR state = ?1) AND (?2 IS NULL OR number < ?2)",
-                    $owner,
-                    " ORDER BY number DESC"
-                )
-            };
-        }
         let JobFilter { owner, state, before } = filter;
-        let sql = if owner.is_some() { jobs!(" AND owner = ?3") } else { jobs!("") };
-        let query = sqlx::query_as(sql).bind(state.map(JobState::as_str)).bind(before).bind(owner);
-        let (mut rows, mut jobs, mut bytes) = (query.fetch(&self.read), Vec::new(), 0);
+        let before = before.unwrap_or(i64::MAX);
+        let state = state.map(JobState::as_str);
+        // One statement per combination, so that each finds its rows by an index.
+        let numbers = match (owner, state) {
+            (None, None) => {
+                let sql = "SELECT number FROM jobs WHERE number < ? ORDER BY number DESC LIMIT ?";
+                sqlx::query_scalar(sql).bind(before)
+            }
+            (Some(owner), None) => {
+                let sql = "SELECT number FROM jobs WHERE owner = ? AND number < ? ORDER BY number DESC LIMIT ?";
+                sqlx::query_scalar(sql).bind(owner).bind(before)
+            }
+            (None, Some(state)) => {
+                let sql = "SELECT number FROM jobs WHERE state = ? AND number < ? ORDER BY number DESC LIMIT ?";
+                sqlx::query_scalar(sql).bind(state).bind(before)
+            }
+            (Some(owner), Some(state)) => {
+                let sql = "SELECT number FROM jobs WHERE owner = ? AND state = ? AND number < ? ORDER BY number DESC LIMIT ?";
+                sqlx::query_scalar(sql).bind(owner).bind(state).bind(before)
+            }
+        };
+        let mut db = self.read.begin().await?;
+        let mut numbers: Vec<i64> = numbers.bind(limit as i64 + 1).fetch_all(&mut *db).await?;
+        let more = numbers.len() > limit;
+        numbers.truncate(limit);
+        let sql = "SELECT * FROM jobs WHERE number IN (SELECT value FROM json_each(?)) ORDER BY number DESC";
+        let query = sqlx::query_as(sql).bind(serde_json::Value::from(numbers).to_string());
+        let (mut rows, mut jobs, mut bytes) = (query.fetch(&mut *db), Vec::new(), 0);
         while let Some(row) = rows.try_next().await? {
             let row: JobRow = row;
             let job = match Job::try_from(row) {
@@ -368,12 +383,12 @@ impl Store {
                 }
             };
             bytes += FIXED + job.spec.shown_bytes() + job.reason.as_ref().map_or(0, String::len);
-            if jobs.len() == limit || (bytes > max_bytes && !jobs.is_empty()) {
+            if bytes > max_bytes && !jobs.is_empty() {
                 return Ok((jobs, true));
             }
             jobs.push(job);
         }
-        Ok((jobs, false))
+        Ok((jobs, more))
     }
 
     /// The number of jobs in each state.

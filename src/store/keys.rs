@@ -33,13 +33,6 @@ pub struct KeyRecord {
     pub last_used_at: Option<Timestamp>,
 }
 
-/// SQL of the revision that the next change of a key gets.
-macro_rules! next_revision {
-    () => {
-        "(SELECT COALESCE(MAX(revision), 0) + 1 FROM api_keys)"
-    };
-}
-
 impl Store {
     /// Stores a new key. Returns false if its id is taken.
     ///
@@ -59,11 +52,9 @@ impl Store {
     /// [`Error`](super::Error) when the database fails.
     pub async fn rotate_key(&self, old: &str, new: &KeyRecord, expires_at: Timestamp) -> Result<bool> {
         let mut tx = self.begin().await?;
-        let sql = concat!(
-            "UPDATE api_keys SET expires_at = MIN(COALESCE(expires_at, ?1), ?1), revision = ",
-            next_revision!(),
-            " WHERE id = ?2 AND revoked_at IS NULL AND (expires_at IS NULL OR expires_at > ?3)"
-        );
+        let sql = "UPDATE api_keys SET expires_at = MIN(COALESCE(expires_at, ?1), ?1),
+                   revision = (SELECT COALESCE(MAX(revision), 0) + 1 FROM api_keys)
+                   WHERE id = ?2 AND revoked_at IS NULL AND (expires_at IS NULL OR expires_at > ?3)";
         let update = sqlx::query(sql).bind(expires_at.as_millisecond()).bind(old).bind(new.created_at.as_millisecond());
         let expires = update.execute(&mut *tx).await?.rows_affected() == 1;
         let rotated = expires && insert(&mut tx, new).await?;
@@ -99,8 +90,8 @@ impl Store {
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
     pub async fn revoke_key(&self, id: &str, now: Timestamp) -> Result<bool> {
-        let sql =
-            concat!("UPDATE api_keys SET revoked_at = COALESCE(revoked_at, ?), revision = ", next_revision!(), " WHERE id = ?");
+        let sql = "UPDATE api_keys SET revoked_at = COALESCE(revoked_at, ?),
+                   revision = (SELECT COALESCE(MAX(revision), 0) + 1 FROM api_keys) WHERE id = ?";
         let mut tx = self.begin().await?;
         let done = sqlx::query(sql).bind(now.as_millisecond()).bind(id).execute(&mut *tx).await?;
         tx.commit().await?;
@@ -122,12 +113,9 @@ impl Store {
 }
 
 async fn insert(db: &mut SqliteConnection, key: &KeyRecord) -> Result<bool> {
-    let sql = concat!(
-        "INSERT INTO api_keys (id, owner, name, digest, scopes, rate, burst, created_at, expires_at, revision)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ",
-        next_revision!(),
-        ") ON CONFLICT (id) DO NOTHING"
-    );
+    let sql = "INSERT INTO api_keys (id, owner, name, digest, scopes, rate, burst, created_at, expires_at, revision)
+               VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, (SELECT COALESCE(MAX(revision), 0) + 1 FROM api_keys))
+               ON CONFLICT (id) DO NOTHING";
     let done = sqlx::query(sql)
         .bind(&key.id)
         .bind(&key.owner)

@@ -27,7 +27,10 @@ mod keys;
 mod metrics;
 mod named_enum;
 mod policies;
+#[cfg(test)]
+mod query_plans;
 mod snapshots;
+mod space;
 mod specs;
 mod upkeep;
 mod writes;
@@ -40,7 +43,7 @@ pub use events::{JobEvent, JobEventKind};
 pub use jobs::{ActionResult, Job, JobAction, JobFilter, JobId, JobState, NewJob, PendingAction, SubmitResult};
 pub use keys::KeyRecord;
 pub use metrics::{Metric, MetricCursor, MetricRow, is_metric_name};
-pub use policies::{NewPolicyVersion, PolicyVersion, PublishedPolicy};
+pub use policies::{NewPolicyVersion, PolicyVersion, PublishedPolicy, VersionKey};
 pub use snapshots::{PartialSnapshot, Snapshot};
 pub use specs::{JobKind, JobSpec, StoredSpec, UnreadableSpec};
 pub use writes::WriteFailure;
@@ -51,7 +54,7 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use sqlx::migrate::{MigrateError, Migration, MigrationType, Migrator};
-use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
+use sqlx::sqlite::{SqliteAutoVacuum, SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
 use sqlx::{Connection, SqlSafeStr, SqliteConnection, SqlitePool};
 
 use crate::files;
@@ -70,6 +73,7 @@ const MIGRATIONS: &[(&str, &str)] = &migrations![
     "0004_events.sql",
     "0005_api_keys.sql",
     "0006_job_specifications.sql",
+    "0007_versions.sql",
     "0008_owners.sql",
     "0009_consecutive_failures.sql",
 ];
@@ -166,12 +170,15 @@ impl Store {
             .synchronous(SqliteSynchronous::Full)
             .foreign_keys(true)
             .busy_timeout(BUSY_TIMEOUT);
+        let mut create = options.clone().create_if_missing(true);
         // SQLite gives the other files of the database the permissions of this one.
-        match files::private_file().create_new(true).open(&path) {
-            Err(error) if error.kind() != std::io::ErrorKind::AlreadyExists => return Err(sqlx::Error::Io(error).into()),
-            _ => {}
+        match files::private_file().create_new(true).open(path) {
+            // In an old file the setting has no effect before `rewrite`, and it would be a write at every start.
+            Ok(_) => create = create.auto_vacuum(SqliteAutoVacuum::Incremental),
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
+            Err(error) => return Err(sqlx::Error::Io(error).into()),
         }
-        SqliteConnection::connect_with(&options.clone().create_if_missing(true)).await?.close().await?;
+        SqliteConnection::connect_with(&create).await?.close().await?;
         // From here on a missing file is an error: a new, empty one would hide that the data is lost. Connections do not age,
         // because the last one to be closed would delete the write-ahead log.
         let pool = SqlitePoolOptions::new().acquire_timeout(ACQUIRE_TIMEOUT).idle_timeout(None).max_lifetime(None);

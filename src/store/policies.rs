@@ -31,6 +31,8 @@ pub struct NewPolicyVersion<'a> {
     pub digest: &'a str,
     /// The checkpoint, as safetensors.
     pub checkpoint: &'a [u8],
+    /// What lists show of it, as JSON.
+    pub info: &'a str,
     /// The current time.
     pub now: Timestamp,
     /// An alias to point to the version.
@@ -41,6 +43,17 @@ pub struct NewPolicyVersion<'a> {
     pub owner: Option<&'a str>,
     /// Whether the name may be one that another owner made.
     pub any_name: bool,
+}
+
+/// A published version without its checkpoint.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct VersionKey {
+    /// Name of the policy.
+    pub name: String,
+    /// Number of the version.
+    pub version: u64,
+    /// SHA-256 of its checkpoint, in hexadecimal.
+    pub digest: String,
 }
 
 /// The result of a publication.
@@ -88,13 +101,50 @@ impl Store {
         owner_of(&mut *self.read.acquire().await?, name).await
     }
 
-    /// Names and numbers of all versions.
+    /// All versions, without their checkpoints.
     ///
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
-    pub async fn policy_versions(&self) -> Result<Vec<(String, u64)>, Error> {
-        let rows = sqlx::query("SELECT name, version FROM policy_versions ORDER BY name, version").fetch_all(&self.read).await?;
-        rows.iter().map(|row| Ok((row.try_get(0)?, row.try_get::<i64, _>(1)? as u64))).collect()
+    pub async fn policy_versions(&self) -> Result<Vec<VersionKey>, Error> {
+        let sql = "SELECT name, version, digest FROM policy_versions ORDER BY name, version";
+        let rows: Vec<(String, i64, String)> = sqlx::query_as(sql).fetch_all(&self.read).await?;
+        Ok(rows.into_iter().map(|(name, version, digest)| VersionKey { name, version: version as u64, digest }).collect())
+    }
+
+    /// What lists show of a version, as JSON; `None` if it was not stored yet.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn policy_info(&self, name: &str, version: u64) -> Result<Option<String>, Error> {
+        let sql = "SELECT info FROM policy_infos WHERE name = ? AND version = ?";
+        Ok(sqlx::query_scalar(sql).bind(name).bind(version as i64).fetch_optional(&self.read).await?)
+    }
+
+    /// Stores what lists show of a version, unless the version was deleted.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn store_policy_info(&self, name: &str, version: u64, info: &str) -> Result<(), Error> {
+        let sql = "REPLACE INTO policy_infos (name, version, info)
+                   SELECT name, version, ?3 FROM policy_versions WHERE name = ?1 AND version = ?2";
+        let mut tx = self.begin().await?;
+        sqlx::query(sql).bind(name).bind(version as i64).bind(info).execute(&mut *tx).await?;
+        tx.commit().await
+    }
+
+    /// Deletes versions of a policy, in one transaction. Their numbers are never given to other versions.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when an alias points to one of them or the database fails.
+    pub async fn delete_policy_versions(&self, name: &str, versions: &[u64]) -> Result<(), Error> {
+        let mut tx = self.begin().await?;
+        for &version in versions {
+            let sql = "DELETE FROM policies_unloaded WHERE name = ? AND version = ?";
+            sqlx::query(sql).bind(name).bind(version as i64).execute(&mut *tx).await?;
+            let sql = "DELETE FROM policy_versions WHERE name = ? AND version = ?";
+            sqlx::query(sql).bind(name).bind(version as i64).execute(&mut *tx).await?;
+        }
+        Ok(tx.commit().await?)
     }
 
     /// The version `version` of policy `name`.
@@ -169,13 +219,15 @@ pub(super) async fn publish(db: &mut SqliteConnection, new: NewPolicyVersion<'_>
 
 async fn insert(db: &mut SqliteConnection, new: NewPolicyVersion<'_>) -> Result<PublishedPolicy, Error> {
     let created_at = new.now.as_millisecond();
-    let sql = "INSERT INTO policies (name, created_at, owner) VALUES (?, ?, ?) ON CONFLICT (name) DO NOTHING";
-    sqlx::query(sql).bind(new.name).bind(created_at).bind(new.owner).execute(&mut *db).await?;
-    let sql = "INSERT INTO policy_versions (name, version, digest, checkpoint, created_at)
-               SELECT ?1, COALESCE(MAX(version), 0) + 1, ?2, ?3, ?4 FROM policy_versions WHERE name = ?1
-               RETURNING version";
-    let query = sqlx::query_scalar(sql).bind(new.name).bind(new.digest).bind(new.checkpoint).bind(created_at);
-    let version: i64 = query.fetch_one(&mut *db).await?;
+    let sql = "INSERT INTO policies (name, created_at, owner, last_version) VALUES (?, ?, ?, 1)
+               ON CONFLICT (name) DO UPDATE SET last_version = last_version + 1 RETURNING last_version";
+    let insert = sqlx::query_scalar(sql).bind(new.name).bind(created_at).bind(new.owner);
+    let version: i64 = insert.fetch_one(&mut *db).await?;
+    let sql = "INSERT INTO policy_versions (name, version, digest, checkpoint, created_at) VALUES (?, ?, ?, ?, ?)";
+    let insert = sqlx::query(sql).bind(new.name).bind(version).bind(new.digest).bind(new.checkpoint).bind(created_at);
+    insert.execute(&mut *db).await?;
+    let sql = "INSERT INTO policy_infos (name, version, info) VALUES (?, ?, ?)";
+    sqlx::query(sql).bind(new.name).bind(version).bind(new.info).execute(&mut *db).await?;
     Ok(PublishedPolicy { version: version as u64, created_at, new: true })
 }
 

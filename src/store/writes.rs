@@ -265,8 +265,17 @@ mod tests {
     async fn publish(store: &Store, checkpoint: &[u8]) -> Result<()> {
         let digest = Uuid::now_v7().to_string();
         let now = Timestamp::UNIX_EPOCH;
-        let new =
-            NewPolicyVersion { name: "p", digest: &digest, checkpoint, now, alias: None, by: None, owner: None, any_name: false };
+        let new = NewPolicyVersion {
+            name: "p",
+            digest: &digest,
+            checkpoint,
+            info: "",
+            now,
+            alias: None,
+            by: None,
+            owner: None,
+            any_name: false,
+        };
         store.publish_policy(new).await.map(drop)
     }
 

@@ -52,7 +52,9 @@ fn describe() {
     describe_gauge!("qedgix_engine_queue_depth", "Fleets in the queue of the engine.");
     describe_gauge!("qedgix_sessions", "Open sessions.");
     describe_gauge!("qedgix_environments", "Hosted environments.");
-    describe_gauge!("qedgix_policy_versions", "Loaded policy versions.");
+    describe_gauge!("qedgix_policy_versions", "Policy versions.");
+    describe_gauge!("qedgix_policy_memory_bytes", "Memory of the policy versions that were read.");
+    describe_counter!("qedgix_policy_loads_total", "Policy versions read into memory.");
     describe_gauge!("qedgix_jobs", "Jobs, by state.");
     describe_counter!("qedgix_jobs_submitted_total", "Jobs submitted since the process started.");
     describe_counter!(

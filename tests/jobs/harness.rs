@@ -14,7 +14,7 @@ use qedgix::draining::Draining;
 use qedgix::jobs::{Executor, Launch, Scheduler, SchedulerConfig, WorkerExit};
 use qedgix::server::{self, DataDir, Listeners};
 use qedgix::service::keys::Keyring;
-use qedgix::service::policies::UploadLimit;
+use qedgix::service::policies::{Loads, Retention, UploadLimit};
 use qedgix::service::{App, WatchLimit};
 use qedgix::serving::{Engine, EngineConfig, Environments, EnvironmentsConfig, Limits, Sessions};
 use qedgix::store::Store;
@@ -115,6 +115,8 @@ impl Server {
             scheduler: Scheduler::open(store.clone(), scheduler, executor, clock.clone(), draining.clone()).await.unwrap(),
             store,
             registry: Arc::default(),
+            loads: Loads::default(),
+            retention: Retention::default(),
             sessions: Sessions::new(limits, clock.clone()),
             environments: Environments::new(EnvironmentsConfig { limits, memory: 1 << 20 }, clock.clone()),
             engine: Engine::start(EngineConfig { threads: 1, queue: 1, max_batch: 1, max_batch_delay: Duration::ZERO }).unwrap(),

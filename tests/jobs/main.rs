@@ -8,5 +8,6 @@ mod processes;
 mod protocol;
 mod publishing;
 mod scheduling;
+mod space;
 mod submission;
 mod unreadable;

@@ -1,21 +1,16 @@
 //! The end of a job that succeeds: its policy is published and the job ends in one transaction.
 
-use std::collections::BTreeMap;
-use std::path::Path;
-
 use jiff::Timestamp;
 use qedgix::checkpoint::{Checkpoint, digest, parameter_layout};
 use qedgix::serving::{PolicySpec, VersionSelector};
-use qedgix::store::{
-    EndedAttempt, FILE, JobAction, JobId, JobKind, JobSpec, JobState, Lease, NewJob, NewPolicyVersion, Store, SubmitResult,
-    WorkerResult,
-};
+use qedgix::store::{EndedAttempt, FILE, JobAction, JobState, Lease, NewPolicyVersion, VersionKey, WorkerResult};
 use qedgix::train_config::{Algorithm, Preset, TrainConfig};
 use qedgix::wire::v1;
 use serde_json::json;
 
 use super::harness::{Server, named, signed};
 use super::protocol::upload;
+use super::space::running_job;
 
 /// A checkpoint whose parameters are all `value`.
 fn checkpoint(value: f32) -> Vec<u8> {
@@ -25,29 +20,10 @@ fn checkpoint(value: f32) -> Vec<u8> {
     Checkpoint::new(config, 400, None, parameters).unwrap().to_bytes()
 }
 
-/// A store with a running job, and its attempt.
-async fn running_job(dir: &Path) -> (Store, Lease) {
-    let store = Store::open(dir).await.unwrap();
-    let (config, now) = (TrainConfig::preset(Algorithm::Qmix, Preset::Practical), Timestamp::UNIX_EPOCH);
-    let spec = JobSpec { kind: JobKind::Train, name: None, labels: BTreeMap::new(), threads: 1, priority: 0, config };
-    let new = NewJob { id: JobId(uuid::Uuid::from_u128(7)), owner: None, any_name: false, spec, now, idempotency: None };
-    let SubmitResult::Created(job) = store.submit_job(new).await.unwrap() else { panic!("a new job") };
-    let lease = store.begin_attempt(job.id, [0; 32], now).await.unwrap().unwrap();
-    (store, lease)
-}
-
 fn success(lease: Lease, digest: &str) -> EndedAttempt<'_> {
     let now = Timestamp::UNIX_EPOCH;
-    let new = NewPolicyVersion {
-        name: "mine",
-        digest,
-        checkpoint: b"weights",
-        now,
-        alias: None,
-        by: None,
-        owner: None,
-        any_name: false,
-    };
+    let (name, checkpoint, info, any_name) = ("mine", b"weights", "{}", false);
+    let new = NewPolicyVersion { name, digest, checkpoint, info, now, alias: None, by: None, owner: None, any_name };
     EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: Some(new), max_attempts: 3, now }
 }
 
@@ -71,7 +47,8 @@ async fn a_transaction_that_fails_neither_publishes_nor_ends() {
     assert!(published.unwrap().new);
     // A worker that did not see the response tries again.
     assert!(store.end_attempt(success(lease, &digest)).await.unwrap().is_none());
-    assert_eq!(store.policy_versions().await.unwrap(), [("mine".to_owned(), 1)]);
+    let mine = VersionKey { name: "mine".into(), version: 1, digest };
+    assert_eq!(store.policy_versions().await.unwrap(), [mine]);
 }
 
 #[tokio::test]
@@ -103,7 +80,7 @@ async fn a_cancel_at_the_moment_of_publishing_is_either_before_or_after_it() {
         let (job, acknowledged) = (server.get(&format!("/v1/jobs/{id}")).await, cancelled.unwrap().status().is_success());
         assert_eq!(job["state"], if acknowledged { "cancelled" } else { "succeeded" }, "{job}");
         let live = server.app.registry.describe(&PolicySpec { name: name.clone(), version: VersionSelector::Newest }).is_ok();
-        let stored = server.app.store.policy_versions().await.unwrap().iter().any(|(stored, _)| *stored == name);
+        let stored = server.app.store.policy_versions().await.unwrap().iter().any(|stored| stored.name == name);
         assert_eq!((live, stored), (!acknowledged, !acknowledged));
         assert_eq!(job["policy"], if acknowledged { json!(null) } else { json!(format!("{name}:1")) });
         worker.exit("exit code 0");

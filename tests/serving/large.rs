@@ -2,7 +2,7 @@
 
 use bytes::Bytes;
 use qedgix::policy::FleetStep;
-use qedgix::serving::FleetInput;
+use qedgix::serving::{FleetInput, Resolved};
 use qedgix::wire::v1;
 
 use super::harness::*;
@@ -24,7 +24,8 @@ fn wide_scene(uavs: usize, users: usize, range: f64) -> v1::Scene {
 #[tokio::test(flavor = "multi_thread")]
 async fn thousand_uavs_and_ten_thousand_users_are_answered() {
     let server = Server::start().await;
-    let loaded = server.app.registry.resolve(&"qedgix".parse().unwrap()).unwrap();
+    let found = server.app.registry.resolve(&"qedgix".parse().unwrap()).unwrap();
+    let Resolved::InMemory(loaded) = found else { panic!("it was published by this server") };
     let policy = &loaded.implementation;
     let (uavs, users) = (1000, 10_000);
     let scene = wide_scene(uavs, users, policy.env().detection_range);

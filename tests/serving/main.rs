@@ -28,3 +28,4 @@ mod security;
 mod server;
 mod soak;
 mod uploads;
+mod versions;

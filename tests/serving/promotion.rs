@@ -243,13 +243,10 @@ async fn same_as_the_store(app: &App, name: &str) {
     assert_eq!(served, now);
     let unloaded = app.store.unloaded_policies().await.unwrap().into_iter().filter(|(n, _)| n == name);
     let versions = app.registry.versions_of(name);
-    let resting = versions.iter().filter(|(_, ready)| !ready).map(|(info, _)| (name.to_owned(), info.reference.version));
+    let resting = versions.iter().filter(|v| !v.loaded).map(|v| (name.to_owned(), v.reference.version));
     assert_eq!(resting.collect::<Vec<_>>(), unloaded.collect::<Vec<_>>());
-    let stored = app.store.policy_versions().await.unwrap().into_iter().filter(|(n, _)| n == name);
-    assert_eq!(
-        versions.iter().map(|(info, _)| info.reference.version).collect::<Vec<_>>(),
-        stored.map(|(_, v)| v).collect::<Vec<_>>()
-    );
+    let stored = app.store.policy_versions().await.unwrap().into_iter().filter(|v| v.name == name);
+    assert_eq!(versions.iter().map(|v| v.reference.version).collect::<Vec<_>>(), stored.map(|v| v.version).collect::<Vec<_>>());
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]

@@ -81,7 +81,7 @@ async fn what_is_no_checkpoint_is_refused() {
         let refused = policies::publish_bytes(&server.app, Publisher::default(), name, bytes).await.unwrap_err();
         assert!(matches!(&refused, Error::Invalid(e) if e.field == field), "{refused}");
     }
-    assert_eq!(server.app.store.policy_versions().await.unwrap().iter().filter(|(name, _)| name == "mine").count(), 0);
+    assert_eq!(server.app.store.policy_versions().await.unwrap().iter().filter(|v| v.name == "mine").count(), 0);
 }
 
 #[tokio::test]

@@ -8,7 +8,8 @@ use super::structs::to_struct;
 use crate::env::EnvConfig;
 use crate::policy::RequiredInput;
 use crate::service::act;
-use crate::serving::{Decision, PolicyDetails, PolicyKind, PolicyRef, SessionInfo};
+use crate::service::policies::{PolicyDetails, VersionSummary};
+use crate::serving::{Decision, PolicyKind, PolicyRef, SessionInfo};
 use crate::wire::v1;
 
 /// The action of one UAV.
@@ -86,9 +87,16 @@ impl From<SessionInfo> for v1::Session {
     }
 }
 
+impl From<VersionSummary> for v1::PolicyVersion {
+    fn from(version: VersionSummary) -> Self {
+        let VersionSummary { reference, loaded, aliases } = version;
+        Self { r#ref: Some((&reference).into()), loaded, aliases }
+    }
+}
+
 impl From<PolicyDetails> for v1::Policy {
     fn from(described: PolicyDetails) -> Self {
-        let PolicyDetails { info, loaded, aliases, versions } = described;
+        let PolicyDetails { info, loaded, aliases, versions, version_count } = described;
         let needs = match info.needs {
             RequiredInput::Detections => v1::Needs::Detections,
             RequiredInput::OwnPositions => v1::Needs::OwnPositions,
@@ -111,6 +119,7 @@ impl From<PolicyDetails> for v1::Policy {
             loaded,
             loaded_versions: versions.iter().filter(|(_, loaded)| *loaded).map(|(version, _)| *version).collect(),
             versions: versions.into_iter().map(|(version, _)| version).collect(),
+            version_count: version_count as u64,
             config: to_struct(&info.config),
             metrics: to_struct(&info.metrics),
             created_at: Some(timestamp(info.created_at)),

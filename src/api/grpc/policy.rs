@@ -127,12 +127,38 @@ impl PolicyService for Handlers {
         request: Request<v1::ListPoliciesRequest>,
     ) -> Result<Response<v1::ListPoliciesResponse>, Status> {
         let v1::ListPoliciesRequest { page_size, page_token } = request.into_inner();
-        let page = policies::list(&self.0, &PageRequest { size: page_size, token: page_token })?.map(Into::into);
+        let page = policies::list(&self.0, &PageRequest { size: page_size, token: page_token }).await?.map(Into::into);
         Ok(Response::new(v1::ListPoliciesResponse { policies: page.items, next_page_token: page.next_token }))
     }
 
     async fn get_policy(&self, request: Request<v1::GetPolicyRequest>) -> Result<Response<v1::Policy>, Status> {
         let spec: PolicySpec = request.into_inner().policy.parse().map_err(Error::from)?;
-        Ok(Response::new(policies::get(&self.0, &spec)?.into()))
+        Ok(Response::new(policies::get(&self.0, &spec).await?.into()))
+    }
+
+    async fn list_policy_versions(
+        &self,
+        request: Request<v1::ListPolicyVersionsRequest>,
+    ) -> Result<Response<v1::ListPolicyVersionsResponse>, Status> {
+        let v1::ListPolicyVersionsRequest { name, page_size, page_token } = request.into_inner();
+        let page = policies::versions(&self.0, &name, &PageRequest { size: page_size, token: page_token })?.map(Into::into);
+        Ok(Response::new(v1::ListPolicyVersionsResponse { versions: page.items, next_page_token: page.next_token }))
+    }
+
+    async fn delete_policy_version(
+        &self,
+        request: Request<v1::DeletePolicyVersionRequest>,
+    ) -> Result<Response<v1::DeletePolicyVersionResponse>, Status> {
+        let v1::DeletePolicyVersionRequest { name, version } = request.into_inner();
+        policies::delete(&self.0, &name, Some(version)).await?;
+        Ok(Response::new(v1::DeletePolicyVersionResponse {}))
+    }
+
+    async fn delete_policy(
+        &self,
+        request: Request<v1::DeletePolicyRequest>,
+    ) -> Result<Response<v1::DeletePolicyResponse>, Status> {
+        policies::delete(&self.0, &request.into_inner().name, None).await?;
+        Ok(Response::new(v1::DeletePolicyResponse {}))
     }
 }

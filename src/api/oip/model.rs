@@ -63,9 +63,9 @@ fn unloaded(spec: &PolicySpec) -> Error {
 ///
 /// # Errors
 /// [`Error::NotFound`] if the model does not exist, `policy_unloaded` if it is not loaded.
-pub fn describe(app: &App, name: &str, version: &str) -> Result<Model, Error> {
+pub async fn describe(app: &App, name: &str, version: &str) -> Result<Model, Error> {
     let spec = policy_spec(name, version)?;
-    let described = policies::get(app, &spec).map_err(model_error)?;
+    let described = policies::get(app, &spec).await.map_err(model_error)?;
     if !described.loaded {
         return Err(unloaded(&spec));
     }
@@ -109,8 +109,8 @@ pub fn describe(app: &App, name: &str, version: &str) -> Result<Model, Error> {
 /// [`Error::Invalid`] if the name or the version does not parse.
 pub fn is_ready(app: &App, name: &str, version: &str) -> Result<bool, Error> {
     let spec = policy_spec(name, version)?;
-    match policies::get(app, &spec) {
-        Ok(described) => Ok(described.loaded),
+    match policies::is_loaded(app, &spec) {
+        Ok(loaded) => Ok(loaded),
         Err(Error::NotFound { .. } | Error::Precondition { .. }) => Ok(false),
         Err(error) => Err(error),
     }

@@ -78,6 +78,7 @@ async fn metrics(State(app): State<Arc<App>>, Extension(render): Extension<fn() 
         ("qedgix_sessions", metrics.sessions),
         ("qedgix_environments", metrics.environments),
         ("qedgix_policy_versions", metrics.policy_versions),
+        ("qedgix_policy_memory_bytes", metrics.policy_memory),
         ("qedgix_engine_queue_depth", metrics.engine_queue),
         ("qedgix_training_threads_busy", metrics.threads_busy),
         ("qedgix_training_threads", metrics.threads),
@@ -85,6 +86,7 @@ async fn metrics(State(app): State<Arc<App>>, Extension(render): Extension<fn() 
     ] {
         metrics::gauge!(name).set(value as f64);
     }
+    metrics::counter!("qedgix_policy_loads_total").absolute(metrics.policy_loads);
     for (state, jobs) in metrics.jobs {
         metrics::gauge!("qedgix_jobs", "state" => state.as_str()).set(jobs as f64);
     }

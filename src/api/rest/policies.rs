@@ -19,8 +19,9 @@ use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
 use super::schemas;
 use crate::policy::RequiredInput;
 use crate::service::keys::Caller;
+use crate::service::policies::{PolicyDetails, VersionSummary};
 use crate::service::{App, Error, PageRequest, policies};
-use crate::serving::{self, PolicyDetails};
+use crate::serving;
 use crate::store::AliasHistoryEntry;
 
 type AppState = State<Arc<App>>;
@@ -32,8 +33,9 @@ const MAX_CHECKPOINT: usize = 64 << 20;
 pub(super) fn router() -> OpenApiRouter<Arc<App>> {
     OpenApiRouter::new()
         .routes(routes!(list))
-        .routes(routes!(get))
-        .routes(routes!(upload))
+        .routes(routes!(get, delete))
+        .routes(routes!(versions, upload))
+        .routes(routes!(delete_version))
         .routes(routes!(export))
         .routes(routes!(load))
         .routes(routes!(unload))
@@ -137,11 +139,14 @@ struct Policy {
     detection_range: f64,
     /// Aliases that point to this version.
     aliases: Vec<String>,
-    /// All versions of the policy.
+    /// The newest 100 versions of the policy, oldest first. `GET /v1/policies/{name}/versions` lists all.
+    #[schema(max_items = 100)]
     versions: Vec<u64>,
+    /// Number of all versions of the policy.
+    version_count: usize,
     /// Whether this version is loaded. If not loaded, open sessions continue and all other requests get 409 (`policy_unloaded`).
     loaded: bool,
-    /// The versions that are loaded.
+    /// Those of `versions` that are loaded.
     loaded_versions: Vec<u64>,
     /// Resolved training configuration of a checkpoint.
     #[serde(skip_serializing_if = "Value::is_null")]
@@ -176,7 +181,7 @@ enum Needs {
 
 impl From<PolicyDetails> for Policy {
     fn from(policy: PolicyDetails) -> Self {
-        let PolicyDetails { info, loaded, aliases, versions } = policy;
+        let PolicyDetails { info, loaded, aliases, versions, version_count } = policy;
         Self {
             r#ref: (&info.reference).into(),
             kind: match info.kind {
@@ -197,6 +202,7 @@ impl From<PolicyDetails> for Policy {
             loaded,
             loaded_versions: versions.iter().filter(|(_, loaded)| *loaded).map(|(version, _)| *version).collect(),
             versions: versions.into_iter().map(|(version, _)| version).collect(),
+            version_count,
             config: info.config.clone(),
             metrics: info.metrics.clone(),
             created_at: info.created_at,
@@ -217,7 +223,7 @@ struct PolicyPage {
     responses((status = 200, description = "A page of policies.", body = PolicyPage), BadRequest)
 )]
 async fn list(State(app): AppState, Query(paging): Query<Paging>) -> Result<Json<PolicyPage>, Error> {
-    let page = policies::list(&app, &paging.into())?.map(Into::into);
+    let page = policies::list(&app, &paging.into()).await?.map(Into::into);
     Ok(Json(PolicyPage { policies: page.items, next_page_token: page.next_token }))
 }
 
@@ -227,7 +233,7 @@ async fn list(State(app): AppState, Query(paging): Query<Paging>) -> Result<Json
     responses((status = 200, description = "The version.", body = Policy), BadRequest, NotFound)
 )]
 async fn get(State(app): AppState, Path(PolicyPath { policy }): Path<PolicyPath>) -> Result<Json<Policy>, Error> {
-    Ok(Json(policies::get(&app, &policy.parse()?)?.into()))
+    Ok(Json(policies::get(&app, &policy.parse()?).await?.into()))
 }
 
 #[derive(Debug, Deserialize, IntoParams)]
@@ -245,6 +251,101 @@ struct UploadQuery {
 struct CheckpointOfJob {
     /// Its id, as `GET /v1/jobs/{id}/checkpoints` returns it.
     checkpoint_id: String,
+}
+
+/// Delete all versions of a policy
+///
+/// Deletes all or none. Their numbers are never given to other versions. Refused with `wrong_state` while an alias points to a
+/// version or a session or a request uses one, and for policies that are bundled with the server.
+#[utoipa::path(
+    delete, path = "/v1/policies/{policy}", operation_id = "deletePolicy", tag = "policies",
+    params(("policy" = String, Path, description = "NAME of the policy.", pattern = "^[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}$")),
+    responses((status = 204, description = "The policy is deleted."), BadRequest, NotFound, Conflict)
+)]
+async fn delete(State(app): AppState, Path(PolicyPath { policy }): Path<PolicyPath>) -> Result<StatusCode, Error> {
+    policies::delete(&app, &policy, None).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+/// A version of a policy.
+#[derive(Debug, Serialize, ToSchema)]
+struct PolicyVersion {
+    r#ref: PolicyRef,
+    /// Whether this version is loaded.
+    loaded: bool,
+    /// Aliases that point to this version.
+    aliases: Vec<String>,
+}
+
+impl From<VersionSummary> for PolicyVersion {
+    fn from(version: VersionSummary) -> Self {
+        let VersionSummary { reference, loaded, aliases } = version;
+        Self { r#ref: (&reference).into(), loaded, aliases }
+    }
+}
+
+#[derive(Debug, Serialize, ToSchema)]
+struct PolicyVersionPage {
+    versions: Vec<PolicyVersion>,
+    /// Empty on the last page.
+    next_page_token: String,
+}
+
+#[derive(Debug, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+struct VersionsQuery {
+    /// Maximum number of versions. 0: 100.
+    #[serde(default)]
+    #[param(maximum = 1000)]
+    page_size: u32,
+    /// `next_page_token` of the previous page.
+    #[serde(default)]
+    #[param(schema_with = schemas::number_token, required = false)]
+    page_token: String,
+}
+
+/// List the versions of a policy, newest first
+#[utoipa::path(
+    get, path = "/v1/policies/{name}/versions", operation_id = "listPolicyVersions", tag = "policies",
+    params(NamePath, VersionsQuery),
+    responses((status = 200, description = "A page of versions.", body = PolicyVersionPage), BadRequest, NotFound)
+)]
+async fn versions(
+    State(app): AppState,
+    Path(NamePath { name }): Path<NamePath>,
+    Query(VersionsQuery { page_size, page_token }): Query<VersionsQuery>,
+) -> Result<Json<PolicyVersionPage>, Error> {
+    let page = policies::versions(&app, &name, &PageRequest { size: page_size, token: page_token })?.map(Into::into);
+    Ok(Json(PolicyVersionPage { versions: page.items, next_page_token: page.next_token }))
+}
+
+#[derive(Deserialize, IntoParams)]
+#[into_params(parameter_in = Path)]
+struct VersionPath {
+    /// NAME of the policy, without a version or alias.
+    #[param(pattern = "^[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}$", example = "qedgix")]
+    name: String,
+    /// The version.
+    #[param(minimum = 1)]
+    version: u64,
+}
+
+/// Delete a policy version
+///
+/// Its number is never given to another version. Refused with `wrong_state` while an alias points to it or a session or a request
+/// uses it, and for versions that are bundled with the server.
+#[utoipa::path(
+    delete, path = "/v1/policies/{name}/versions/{version}", operation_id = "deletePolicyVersion", tag = "policies",
+    params(VersionPath),
+    responses((status = 204, description = "The version is deleted."), BadRequest, NotFound, Conflict)
+)]
+async fn delete_version(
+    State(app): AppState,
+    Path(VersionPath { name, version }): Path<VersionPath>,
+) -> Result<StatusCode, Error> {
+    policies::delete(&app, &name, Some(version)).await?;
+    Ok(StatusCode::NO_CONTENT)
 }
 
 /// Publish a checkpoint as the next version of a policy
@@ -318,7 +419,7 @@ async fn export(State(app): AppState, Path(PolicyPath { policy }): Path<PolicyPa
 )]
 async fn load(State(app): AppState, Path(VersionsPath { policy }): Path<VersionsPath>) -> Result<Json<Policy>, Error> {
     policies::load_policy(&app, &policy).await?;
-    Ok(Json(policies::get(&app, &policy.parse()?)?.into()))
+    Ok(Json(policies::get(&app, &policy.parse()?).await?.into()))
 }
 
 /// Unload all versions of a policy, or one; open sessions keep using them
@@ -330,7 +431,7 @@ async fn load(State(app): AppState, Path(VersionsPath { policy }): Path<Versions
 )]
 async fn unload(State(app): AppState, Path(VersionsPath { policy }): Path<VersionsPath>) -> Result<Json<Policy>, Error> {
     policies::unload_policy(&app, &policy).await?;
-    Ok(Json(policies::get(&app, &policy.parse()?)?.into()))
+    Ok(Json(policies::get(&app, &policy.parse()?).await?.into()))
 }
 
 #[derive(Debug, Serialize, ToSchema)]
@@ -343,16 +444,22 @@ struct Alias {
 #[derive(Debug, Serialize, ToSchema)]
 struct Aliases {
     aliases: Vec<Alias>,
+    /// Empty on the last page.
+    next_page_token: String,
 }
 
-/// List the aliases of a policy
+/// List the aliases of a policy by name
 #[utoipa::path(
-    get, path = "/v1/policies/{name}/aliases", operation_id = "listAliases", tag = "policies", params(NamePath),
-    responses((status = 200, description = "All aliases.", body = Aliases), BadRequest, NotFound)
+    get, path = "/v1/policies/{name}/aliases", operation_id = "listAliases", tag = "policies", params(NamePath, Paging),
+    responses((status = 200, description = "A page of aliases.", body = Aliases), BadRequest, NotFound)
 )]
-async fn aliases(State(app): AppState, Path(NamePath { name }): Path<NamePath>) -> Result<Json<Aliases>, Error> {
-    let aliases = policies::aliases(&app, &name)?.into_iter();
-    Ok(Json(Aliases { aliases: aliases.map(|(alias, version)| Alias { alias, version }).collect() }))
+async fn aliases(
+    State(app): AppState,
+    Path(NamePath { name }): Path<NamePath>,
+    Query(paging): Query<Paging>,
+) -> Result<Json<Aliases>, Error> {
+    let page = policies::aliases(&app, &name, &paging.into())?.map(|(alias, version)| Alias { alias, version });
+    Ok(Json(Aliases { aliases: page.items, next_page_token: page.next_token }))
 }
 
 /// The version that an alias is to point to.

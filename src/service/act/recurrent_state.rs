@@ -7,7 +7,7 @@ use super::compute;
 use super::request::{Request, Response};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
-use crate::service::{App, Error};
+use crate::service::{App, Error, policies};
 use crate::serving::{FleetIds, FleetInput, LoadedPolicy, OutputBuffers, PolicySpec, RecurrentState, Task};
 
 pub(super) async fn act(app: &App, state: &[u8], request: Request, deadline: Option<Instant>) -> Result<Response, Error> {
@@ -16,8 +16,8 @@ pub(super) async fn act(app: &App, state: &[u8], request: Request, deadline: Opt
     };
     let state = if state.is_empty() { None } else { Some(RecurrentState::decode(state)?) };
     let policy = match &state {
-        None => app.registry.resolve(spec)?,
-        Some(state) => pinned_version(app, spec, state)?,
+        None => policies::resolve(app, spec).await?,
+        Some(state) => pinned_version(app, spec, state).await?,
     };
     let FleetInput { fleet, canonical_of_request, content } = request.input;
     let slot = compute::convert(content, fleet.size(), &policy).await?;
@@ -42,11 +42,12 @@ pub(super) async fn act(app: &App, state: &[u8], request: Request, deadline: Opt
 
 /// The version that wrote `state`: an episode stays on its version even if an alias has moved or a newer version has been
 /// published.
-fn pinned_version(app: &App, spec: &PolicySpec, state: &RecurrentState) -> Result<Arc<LoadedPolicy>, Error> {
-    app.registry.find_by_digest(spec, &state.digest)?.ok_or_else(|| {
+async fn pinned_version(app: &App, spec: &PolicySpec, state: &RecurrentState) -> Result<Arc<LoadedPolicy>, Error> {
+    let found = app.registry.find_by_digest(spec, &state.digest)?.ok_or_else(|| {
         let expected = format!("the recurrent_state of an earlier response of {spec}");
-        Invalid::new("recurrent_state", "the state of another policy or version", expected).into()
-    })
+        Error::from(Invalid::new("recurrent_state", "the state of another policy or version", expected))
+    })?;
+    policies::in_memory(app, found).await
 }
 
 /// The memory in `state`, checked against the fleet and the policy.

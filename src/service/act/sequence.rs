@@ -11,7 +11,7 @@ use super::request::{Request, Response, Sequence, SequenceId};
 use super::session::{self, SessionStep};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
-use crate::service::{App, Error};
+use crate::service::{App, Error, policies};
 use crate::serving::{FleetInput, Owner, PolicySpec, Session};
 
 /// Prefix of the names of sessions that are sequences.
@@ -71,7 +71,7 @@ async fn start(
         let message = format!("step {step} cannot begin a sequence; send step 0, or omit sequence_start");
         return Err(Error::Precondition { code: ErrorCode::WrongStep, message });
     }
-    let policy = app.registry.resolve(spec)?;
+    let policy = policies::resolve(app, spec).await?;
     let FleetInput { fleet, canonical_of_request, content } = request.input;
     let graph = compute::convert(content, fleet.size(), &policy).await?;
     let step = SessionStep { fleet, canonical_of_request, graph, step: Some(0), run_id: None };

@@ -1,7 +1,5 @@
 //! Aliases: movable names of versions, and the history of their moves.
 
-use std::collections::BTreeMap;
-
 use super::{PolicyStores, one_at_a_time};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
@@ -26,13 +24,16 @@ pub struct AliasChange {
     pub by: Option<String>,
 }
 
-/// Aliases of the policy `name`, and the versions that they point to.
+/// A page of the aliases of the policy `name` in order of their names, and the versions that they point to.
 ///
 /// # Errors
-/// [`Error::NotFound`], or [`Error::Invalid`] for a malformed name.
-pub fn aliases(app: &App, name: &str) -> Result<BTreeMap<String, u64>, Error> {
+/// [`Error::NotFound`], or [`Error::Invalid`] for a malformed name or a page size out of range.
+pub fn aliases(app: &App, name: &str, page: &PageRequest) -> Result<Page<(String, u64)>, Error> {
     check_name("policy", name)?;
-    Ok(app.registry.aliases(name)?)
+    let limit = page.usual_limit()?;
+    let mut rest = app.registry.aliases(name)?.into_iter().filter(|(alias, _)| *alias > page.token);
+    let items = rest.by_ref().take(limit).collect();
+    Ok(Page::new(items, rest.next().is_some(), |(alias, _): &(String, u64)| alias.clone()))
 }
 
 /// Points an alias to `version` for all later requests, and returns the version that it pointed to before. If that is the same
@@ -47,15 +48,15 @@ pub async fn set_alias(app: &App, change: AliasChange, version: u64) -> Result<O
     one_at_a_time(app, async move |PolicyStores { store, registry }| {
         let AliasChange { name, alias, by, .. } = &change;
         let spec = PolicySpec { name: name.clone(), version: VersionSelector::Version(version) };
-        let found = registry.describe(&spec)?;
-        if found.info.kind == PolicyKind::Baseline {
+        let found = registry.describe(&spec)?.state;
+        if found.kind == PolicyKind::Baseline {
             let message = format!("{name} is a baseline, which has one version and no aliases");
             return Err(Error::Precondition { code: ErrorCode::NoCheckpoint, message });
         }
         check_expected(&registry, &change)?;
         check_alias(&registry, name, alias)?;
         if !found.loaded {
-            return Err(unloaded(&found.info.reference));
+            return Err(unloaded(&found.reference));
         }
         let m = AliasMove { name, alias, to: Some(version), at, by: by.as_deref() };
         let previous = store.move_policy_alias(m).await?;

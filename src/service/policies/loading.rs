@@ -1,9 +1,13 @@
-//! Loads policy versions into the registry: all at start, and single ones when callers load and unload them.
+//! Loads policy versions into memory when they are asked for, and lets callers load and unload them.
 
-use std::error::Error as _;
-use std::sync::Arc;
+use std::collections::HashMap;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 
+use futures::FutureExt;
+use futures::future::{BoxFuture, Shared};
 use sha2::{Digest, Sha256};
+use tokio::sync::Semaphore;
 
 use super::publish::{Publisher, StoredVersion, publish_bytes};
 use super::{PolicyStores, one_at_a_time};
@@ -11,7 +15,114 @@ use crate::invalid::Invalid;
 use crate::policy::{EnvParams, baselines};
 use crate::service::{App, Error};
 use crate::serving::bundled::BUNDLED;
-use crate::serving::{LoadedPolicy, PolicyInfo, PolicyKind, PolicyRef, PolicySpec, Registry, VersionSelector};
+use crate::serving::{LoadedPolicy, PolicyKind, PolicyRef, PolicySpec, Registry, Resolved, VersionSelector, VersionState};
+use crate::store::Store;
+
+/// Maximum number of checkpoints that are read at once.
+const MAX_LOADS: usize = 2;
+
+/// A load that several requests wait for.
+type Load = Shared<BoxFuture<'static, Result<Arc<LoadedPolicy>, Arc<Error>>>>;
+
+/// Loads in progress. Requests for the same version wait for one load.
+#[derive(Clone, Debug)]
+pub struct Loads(Arc<LoadsInner>);
+
+#[derive(Debug)]
+struct LoadsInner {
+    running: Mutex<HashMap<(String, u64), Load>>,
+    permits: Semaphore,
+    count: AtomicU64,
+}
+
+impl Default for Loads {
+    fn default() -> Self {
+        let (running, permits) = (Mutex::default(), Semaphore::new(MAX_LOADS));
+        Self(Arc::new(LoadsInner { running, permits, count: AtomicU64::new(0) }))
+    }
+}
+
+impl Loads {
+    /// Number of versions that were read since the start.
+    pub fn count(&self) -> u64 {
+        self.0.count.load(Ordering::Relaxed)
+    }
+
+    /// The load of a version, which begins now unless it is in progress. It completes even if all callers disconnect.
+    fn begin(&self, app: &App, reference: PolicyRef) -> Load {
+        let mut running = self.0.running.lock().unwrap_or_else(PoisonError::into_inner);
+        // A load adds the version to the registry before it leaves `running`, so none is missed.
+        if let Some(policy) = app.registry.in_memory(&reference) {
+            return async { Ok(policy) }.boxed().shared();
+        }
+        let key = (reference.name.clone(), reference.version);
+        if let Some(load) = running.get(&key) {
+            return load.clone();
+        }
+        let (store, registry) = (app.store.clone(), app.registry.clone());
+        let guard = LoadGuard { loads: self.clone(), key: key.clone() };
+        let task = tokio::spawn(async move {
+            let guard = guard;
+            // Never closed.
+            let _permit = guard.loads.0.permits.acquire().await;
+            guard.loads.0.count.fetch_add(1, Ordering::Relaxed);
+            read(&store, &registry, &reference).await
+        });
+        let load = async { task.await.map_err(Error::internal).flatten().map_err(Arc::new) }.boxed().shared();
+        running.insert(key, load.clone());
+        load
+    }
+}
+
+/// Ends a load, also after a panic.
+struct LoadGuard {
+    loads: Loads,
+    key: (String, u64),
+}
+
+impl Drop for LoadGuard {
+    fn drop(&mut self) {
+        self.loads.0.running.lock().unwrap_or_else(PoisonError::into_inner).remove(&self.key);
+    }
+}
+
+/// Reads a version from the store into memory.
+async fn read(store: &Store, registry: &Registry, reference: &PolicyRef) -> Result<Arc<LoadedPolicy>, Error> {
+    let stored = StoredVersion::read(store, &reference.name, reference.version).await?;
+    let share = registry.take_memory(stored.size())?;
+    let policy = registry.keep(stored.load(share).await?);
+    tracing::debug!(policy = %reference, bytes = policy.memory_bytes(), "policy read into memory");
+    Ok(policy)
+}
+
+/// Loads a version that is not in memory.
+async fn load(app: &App, reference: PolicyRef) -> Result<Arc<LoadedPolicy>, Error> {
+    let load = app.loads.begin(app, reference).await;
+    load.map_err(|error| match &*error {
+        Error::Busy { message, retry_after } => Error::Busy { message: message.clone(), retry_after: *retry_after },
+        // It was deleted meanwhile.
+        Error::NotFound { what, id } => Error::NotFound { what, id: id.clone() },
+        _ => Error::internal(error),
+    })
+}
+
+/// The version that a look-up in the registry found, in memory.
+pub(in crate::service) async fn in_memory(app: &App, found: Resolved) -> Result<Arc<LoadedPolicy>, Error> {
+    match found {
+        Resolved::InMemory(policy) => Ok(policy),
+        // In a box, because it is rare and would make the futures of all requests larger.
+        Resolved::Stored(reference) => Box::pin(load(app, reference)).await,
+    }
+}
+
+/// The version that `spec` resolves to, in memory.
+///
+/// # Errors
+/// [`Error::NotFound`], `policy_unloaded`; [`Error::Busy`] if sessions and requests use all memory of policies;
+/// [`Error::Internal`] if its checkpoint is damaged.
+pub(in crate::service) async fn resolve(app: &App, spec: &PolicySpec) -> Result<Arc<LoadedPolicy>, Error> {
+    in_memory(app, app.registry.resolve(spec)?).await
+}
 
 /// A version and whether it is loaded.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -28,46 +139,29 @@ pub struct IndexEntry {
 
 /// All versions by name and number.
 pub fn index(app: &App) -> Vec<IndexEntry> {
-    let entry = |reference: &PolicyRef, loaded| IndexEntry {
-        name: reference.name.clone(),
+    let entry = |VersionState { reference, loaded, .. }| IndexEntry {
+        name: reference.name,
         version: reference.version,
         loaded,
         reason: if loaded { String::new() } else { "unloaded".to_owned() },
     };
-    app.registry.versions().iter().map(|(info, loaded)| entry(&info.reference, *loaded)).collect()
+    app.registry.versions().into_iter().map(entry).collect()
 }
 
 /// Loads every version of a policy (`NAME`) or one (`NAME:VERSION`). Loaded versions stay as they are.
 ///
 /// # Errors
-/// [`Error::NotFound`] when there is no such version, [`Error::Internal`] when a checkpoint is damaged. Nothing changes then.
+/// [`Error::NotFound`] when there is no such version, [`Error::Internal`] when a checkpoint is damaged, [`Error::Busy`] when
+/// sessions and requests use all memory of policies. Nothing changes then.
 pub async fn load_policy(app: &App, name: &str) -> Result<(), Error> {
     let spec = spec_of(name)?;
-    let now = app.clock.now();
-    one_at_a_time(app, async move |PolicyStores { store, registry }| {
-        let mut to_insert = Vec::new();
-        for (info, loaded) in versions(&registry, &spec)? {
-            to_insert.push(match (loaded, info.kind) {
-                (true, _) => continue,
-                (false, PolicyKind::Baseline) => {
-                    let missing = || Error::not_found("policy", info.reference.to_string());
-                    let implementation = baselines::by_name(&spec.name, EnvParams::default()).ok_or_else(missing)?;
-                    LoadedPolicy { info, implementation }
-                }
-                (false, PolicyKind::Checkpoint) => {
-                    StoredVersion::read(&store, &spec.name, info.reference.version).await?.load().await?
-                }
-            });
+    // Every version is read, so that none is loaded that cannot be served. Those that do not fit into memory together leave it.
+    for VersionState { reference, kind, loaded } in versions(&app.registry, &spec)? {
+        if !loaded && kind == PolicyKind::Checkpoint {
+            load(app, reference).await?;
         }
-        let numbers: Vec<u64> = to_insert.iter().map(|policy| policy.reference.version).collect();
-        store.set_policy_versions_loaded(&spec.name, &numbers, true, now).await?;
-        for policy in to_insert {
-            tracing::info!(policy = %policy.reference, "policy loaded");
-            registry.insert(policy);
-        }
-        Ok(())
-    })
-    .await
+    }
+    set_loaded(app, spec, true).await
 }
 
 /// Unloads every version of a policy (`NAME`) or one (`NAME:VERSION`) until it is loaded again, also across restarts. Open
@@ -76,15 +170,18 @@ pub async fn load_policy(app: &App, name: &str) -> Result<(), Error> {
 /// # Errors
 /// [`Error::NotFound`] when there is no such version.
 pub async fn unload_policy(app: &App, name: &str) -> Result<(), Error> {
-    let spec = spec_of(name)?;
+    set_loaded(app, spec_of(name)?, false).await
+}
+
+async fn set_loaded(app: &App, spec: PolicySpec, loaded: bool) -> Result<(), Error> {
     let now = app.clock.now();
     one_at_a_time(app, async move |PolicyStores { store, registry }| {
         let all = versions(&registry, &spec)?;
-        let numbers: Vec<u64> = all.iter().filter(|(_, loaded)| *loaded).map(|(info, _)| info.reference.version).collect();
-        store.set_policy_versions_loaded(&spec.name, &numbers, false, now).await?;
+        let numbers: Vec<u64> = all.iter().filter(|v| v.loaded != loaded).map(|v| v.reference.version).collect();
+        store.set_policy_versions_loaded(&spec.name, &numbers, loaded, now).await?;
         for version in numbers {
-            registry.unload(&spec.name, version);
-            tracing::info!(policy = spec.name, version, "policy unloaded");
+            registry.set_loaded(&spec.name, version, loaded);
+            tracing::info!(policy = spec.name, version, "{}", if loaded { "policy loaded" } else { "policy unloaded" });
         }
         Ok(())
     })
@@ -99,17 +196,17 @@ fn spec_of(name: &str) -> Result<PolicySpec, Invalid> {
     Ok(spec)
 }
 
-/// The versions that `spec` names, and whether each is loaded.
-fn versions(registry: &Registry, spec: &PolicySpec) -> Result<Vec<(Arc<PolicyInfo>, bool)>, Error> {
+/// The versions that `spec` names.
+fn versions(registry: &Registry, spec: &PolicySpec) -> Result<Vec<VersionState>, Error> {
     let mut found = registry.versions_of(&spec.name);
     if let VersionSelector::Version(version) = spec.version {
-        found.retain(|(info, _)| info.reference.version == version);
+        found.retain(|state| state.reference.version == version);
     }
     if found.is_empty() { Err(Error::not_found("policy", spec.to_string())) } else { Ok(found) }
 }
 
-/// Fills the registry with baselines, published versions, bundled policies and aliases. Unloaded versions stay unloaded. A
-/// damaged version is logged and skipped.
+/// Fills the registry with baselines, published versions, bundled policies and aliases. Unloaded versions stay unloaded. No
+/// checkpoint is read.
 ///
 /// # Errors
 /// [`Error::Internal`] when the database fails, [`Error::Invalid`] when a bundled policy is not a checkpoint.
@@ -122,23 +219,24 @@ pub async fn fill_registry(app: &App) -> Result<(), Error> {
         let reference = PolicyRef { name: baseline.name.to_owned(), version: 1, digest };
         app.registry.insert(LoadedPolicy::baseline(reference, baseline.description, policy, app.clock.now()));
     }
-    for (name, version) in app.store.policy_versions().await? {
-        match StoredVersion::read(&app.store, &name, version).await?.load().await {
-            Ok(policy) => drop(app.registry.insert(policy)),
-            Err(e) => {
-                let reason = e.source().map_or_else(|| e.to_string(), ToString::to_string);
-                tracing::error!(policy = name, version, reason, "a checkpoint cannot be read");
-            }
+    for version in app.store.policy_versions().await? {
+        let (name, version, digest) = (version.name, version.version, version.digest);
+        let mut bytes = [0; 32];
+        match hex::decode_to_slice(&digest, &mut bytes) {
+            Ok(()) => app.registry.add(PolicyRef { name, version, digest: bytes }),
+            Err(_) => tracing::error!(policy = name, version, digest, "the digest of a version cannot be read"),
         }
     }
     for (name, bytes) in BUNDLED {
-        publish_bytes(app, Publisher::PROGRAM, name, bytes.to_vec()).await?;
+        if app.registry.version_of_digest(name, &Sha256::digest(bytes).into()).is_none() {
+            publish_bytes(app, Publisher::PROGRAM, name, bytes.to_vec()).await?;
+        }
     }
     for alias in app.store.policy_aliases().await? {
         app.registry.set_alias(&alias.name, &alias.alias, alias.version);
     }
     for (name, version) in app.store.unloaded_policies().await? {
-        app.registry.unload(&name, version);
+        app.registry.set_loaded(&name, version, false);
     }
     Ok(())
 }

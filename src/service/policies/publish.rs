@@ -7,6 +7,8 @@ use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
 use super::aliases::{check_alias, unloaded};
+use super::deletion::retain_after_publishing;
+use super::info::{self, PolicyDetails, complete};
 use super::upload_limit::UploadPermit;
 use super::{PolicyStores, one_at_a_time};
 use crate::checkpoint::Checkpoint;
@@ -17,7 +19,7 @@ use crate::service::keys::{Caller, Scope};
 use crate::service::{App, Error, checkpoints};
 use crate::serving::bundled::BUNDLED;
 use crate::serving::{
-    LoadedPolicy, PolicyDetails, PolicyInfo, PolicyKind, PolicyRef, PolicySpec, Registry, VersionSelector, check_name,
+    LoadedPolicy, MemoryShare, PolicyInfo, PolicyKind, PolicyRef, PolicySpec, Registry, VersionSelector, check_name,
 };
 use crate::store::{EndedAttempt, Job, Lease, NewPolicyVersion, PolicyVersion, PublishedPolicy, Store, WorkerResult};
 
@@ -100,7 +102,7 @@ pub fn check_publishable(name: &str) -> Result<(), Invalid> {
 /// [`Error::Invalid`] for a name or bytes that cannot be published, [`Error::PermissionDenied`] when another owner made the name,
 /// [`Error::Internal`] when the database fails.
 pub async fn publish_bytes(app: &App, publisher: Publisher, name: &str, bytes: Vec<u8>) -> Result<PolicyRef, Error> {
-    let version = NewVersion::parse(publisher, name, CheckpointBytes { bytes, _permit: None }).await?;
+    let version = NewVersion::parse(app, publisher, name, CheckpointBytes { bytes, _permit: None }).await?;
     let (reference, _) = version.publish(app, None).await?;
     Ok(reference)
 }
@@ -122,9 +124,11 @@ pub async fn publish(app: &App, caller: &Caller, request: PublishRequest) -> Res
         CheckpointSource::Bytes(bytes, permit) => CheckpointBytes { bytes, _permit: Some(permit) },
         CheckpointSource::Job(id) => CheckpointBytes { bytes: checkpoints::get(app, caller, &id).await?.1, _permit: None },
     };
-    let (reference, new) = NewVersion::parse(caller.into(), &name, checkpoint).await?.publish(app, alias).await?;
+    let (reference, new) = NewVersion::parse(app, caller.into(), &name, checkpoint).await?.publish(app, alias).await?;
     let spec = PolicySpec { name, version: VersionSelector::Version(reference.version) };
-    Ok((app.registry.describe(&spec)?, new))
+    let published = complete(app, app.registry.describe(&spec)?).await?;
+    retain_after_publishing(app, &spec.name).await;
+    Ok((published, new))
 }
 
 /// Ends the attempt of a job that succeeded and publishes `version`, in one transaction. Nothing is published if the job is
@@ -134,7 +138,8 @@ pub async fn publish(app: &App, caller: &Caller, request: PublishRequest) -> Res
 /// [`Error::Internal`] when the database fails.
 pub(in crate::service) async fn publish_and_end(app: &App, version: NewVersion, lease: Lease) -> Result<Option<Job>, Error> {
     let (max_attempts, now) = (app.scheduler.config().max_attempts, app.clock.now());
-    one_at_a_time(app, async move |PolicyStores { store, registry }| {
+    let name = version.name.clone();
+    let job = one_at_a_time(app, async move |PolicyStores { store, registry }| {
         let new = version.row(now, None);
         let ended = EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: Some(new), max_attempts, now };
         let Some((job, published)) = store.end_attempt(ended).await? else { return Ok(None) };
@@ -143,7 +148,9 @@ pub(in crate::service) async fn publish_and_end(app: &App, version: NewVersion, 
         }
         Ok(Some(job))
     })
-    .await
+    .await?;
+    retain_after_publishing(app, &name).await;
+    Ok(job)
 }
 
 /// A parsed checkpoint that is to become a version of policy `name`.
@@ -151,6 +158,8 @@ pub(in crate::service) struct NewVersion {
     publisher: Publisher,
     name: String,
     digest_hex: String,
+    /// What lists show of it, as JSON.
+    info: String,
     parsed: ParsedCheckpoint,
 }
 
@@ -159,21 +168,27 @@ impl NewVersion {
     ///
     /// # Errors
     /// [`Error::Invalid`] for a name or bytes that cannot be published.
-    pub(in crate::service) async fn from_bytes(publisher: Publisher, name: &str, bytes: Vec<u8>) -> Result<Self, Error> {
-        Self::parse(publisher, name, CheckpointBytes { bytes, _permit: None }).await
+    pub(in crate::service) async fn from_bytes(
+        app: &App,
+        publisher: Publisher,
+        name: &str,
+        bytes: Vec<u8>,
+    ) -> Result<Self, Error> {
+        Self::parse(app, publisher, name, CheckpointBytes { bytes, _permit: None }).await
     }
 
-    async fn parse(publisher: Publisher, name: &str, source: CheckpointBytes) -> Result<Self, Error> {
+    async fn parse(app: &App, publisher: Publisher, name: &str, source: CheckpointBytes) -> Result<Self, Error> {
         check_publishable(name)?;
         let parsed = ParsedCheckpoint::parse(source).await?;
-        Ok(Self { publisher, name: name.to_owned(), digest_hex: hex::encode(parsed.digest), parsed })
+        let reference = PolicyRef { name: name.to_owned(), version: 0, digest: parsed.digest };
+        let info = info::to_json(&parsed.describe(reference, app.clock.now()))?;
+        Ok(Self { publisher, name: name.to_owned(), digest_hex: hex::encode(parsed.digest), info, parsed })
     }
 
     fn row<'a>(&'a self, now: Timestamp, alias: Option<&'a str>) -> NewPolicyVersion<'a> {
-        let (name, digest, checkpoint) = (&self.name, &self.digest_hex, &self.parsed.source.bytes);
-        let Publisher { owner, any_name, key } = &self.publisher;
-        let (owner, by) = (owner.as_deref(), key.as_deref());
-        NewPolicyVersion { name, digest, checkpoint, now, alias, by, owner, any_name: *any_name }
+        let Self { publisher: Publisher { owner, any_name, key }, name, digest_hex: digest, info, parsed } = self;
+        let (owner, by, any_name, checkpoint) = (owner.as_deref(), key.as_deref(), *any_name, &parsed.source.bytes);
+        NewPolicyVersion { name, digest, checkpoint, info, now, alias, by, owner, any_name }
     }
 
     /// Publishes the version. Returns it, and whether it is new.
@@ -182,10 +197,9 @@ impl NewVersion {
         one_at_a_time(app, async move |PolicyStores { store, registry }| {
             if let Some(alias) = &alias {
                 check_alias(&registry, &self.name, alias)?;
-                let of_name = registry.versions_of(&self.name);
-                let known = of_name.into_iter().find(|(info, _)| info.reference.digest == self.parsed.digest);
-                if let Some((info, false)) = &known {
-                    return Err(unloaded(&info.reference));
+                let known = registry.version_of_digest(&self.name, &self.parsed.digest);
+                if let Some(known) = known.filter(|known| !known.loaded) {
+                    return Err(unloaded(&known.reference));
                 }
             }
             let published = store.publish_policy(self.row(now, alias.as_deref())).await?;
@@ -195,12 +209,15 @@ impl NewVersion {
         .await
     }
 
-    /// Adds the version to the registry, after it was committed to the database. A known version stays as it is: loaded or
-    /// unloaded.
+    /// Adds the version to the registry, after it was committed to the database, and keeps it in memory if there is free memory. A
+    /// known version stays as it is: loaded or unloaded.
     fn register(self, registry: &Registry, published: PublishedPolicy, alias: Option<&str>) -> PolicyRef {
         let reference = PolicyRef { name: self.name, version: published.version, digest: self.parsed.digest };
-        if !registry.versions_of(&reference.name).iter().any(|(info, _)| info.reference.version == published.version) {
-            registry.insert(self.parsed.into_policy(reference.clone(), published.created_at));
+        if registry.version_of_digest(&reference.name, &reference.digest).is_none() {
+            registry.add(reference.clone());
+            if let Some(share) = registry.take_free_memory(self.parsed.source.bytes.len()) {
+                registry.keep(self.parsed.into_policy(reference.clone(), published.created_at, share));
+            }
         }
         if let Some(alias) = alias {
             registry.set_alias(&reference.name, alias, reference.version);
@@ -240,8 +257,8 @@ impl ParsedCheckpoint {
         parsed.await.map_err(Error::internal)?
     }
 
-    /// The policy, published as `reference`.
-    fn into_policy(self, reference: PolicyRef, created_at: i64) -> LoadedPolicy {
+    /// What lists show of it, published as `reference`.
+    fn describe(&self, reference: PolicyRef, created_at: Timestamp) -> PolicyInfo {
         let (config, step) = (self.checkpoint.config(), self.checkpoint.env_steps());
         let (environment, training) = (&config.environment, &config.training);
         let flat = training.observation == ObservationKind::Flat;
@@ -252,7 +269,7 @@ impl ParsedCheckpoint {
             all.extend(evaluated);
         }
         let (uavs, users) = (environment.uavs, environment.users);
-        let info = PolicyInfo {
+        PolicyInfo {
             reference,
             kind: PolicyKind::Checkpoint,
             description: format!("{:?}, trained for {step} slots with {uavs} UAVs and {users} users.", config.algorithm),
@@ -263,9 +280,14 @@ impl ParsedCheckpoint {
             detection_range: self.policy.env().detection_range,
             config: object(serde_json::to_value(config)),
             metrics,
-            created_at: Timestamp::from_millisecond(created_at).unwrap_or_default(),
-        };
-        LoadedPolicy { info: Arc::new(info), implementation: self.policy }
+            created_at,
+        }
+    }
+
+    /// The policy, published as `reference`.
+    fn into_policy(self, reference: PolicyRef, created_at: i64, memory: MemoryShare) -> LoadedPolicy {
+        let created_at = Timestamp::from_millisecond(created_at).unwrap_or_default();
+        LoadedPolicy::new(Arc::new(self.describe(reference, created_at)), self.policy, memory)
     }
 }
 
@@ -294,10 +316,29 @@ impl StoredVersion {
         Ok((reference, version.checkpoint))
     }
 
-    /// The policy, ready to be added to the registry.
-    pub(super) async fn load(self) -> Result<LoadedPolicy, Error> {
+    /// Bytes of the checkpoint, which are about those of the policy in memory.
+    pub(super) fn size(&self) -> usize {
+        self.version.checkpoint.len()
+    }
+
+    /// The policy, which takes `memory`.
+    pub(super) async fn load(self, memory: MemoryShare) -> Result<LoadedPolicy, Error> {
         let created_at = self.version.created_at;
+        let (reference, parsed) = self.parse().await?;
+        Ok(parsed.into_policy(reference, created_at, memory))
+    }
+
+    /// What lists show of it.
+    pub(super) async fn describe(self) -> Result<PolicyInfo, Error> {
+        let created_at = Timestamp::from_millisecond(self.version.created_at).unwrap_or_default();
+        let (reference, parsed) = self.parse().await?;
+        Ok(parsed.describe(reference, created_at))
+    }
+
+    async fn parse(self) -> Result<(PolicyRef, ParsedCheckpoint), Error> {
         let (reference, bytes) = self.checkpoint()?;
-        Ok(ParsedCheckpoint::parse(CheckpointBytes { bytes, _permit: None }).await?.into_policy(reference, created_at))
+        // The checkpoint was readable when it was published, so the caller has made no mistake.
+        let parsed = ParsedCheckpoint::parse(CheckpointBytes { bytes, _permit: None }).await.map_err(Error::internal)?;
+        Ok((reference, parsed))
     }
 }

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use jiff::Timestamp;
-use qedgix::serving::{LoadedPolicy, PolicyInfo, PolicyKind, PolicyRef};
+use qedgix::serving::{LoadedPolicy, MemoryShare, PolicyInfo, PolicyKind, PolicyRef};
 use tonic::Code;
 
 use super::*;
@@ -287,8 +287,7 @@ async fn metadata_says_what_a_policy_takes() {
     let reference = PolicyRef { name: "fixed".into(), version: 3, digest: [3; 32] };
     let policy = LoadedPolicy::baseline(reference, "of a test", Arc::new(TestPolicy::Count), Timestamp::UNIX_EPOCH);
     let info = PolicyInfo { kind: PolicyKind::Checkpoint, uavs: Some(3), ..(*policy.info).clone() };
-    let policy = LoadedPolicy { info: Arc::new(info), ..policy };
-    server.app.registry.insert(policy);
+    server.app.registry.insert(LoadedPolicy::new(Arc::new(info), policy.implementation, MemoryShare::default()));
     let mut client = client(&server).await;
     let ask = |name: &str| oip::ModelMetadataRequest { name: name.into(), version: String::new() };
     let fixed = client.model_metadata(ask("fixed")).await.unwrap().into_inner();

@@ -88,7 +88,7 @@ impl GrpcInferenceService for Service {
 
     async fn model_metadata(&self, request: Request<wire::ModelMetadataRequest>) -> GrpcResult<wire::ModelMetadataResponse> {
         let wire::ModelMetadataRequest { name, version } = request.into_inner();
-        Ok(Response::new(metadata(oip::describe(&self.0, &name, &version)?)))
+        Ok(Response::new(metadata(oip::describe(&self.0, &name, &version).await?)))
     }
 
     async fn model_infer(&self, request: Request<wire::ModelInferRequest>) -> GrpcResult<wire::ModelInferResponse> {
@@ -115,7 +115,7 @@ impl GrpcInferenceService for Service {
 
     async fn model_config(&self, request: Request<wire::ModelConfigRequest>) -> GrpcResult<wire::ModelConfigResponse> {
         let wire::ModelConfigRequest { name, version } = request.into_inner();
-        let model = oip::describe(&self.0, &name, &version)?;
+        let model = oip::describe(&self.0, &name, &version).await?;
         Ok(Response::new(wire::ModelConfigResponse { config: Some(config(model, self.0.sessions.ttl())) }))
     }
 

@@ -96,13 +96,13 @@ async fn ready(State(app): Shared) -> Result<Json<Value>, Error> {
 async fn model_ready(State(app): Shared, Path(path): Path<ModelPath>) -> Result<Json<Value>, Error> {
     if !oip::is_ready(&app, &path.model, &path.version)? {
         // Returns the error if the model does not exist or is not loaded.
-        oip::describe(&app, &path.model, &path.version)?;
+        oip::describe(&app, &path.model, &path.version).await?;
     }
     Ok(Json(json!({"name": path.model, "ready": true})))
 }
 
 async fn metadata(State(app): Shared, Path(path): Path<ModelPath>) -> Result<Json<Value>, Error> {
-    let model = oip::describe(&app, &path.model, &path.version)?;
+    let model = oip::describe(&app, &path.model, &path.version).await?;
     let tensor = |t: &TensorShape| json!({"name": t.name, "datatype": t.datatype.name(), "shape": t.shape});
     Ok(Json(json!({
         "name": model.name,
@@ -114,7 +114,7 @@ async fn metadata(State(app): Shared, Path(path): Path<ModelPath>) -> Result<Jso
 }
 
 async fn config(State(app): Shared, Path(path): Path<ModelPath>) -> Result<Json<Value>, Error> {
-    let model = oip::describe(&app, &path.model, &path.version)?;
+    let model = oip::describe(&app, &path.model, &path.version).await?;
     let output = |t: &TensorShape| json!({"name": t.name, "data_type": oip::config_type(t.datatype), "dims": t.shape});
     let input = |t: &TensorShape| {
         let mut input = output(t);

@@ -180,4 +180,21 @@ impl PolicyService for FixedResponse {
     async fn get_policy(&self, _: Request<v1::GetPolicyRequest>) -> Result<Response<v1::Policy>, Status> {
         unimplemented()
     }
+    async fn list_policy_versions(
+        &self,
+        _: Request<v1::ListPolicyVersionsRequest>,
+    ) -> Result<Response<v1::ListPolicyVersionsResponse>, Status> {
+        unimplemented()
+    }
+
+    async fn delete_policy_version(
+        &self,
+        _: Request<v1::DeletePolicyVersionRequest>,
+    ) -> Result<Response<v1::DeletePolicyVersionResponse>, Status> {
+        unimplemented()
+    }
+
+    async fn delete_policy(&self, _: Request<v1::DeletePolicyRequest>) -> Result<Response<v1::DeletePolicyResponse>, Status> {
+        unimplemented()
+    }
 }
