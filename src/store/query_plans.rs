@@ -13,7 +13,8 @@ const SCANS: &[(&str, &str)] = &[
     ("SELECT name, version FROM policies_unloaded", "once at the start"),
     ("SELECT id, COALESCE(owner, id) AS owner, name,", "only after a key has changed; keys are few"),
     ("DELETE FROM snapshots WHERE sha256 IS NULL", "the index has only incomplete snapshots, which are all deleted"),
-    ("SELECT 1 FROM sqlite_schema", "reads one row"),
+    ("SELECT version FROM _sqlx_migrations", "one row per migration"),
+    ("SELECT version FROM written_by", "one row"),
 ];
 
 /// The string literals of a Rust source.
@@ -78,7 +79,10 @@ async fn every_statement_uses_an_index() {
             // A step without the name of a table is a subquery, or a table-valued function such as json_each.
             let scan = |step: &String| {
                 let words: Vec<&str> = step.split(' ').collect();
-                words[0] == "SCAN" && (words.len() == 2 || words[2] != "VIRTUAL") && !words[1].starts_with('(')
+                words[0] == "SCAN"
+                    && words[1] != "sqlite_schema"
+                    && (words.len() == 2 || words[2] != "VIRTUAL")
+                    && !words[1].starts_with('(')
             };
             let listed = SCANS.iter().position(|(beginning, _)| statement.starts_with(beginning));
             if steps.iter().any(scan) {

@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::publish::StoredVersion;
+use super::stored::StoredVersion;
 use crate::policy::RequiredInput;
 use crate::service::{App, Error};
 use crate::serving::{PolicyInfo, PolicyKind, PolicyRef, VersionDetails};

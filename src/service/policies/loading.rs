@@ -9,7 +9,8 @@ use futures::future::{BoxFuture, Shared};
 use sha2::{Digest, Sha256};
 use tokio::sync::Semaphore;
 
-use super::publish::{Publisher, StoredVersion, publish_bytes};
+use super::publish::{Publisher, publish_bytes};
+use super::stored::StoredVersion;
 use super::{PolicyStores, one_at_a_time};
 use crate::invalid::Invalid;
 use crate::policy::{EnvParams, baselines};

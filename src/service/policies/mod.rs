@@ -9,6 +9,7 @@ mod deletion;
 mod info;
 mod loading;
 mod publish;
+mod stored;
 mod upload_limit;
 
 use std::sync::Arc;
@@ -98,7 +99,7 @@ pub async fn export(app: &App, spec: &PolicySpec) -> Result<(PolicyRef, Vec<u8>)
         let message = format!("{name} is a baseline, which has no checkpoint to export");
         return Err(Error::Precondition { code: ErrorCode::NoCheckpoint, message });
     }
-    publish::StoredVersion::read(&app.store, name, *version).await?.checkpoint()
+    stored::StoredVersion::read(&app.store, name, *version).await?.checkpoint()
 }
 
 /// What a change of policies changes: the database, then the registry.

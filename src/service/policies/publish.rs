@@ -1,27 +1,20 @@
 //! Publishes checkpoints as versions of policies.
 
-use std::sync::Arc;
-
 use jiff::Timestamp;
-use serde_json::{Value, json};
-use sha2::{Digest, Sha256};
 
 use super::aliases::{check_alias, unloaded};
 use super::deletion::retain_after_publishing;
 use super::info::{self, PolicyDetails, complete};
+use super::stored::{CheckpointBytes, ParsedCheckpoint};
 use super::upload_limit::UploadPermit;
 use super::{PolicyStores, one_at_a_time};
-use crate::checkpoint::Checkpoint;
 use crate::invalid::Invalid;
 use crate::policy::baselines;
-use crate::policy::{Identity, ObservationKind, Policy};
 use crate::service::keys::{Caller, Scope};
 use crate::service::{App, Error, checkpoints};
 use crate::serving::bundled::BUNDLED;
-use crate::serving::{
-    LoadedPolicy, MemoryShare, PolicyInfo, PolicyKind, PolicyRef, PolicySpec, Registry, VersionSelector, check_name,
-};
-use crate::store::{EndedAttempt, Job, Lease, NewPolicyVersion, PolicyVersion, PublishedPolicy, Store, WorkerResult};
+use crate::serving::{PolicyRef, PolicySpec, Registry, VersionSelector, check_name};
+use crate::store::{EndedAttempt, Job, Lease, NewPolicyVersion, PublishedPolicy, WorkerResult};
 
 /// The checkpoint to publish.
 #[derive(Debug)]
@@ -102,7 +95,7 @@ pub fn check_publishable(name: &str) -> Result<(), Invalid> {
 /// [`Error::Invalid`] for a name or bytes that cannot be published, [`Error::PermissionDenied`] when another owner made the name,
 /// [`Error::Internal`] when the database fails.
 pub async fn publish_bytes(app: &App, publisher: Publisher, name: &str, bytes: Vec<u8>) -> Result<PolicyRef, Error> {
-    let version = NewVersion::parse(app, publisher, name, CheckpointBytes { bytes, _permit: None }).await?;
+    let version = NewVersion::parse(app, publisher, name, CheckpointBytes { bytes, permit: None }).await?;
     let (reference, _) = version.publish(app, None).await?;
     Ok(reference)
 }
@@ -121,8 +114,8 @@ pub async fn publish(app: &App, caller: &Caller, request: PublishRequest) -> Res
         check_name("alias", alias)?;
     }
     let checkpoint = match source {
-        CheckpointSource::Bytes(bytes, permit) => CheckpointBytes { bytes, _permit: Some(permit) },
-        CheckpointSource::Job(id) => CheckpointBytes { bytes: checkpoints::get(app, caller, &id).await?.1, _permit: None },
+        CheckpointSource::Bytes(bytes, permit) => CheckpointBytes { bytes, permit: Some(permit) },
+        CheckpointSource::Job(id) => CheckpointBytes { bytes: checkpoints::get(app, caller, &id).await?.1, permit: None },
     };
     let (reference, new) = NewVersion::parse(app, caller.into(), &name, checkpoint).await?.publish(app, alias).await?;
     let spec = PolicySpec { name, version: VersionSelector::Version(reference.version) };
@@ -174,7 +167,7 @@ impl NewVersion {
         name: &str,
         bytes: Vec<u8>,
     ) -> Result<Self, Error> {
-        Self::parse(app, publisher, name, CheckpointBytes { bytes, _permit: None }).await
+        Self::parse(app, publisher, name, CheckpointBytes { bytes, permit: None }).await
     }
 
     async fn parse(app: &App, publisher: Publisher, name: &str, source: CheckpointBytes) -> Result<Self, Error> {
@@ -226,119 +219,5 @@ impl NewVersion {
             tracing::info!(policy = %reference, digest = reference.digest_hex(), alias, "policy published");
         }
         reference
-    }
-}
-
-/// A checkpoint in memory, with the permit of its upload if it was uploaded.
-struct CheckpointBytes {
-    bytes: Vec<u8>,
-    _permit: Option<UploadPermit>,
-}
-
-/// A parsed checkpoint and its policy.
-struct ParsedCheckpoint {
-    checkpoint: Checkpoint,
-    policy: Arc<dyn Policy>,
-    source: CheckpointBytes,
-    digest: [u8; 32],
-}
-
-impl ParsedCheckpoint {
-    /// Parses a checkpoint on a thread that does not serve connections.
-    async fn parse(source: CheckpointBytes) -> Result<Self, Error> {
-        let parsed = tokio::task::spawn_blocking(move || {
-            let bytes = &source.bytes;
-            let size = bytes.len();
-            let invalid = |e| Invalid::new("checkpoint", format!("{size} bytes"), format!("a checkpoint of Qedgix ({e})"));
-            let checkpoint = Checkpoint::from_bytes(bytes).map_err(invalid)?;
-            let (policy, digest) = (Arc::new(checkpoint.policy()), Sha256::digest(bytes).into());
-            Ok(Self { checkpoint, policy, source, digest })
-        });
-        parsed.await.map_err(Error::internal)?
-    }
-
-    /// What lists show of it, published as `reference`.
-    fn describe(&self, reference: PolicyRef, created_at: Timestamp) -> PolicyInfo {
-        let (config, step) = (self.checkpoint.config(), self.checkpoint.env_steps());
-        let (environment, training) = (&config.environment, &config.training);
-        let flat = training.observation == ObservationKind::Flat;
-        let object = |value: serde_json::Result<Value>| value.unwrap_or_default();
-        let mut metrics = json!({"step": step});
-        let evaluated = object(serde_json::to_value(self.checkpoint.metrics()));
-        if let (Some(all), Value::Object(evaluated)) = (metrics.as_object_mut(), evaluated) {
-            all.extend(evaluated);
-        }
-        let (uavs, users) = (environment.uavs, environment.users);
-        PolicyInfo {
-            reference,
-            kind: PolicyKind::Checkpoint,
-            description: format!("{:?}, trained for {step} slots with {uavs} UAVs and {users} users.", config.algorithm),
-            uavs: (flat || training.identity == Identity::Onehot).then_some(uavs as u32),
-            users: flat.then_some(users as u32),
-            actions: self.policy.actions(),
-            needs: self.policy.needs(),
-            detection_range: self.policy.env().detection_range,
-            config: object(serde_json::to_value(config)),
-            metrics,
-            created_at,
-        }
-    }
-
-    /// The policy, published as `reference`.
-    fn into_policy(self, reference: PolicyRef, created_at: i64, memory: MemoryShare) -> LoadedPolicy {
-        let created_at = Timestamp::from_millisecond(created_at).unwrap_or_default();
-        LoadedPolicy::new(Arc::new(self.describe(reference, created_at)), self.policy, memory)
-    }
-}
-
-/// A published version as stored.
-pub(super) struct StoredVersion {
-    reference: PolicyRef,
-    version: PolicyVersion,
-}
-
-impl StoredVersion {
-    pub(super) async fn read(store: &Store, name: &str, version: u64) -> Result<Self, Error> {
-        let found = store.policy_version(name, version).await?;
-        let found = found.ok_or_else(|| Error::not_found("checkpoint", format!("{name}:{version}")))?;
-        let hash = move || (Sha256::digest(&found.checkpoint).into(), found);
-        let (digest, version) = tokio::task::spawn_blocking(hash).await.map_err(Error::internal)?;
-        Ok(Self { reference: PolicyRef { name: name.to_owned(), version: version.version, digest }, version })
-    }
-
-    /// The checkpoint, after a check that it has not changed since it was published.
-    pub(super) fn checkpoint(self) -> Result<(PolicyRef, Vec<u8>), Error> {
-        let Self { reference, version } = self;
-        if reference.digest_hex() != version.digest {
-            let reason = format!("the checkpoint of {reference} is damaged: its digest has changed");
-            return Err(Error::internal(reason));
-        }
-        Ok((reference, version.checkpoint))
-    }
-
-    /// Bytes of the checkpoint, which are about those of the policy in memory.
-    pub(super) fn size(&self) -> usize {
-        self.version.checkpoint.len()
-    }
-
-    /// The policy, which takes `memory`.
-    pub(super) async fn load(self, memory: MemoryShare) -> Result<LoadedPolicy, Error> {
-        let created_at = self.version.created_at;
-        let (reference, parsed) = self.parse().await?;
-        Ok(parsed.into_policy(reference, created_at, memory))
-    }
-
-    /// What lists show of it.
-    pub(super) async fn describe(self) -> Result<PolicyInfo, Error> {
-        let created_at = Timestamp::from_millisecond(self.version.created_at).unwrap_or_default();
-        let (reference, parsed) = self.parse().await?;
-        Ok(parsed.describe(reference, created_at))
-    }
-
-    async fn parse(self) -> Result<(PolicyRef, ParsedCheckpoint), Error> {
-        let (reference, bytes) = self.checkpoint()?;
-        // The checkpoint was readable when it was published, so the caller has made no mistake.
-        let parsed = ParsedCheckpoint::parse(CheckpointBytes { bytes, _permit: None }).await.map_err(Error::internal)?;
-        Ok((reference, parsed))
     }
 }
