@@ -95,7 +95,7 @@ pub fn check_publishable(name: &str) -> Result<(), Invalid> {
 /// [`Error::Invalid`] for a name or bytes that cannot be published, [`Error::PermissionDenied`] when another owner made the name,
 /// [`Error::Internal`] when the database fails.
 pub async fn publish_bytes(app: &App, publisher: Publisher, name: &str, bytes: Vec<u8>) -> Result<PolicyRef, Error> {
-    let version = NewVersion::parse(app, publisher, name, CheckpointBytes { bytes, permit: None }).await?;
+    let version = NewVersion::parse(app, publisher, name, CheckpointBytes { bytes, _permit: None }).await?;
     let (reference, _) = version.publish(app, None).await?;
     Ok(reference)
 }
@@ -114,8 +114,8 @@ pub async fn publish(app: &App, caller: &Caller, request: PublishRequest) -> Res
         check_name("alias", alias)?;
     }
     let checkpoint = match source {
-        CheckpointSource::Bytes(bytes, permit) => CheckpointBytes { bytes, permit: Some(permit) },
-        CheckpointSource::Job(id) => CheckpointBytes { bytes: checkpoints::get(app, caller, &id).await?.1, permit: None },
+        CheckpointSource::Bytes(bytes, permit) => CheckpointBytes { bytes, _permit: Some(permit) },
+        CheckpointSource::Job(id) => CheckpointBytes { bytes: checkpoints::get(app, caller, &id).await?.1, _permit: None },
     };
     let (reference, new) = NewVersion::parse(app, caller.into(), &name, checkpoint).await?.publish(app, alias).await?;
     let spec = PolicySpec { name, version: VersionSelector::Version(reference.version) };
@@ -167,7 +167,7 @@ impl NewVersion {
         name: &str,
         bytes: Vec<u8>,
     ) -> Result<Self, Error> {
-        Self::parse(app, publisher, name, CheckpointBytes { bytes, permit: None }).await
+        Self::parse(app, publisher, name, CheckpointBytes { bytes, _permit: None }).await
     }
 
     async fn parse(app: &App, publisher: Publisher, name: &str, source: CheckpointBytes) -> Result<Self, Error> {

@@ -17,7 +17,7 @@ use crate::store::{PolicyVersion, Store};
 /// A checkpoint in memory, with the permit of its upload if it was uploaded.
 pub(super) struct CheckpointBytes {
     pub(super) bytes: Vec<u8>,
-    pub(super) permit: Option<UploadPermit>,
+    pub(super) _permit: Option<UploadPermit>,
 }
 
 /// A parsed checkpoint and its policy.
@@ -123,7 +123,7 @@ impl StoredVersion {
     async fn parse(self) -> Result<(PolicyRef, ParsedCheckpoint), Error> {
         let (reference, bytes) = self.checkpoint()?;
         // The checkpoint was readable when it was published, so the caller has made no mistake.
-        let parsed = ParsedCheckpoint::parse(CheckpointBytes { bytes, permit: None }).await.map_err(Error::internal)?;
+        let parsed = ParsedCheckpoint::parse(CheckpointBytes { bytes, _permit: None }).await.map_err(Error::internal)?;
         Ok((reference, parsed))
     }
 }
