@@ -47,6 +47,16 @@ pub(super) enum Protocol {
     Http,
 }
 
+/// The version of HTTP on a connection.
+#[derive(Clone, Copy, Debug)]
+enum Version {
+    Http1,
+    /// `date`: responses have a date, as HTTP requires and gRPC does not use.
+    Http2 {
+        date: bool,
+    },
+}
+
 /// Settings and limits that connections share; cheap to clone.
 #[derive(Clone)]
 pub(super) struct Connections {
@@ -116,7 +126,8 @@ impl Connections {
         let _ = stream.set_nodelay(true);
         let stream = WriteTimeout::new(stream, self.limits.write);
         let Some(tls) = &self.tls else {
-            return self.serve_http(stream, protocol, protocol == Protocol::Grpc, service, &place).await;
+            let version = if protocol == Protocol::Grpc { Version::Http2 { date: false } } else { Version::Http1 };
+            return self.serve_http(stream, version, service, &place).await;
         };
         let configs = tls.current();
         let config = if protocol == Protocol::Grpc { configs.grpc } else { configs.http };
@@ -130,7 +141,8 @@ impl Connections {
                 let agreed = stream.get_ref().1.alpn_protocol();
                 // Without ALPN, the connection uses the default protocol of the port.
                 let http2 = agreed.map_or(protocol == Protocol::Grpc, |agreed| agreed == H2);
-                self.serve_http(stream, protocol, http2, service, &place).await;
+                let version = if http2 { Version::Http2 { date: protocol == Protocol::Http } } else { Version::Http1 };
+                self.serve_http(stream, version, service, &place).await;
             }
             Ok(Err(error)) => tracing::debug!(%error, "TLS handshake failed"),
             Err(_) => tracing::debug!(timeout = ?self.limits.read, "TLS handshake timed out"),
@@ -145,7 +157,7 @@ impl Connections {
         self.limits.write = self.limits.write.min(RESERVED_LIFE);
     }
 
-    async fn serve_http<IO, S, B>(&self, io: IO, protocol: Protocol, http2: bool, service: S, place: &Place)
+    async fn serve_http<IO, S, B>(&self, io: IO, version: Version, service: S, place: &Place)
     where
         IO: AsyncRead + AsyncWrite + Send + Unpin + 'static,
         S: Service<Request<IncomingBody>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
@@ -158,13 +170,9 @@ impl Connections {
         let _ = getrandom::fill(&mut jitter);
         let jitter = f64::from(jitter[0]) / 255.0;
         let lifetime = Lifetime::new(self.life, self.clock.clone(), self.stop.clone(), place.reserved, jitter);
-        if http2 {
-            let settings = http2::Settings {
-                max_streams: self.max_streams,
-                limits: self.limits,
-                purse: place.purse.clone(),
-                date: protocol == Protocol::Http,
-            };
+        if let Version::Http2 { date } = version {
+            let (max_streams, limits, purse) = (self.max_streams, self.limits, place.purse.clone());
+            let settings = http2::Settings { max_streams, limits, purse, date };
             if let Err(error) = http2::serve(io, service, &settings, lifetime).await {
                 tracing::debug!(%error, "connection failed");
             }

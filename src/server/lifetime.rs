@@ -155,7 +155,7 @@ mod tests {
         assert_eq!(after(1), [Verdict::Leave, Verdict::Stay, Verdict::Stay]);
         assert_eq!(after(29), [Verdict::Stay; 3]);
         assert_eq!(after(1), [Verdict::Close, Verdict::Stay, Verdict::Stay]);
-        assert_eq!(after(170)[1..], [Verdict::Close, Verdict::Leave]);
+        assert_eq!(after(171)[1..], [Verdict::Leave; 2]);
     }
 
     #[test]
