@@ -8,7 +8,7 @@
 //!     QEDGIX_CHAOS_INJECTIONS=200 cargo test --release --test chaos -- --nocapture
 //!     QEDGIX_CHAOS_SEED=17 QEDGIX_CHAOS_INJECTIONS=200 cargo test --release --test chaos -- --nocapture
 //!
-//! `QEDGIX_CHAOS_ONLY=FullDisk,KillServer` injects some of the faults only.
+//! `QEDGIX_CHAOS_ONLY=FullDisk,KillServer` injects some of the faults only; `QEDGIX_CHAOS_JOBS` is the number of jobs.
 
 mod disk;
 mod faults;
@@ -377,6 +377,7 @@ async fn every_job_ends_as_asked_whatever_happens() {
     let only = std::env::var("QEDGIX_CHAOS_ONLY").ok();
     let chosen = |fault: &Fault| only.as_ref().is_none_or(|only| only.split(',').any(|name| name == format!("{fault:?}")));
     let (jobs, steps) = if full { (30, 24_000) } else { (6, 8_000) };
+    let jobs = setting("QEDGIX_CHAOS_JOBS").unwrap_or(jobs);
     println!("QEDGIX_CHAOS_SEED={seed}: {count} faults, {jobs} jobs of {steps} environment steps");
     let specs: Vec<Value> = (0..jobs).map(|number| jobs::spec(number, steps)).collect();
     let started = Instant::now();
