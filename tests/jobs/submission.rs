@@ -146,7 +146,7 @@ async fn a_job_that_needs_more_memory_than_there_is_is_refused() {
     let server = Server::start_with(dir.path(), 2, |s| s.memory = 1 << 30).await;
     for (field, fields) in [
         ("training.buffer", json!({"training": {"buffer": 1_000_000, "steps": 1_000_000_000}})),
-        ("environment.uavs", json!({"environment": {"uavs": 1000, "users": 900}})),
+        ("environment.uavs", json!({"environment": {"uavs": 1000, "users": 900}, "training": {"buffer": 100}})),
     ] {
         let refused = server.request(Method::POST, "/v1/jobs").json(&fields);
         let refused = expect(refused, StatusCode::BAD_REQUEST).await;
