@@ -34,6 +34,8 @@ pub struct Config {
     pub session_ttl: Duration,
     /// Maximum open sessions.
     pub max_sessions: usize,
+    /// Memory of all sessions together, in bytes.
+    pub session_memory: usize,
     /// Idle time after which a hosted environment expires.
     pub environment_ttl: Duration,
     /// Maximum hosted environments.
@@ -111,6 +113,7 @@ impl Config {
             worker: None,
             session_ttl: Duration::from_secs(600),
             max_sessions: 100_000,
+            session_memory: 512 << 20,
             environment_ttl: Duration::from_secs(600),
             max_environments: 1024,
             environment_memory: 1 << 30,
@@ -150,6 +153,7 @@ impl Config {
         in_seconds("--heartbeat-timeout", self.heartbeat_timeout, 2.0..=3600.0)?;
         in_seconds("--session-ttl", self.session_ttl, 0.001..=1e9)?;
         in_range("--max-sessions", self.max_sessions, 1..=100_000_000)?;
+        in_range("--session-memory", self.session_memory, 1 << 20..=1 << 40)?;
         in_seconds("--environment-ttl", self.environment_ttl, 0.001..=1e9)?;
         in_range("--max-environments", self.max_environments, 1..=100_000_000)?;
         in_range("--environment-memory", self.environment_memory, 1 << 20..=1 << 40)?;

@@ -41,7 +41,7 @@ use crate::jobs::{LocalProcess, Scheduler, SchedulerConfig};
 use crate::service::keys::{Keyring, Rate};
 use crate::service::policies::{Loads, UploadLimit};
 use crate::service::{App, WatchLimit, operations, policies};
-use crate::serving::{Engine, Environments, EnvironmentsConfig, Limits, Registry, Sessions};
+use crate::serving::{Engine, Environments, Limits, Registry, Sessions};
 use crate::store::{self, Store};
 use crate::telemetry;
 
@@ -210,9 +210,8 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
     config.validate()?;
     // The recorder must exist before anything creates a metric.
     telemetry::install_metrics();
-    let sessions = Limits { ttl: config.session_ttl, max: config.max_sessions };
-    let limits = Limits { ttl: config.environment_ttl, max: config.max_environments };
-    let environments = EnvironmentsConfig { limits, memory: config.environment_memory };
+    let sessions = Limits { ttl: config.session_ttl, max: config.max_sessions, memory: config.session_memory };
+    let environments = Limits { ttl: config.environment_ttl, max: config.max_environments, memory: config.environment_memory };
     data.make_private();
     let store = Store::open(&data.path).await?;
     housekeeping::prepare_file(&store, &data.path).await?;
@@ -247,6 +246,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         engine: Engine::start(config.engine).map_err(Error::Engine)?,
         watchers: WatchLimit::new(config.max_watchers, config.event_heartbeat),
         clock,
+        max_message_size: config.max_message_size,
         draining,
     };
     policies::fill_registry(&app).await.map_err(Error::Policies)?;

@@ -11,7 +11,9 @@ use futures::future::BoxFuture;
 use jiff::Timestamp;
 use qedgix::learner::{Algorithm, Learner, Preset, TrainConfig};
 use qedgix::policy::{FleetGraph, LearnedPolicy};
-use qedgix::serving::{Decision, Engine, EngineConfig, Error, LoadedPolicy, OutputBuffers, PolicyRef, Task, TaskOutput};
+use qedgix::serving::{
+    Decision, Engine, EngineConfig, Error, FleetMemory, LoadedPolicy, OutputBuffers, Owner, PolicyRef, Task, TaskOutput,
+};
 
 const UAVS: usize = 3;
 const USERS: usize = 5;
@@ -33,7 +35,8 @@ fn slot(fleet: usize, step: usize) -> FleetGraph {
 
 /// Runs `fleets` fleets concurrently for `steps` slots. Returns the number of allocations of each slot.
 fn allocations_per_slot(engine: &Engine, policy: &Arc<LoadedPolicy>, fleets: usize, steps: usize) -> Vec<u64> {
-    let fresh = || TaskOutput { memory: vec![0.0; policy.implementation.memory_len(UAVS, USERS)], decision: Decision::default() };
+    let plain = || FleetMemory::Plain(vec![0.0; policy.implementation.memory_len(UAVS, USERS)]);
+    let fresh = || TaskOutput { memory: plain(), decision: Decision::default() };
     let mut last: Vec<TaskOutput> = (0..fleets).map(|_| fresh()).collect();
     let mut counts = Vec::new();
     for step in 0..steps {
@@ -42,8 +45,8 @@ fn allocations_per_slot(engine: &Engine, policy: &Arc<LoadedPolicy>, fleets: usi
             .enumerate()
             .map(|(fleet, TaskOutput { memory, decision: Decision { headings, q_values, .. } })| {
                 let buffers = OutputBuffers { headings, q_values };
-                let task = Task::new(policy.clone(), slot(fleet, step), step as u64, memory, buffers);
-                Some(engine.run(task, None).boxed())
+                let task = Task::new(policy.clone(), slot(fleet, step).into(), step as u64, memory, buffers);
+                Some(engine.run(&Owner::NOBODY, task, None).boxed())
             })
             .collect();
         let mut answers: Vec<Option<TaskOutput>> = calls.iter().map(|_| None).collect();

@@ -57,6 +57,9 @@ pub struct ServeArgs {
     /// Maximum open sessions
     #[arg(long, env = "QEDGIX_MAX_SESSIONS", default_value_t = 100_000, value_name = "SESSIONS")]
     max_sessions: usize,
+    /// Maximum memory of all sessions together, in bytes
+    #[arg(long, env = "QEDGIX_SESSION_MEMORY", default_value_t = 512 << 20, value_name = "BYTES")]
+    session_memory: usize,
     /// Idle time after which a hosted environment expires
     #[arg(long, env = "QEDGIX_ENVIRONMENT_TTL", default_value = "10m", value_parser = duration, value_name = "TIME")]
     environment_ttl: Duration,
@@ -269,6 +272,7 @@ impl ServeArgs {
             heartbeat_timeout: self.heartbeat_timeout,
             session_ttl: self.session_ttl,
             max_sessions: self.max_sessions,
+            session_memory: self.session_memory,
             environment_ttl: self.environment_ttl,
             max_environments: self.max_environments,
             environment_memory: self.environment_memory,

@@ -63,8 +63,9 @@ impl FleetGraph {
         Self::from_flat_detections(uav_positions, uavs, aoi, offsets, flat)
     }
 
-    /// As [`FleetGraph::from_scene`], but `None` if there are more than `max_detections` detections. Work and memory are bounded by
-    /// the number of nodes and by `max_detections`.
+    /// As [`FleetGraph::from_scene`], but only nodes 0..`observers` have detections, and `None` if there are more than
+    /// `max_detections`. Work and memory are bounded by the number of nodes and by `max_detections`. `limits`: observers,
+    /// `max_detections`.
     ///
     /// # Panics
     /// When `aoi` does not have one entry per user.
@@ -73,10 +74,10 @@ impl FleetGraph {
         users: &[Point],
         aoi: &[f32],
         ranges: impl Into<Ranges>,
-        max_detections: usize,
+        limits: (usize, usize),
     ) -> Option<Self> {
         let mut graph = Self::default();
-        graph.rebuild(uavs, users, aoi, ranges.into(), max_detections).then_some(graph)
+        graph.rebuild(uavs, users, aoi, ranges.into(), limits).then_some(graph)
     }
 
     /// As [`FleetGraph::from_detections`], from all lists in one vector: the list of node i is
@@ -106,11 +107,18 @@ impl FleetGraph {
     /// # Panics
     /// When `aoi` does not have one entry per user.
     pub fn set_scene(&mut self, uavs: &[Point], users: &[Point], aoi: &[f32], ranges: impl Into<Ranges>) {
-        self.rebuild(uavs, users, aoi, ranges.into(), usize::MAX);
+        self.rebuild(uavs, users, aoi, ranges.into(), (usize::MAX, usize::MAX));
     }
 
     /// Returns false and leaves the graph incomplete if there are more than `max_detections` detections.
-    fn rebuild(&mut self, uavs: &[Point], users: &[Point], aoi: &[f32], ranges: Ranges, max_detections: usize) -> bool {
+    fn rebuild(
+        &mut self,
+        uavs: &[Point],
+        users: &[Point],
+        aoi: &[f32],
+        ranges: Ranges,
+        (observers, max_detections): (usize, usize),
+    ) -> bool {
         assert_eq!(aoi.len(), users.len(), "one AoI per user");
         self.uavs = uavs.len();
         self.users = users.len();
@@ -128,13 +136,11 @@ impl FleetGraph {
         self.points.clear();
         self.points.extend_from_slice(uavs);
         self.points.extend_from_slice(users);
-        self.search.append_detections(
-            (&self.points, uavs.len()),
-            self.points.len(),
-            ranges,
-            (&mut self.offsets, &mut self.detections),
-            max_detections,
-        )
+        let observers = observers.min(self.points.len());
+        let lists = (&mut self.offsets, &mut self.detections);
+        let complete = self.search.append_detections((&self.points, uavs.len()), observers, ranges, lists, max_detections);
+        self.offsets.resize(self.points.len() + 1, self.detections.len() as u32);
+        complete
     }
 
     /// M.

@@ -84,7 +84,7 @@ pub struct GeometryConfig {
 
 impl GeometryConfig {
     /// Number of nodes of a fleet whose detections are needed.
-    fn observers(&self, uavs: usize, users: usize) -> usize {
+    pub(super) fn observers(&self, uavs: usize, users: usize) -> usize {
         if self.layers == 0 && self.hops <= 1 { uavs } else { uavs + users }
     }
 }

@@ -99,6 +99,14 @@ impl Policy for LearnedPolicy {
         self.agent.check_fleet(uavs, users)
     }
 
+    fn observers(&self, uavs: usize, users: usize) -> usize {
+        self.agent.geometry_config().observers(uavs, users)
+    }
+
+    fn memory_period(&self, _uavs: usize, users: usize) -> usize {
+        if self.agent.config().memory.is_none() { self.stride() } else { uav_memory_len(users) }
+    }
+
     fn memory_len(&self, uavs: usize, users: usize) -> usize {
         let remembered = if self.agent.config().memory.is_none() { 0 } else { uav_memory_len(users) };
         uavs * (self.stride() + remembered)

@@ -28,7 +28,7 @@ pub use geometry::{FleetSpan, Geometry, GeometryConfig, NodeView};
 pub use goals::Goals;
 pub use hop_search::HopSearch;
 pub use learned::LearnedPolicy;
-pub use neighbor_search::Detection;
+pub use neighbor_search::{Detection, DetectionEstimate, estimate_detections};
 pub use sight::Sight;
 
 use serde::{Deserialize, Serialize};
@@ -88,8 +88,23 @@ pub trait Policy: Send + Sync {
     /// Length of a fleet's memory.
     fn memory_len(&self, uavs: usize, users: usize) -> usize;
 
+    /// Distance at which numbers of the memory resemble each other, as those of two UAVs about the same user do. Packing uses it.
+    fn memory_period(&self, uavs: usize, users: usize) -> usize {
+        self.memory_len(uavs, users) / uavs.max(1)
+    }
+
     /// Initialises a fleet's memory for slot 0. `seed` determines all random numbers of the episode.
     fn start(&self, uavs: usize, users: usize, seed: u64, memory: &mut [f32]);
+
+    /// Number of nodes, of the first ones (UAVs, then users), whose detections the policy reads. Others need not be computed.
+    fn observers(&self, uavs: usize, users: usize) -> usize {
+        uavs + users
+    }
+
+    /// Estimated time of a slot. The unit is the time that a learned policy takes for a detection: about 0.1 microseconds.
+    fn work(&self, uavs: usize, users: usize, detections: usize) -> usize {
+        32 * uavs + users + detections
+    }
 
     /// Whether the time for a slot is about proportional to its nodes and detections. Small fleets of such policies can be computed
     /// on the thread that received the request.

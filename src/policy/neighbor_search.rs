@@ -117,6 +117,68 @@ impl NeighborSearch {
     }
 }
 
+/// How many detections a scene has, from the numbers of nodes in square cells.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct DetectionEstimate {
+    /// The scene has at least so many.
+    pub at_least: usize,
+    /// The scene has about so many.
+    pub about: usize,
+}
+
+/// Cells per range of an estimate.
+const CELLS_PER_RANGE: f64 = 8.0;
+
+/// Estimates how many detections nodes 0..`observers` have among `uavs` and `users`, in a time that is proportional to the nodes.
+pub fn estimate_detections(uavs: &[Point], users: &[Point], observers: usize, ranges: Ranges) -> DetectionEstimate {
+    let nodes = uavs.len() + users.len();
+    if observers == 0 || nodes == 0 {
+        return DetectionEstimate { at_least: 0, about: 0 };
+    }
+    let points = || uavs.iter().chain(users);
+    let fold = |axis: usize, f: fn(f64, f64) -> f64| points().map(|p| p[axis]).reduce(f).unwrap_or(0.0);
+    let low = [fold(0, f64::min), fold(1, f64::min)];
+    let extent = (fold(0, f64::max) - low[0]).max(fold(1, f64::max) - low[1]);
+    let range = ranges.detection;
+    // Not more cells than nodes, about.
+    let size = (range / CELLS_PER_RANGE).max(extent / (nodes as f64).sqrt()).max(f64::MIN_POSITIVE);
+    let side = (extent / size) as usize + 1;
+    // Number of observers in each cell, and number of nodes in the cells before each cell of its row.
+    let (mut observed, mut before) = (vec![0_usize; side * side], vec![0_usize; side * (side + 1)]);
+    for (i, p) in points().enumerate() {
+        let [x, y] = [0, 1].map(|axis| (((p[axis] - low[axis]) / size) as usize).min(side - 1));
+        observed[y * side + x] += usize::from(i < observers);
+        before[y * (side + 1) + x + 1] += 1;
+    }
+    for row in before.chunks_exact_mut(side + 1) {
+        (1..row.len()).for_each(|x| row[x] += row[x - 1]);
+    }
+    // For each number of rows between two cells, the number of columns up to which about half of the pairs of nodes are within range, and
+    // up to which all are. The factor allows for rounding.
+    let cells = range / size;
+    let reach = (cells as usize).min(side);
+    let about_columns = |dy: usize| (cells * cells - (dy * dy) as f64).max(0.0).sqrt() as usize;
+    let all_columns = |dy: usize| {
+        let columns = (cells * cells * (1.0 - 1e-9) - ((dy + 1) * (dy + 1)) as f64).sqrt() - 1.0;
+        (columns >= 0.0).then_some(columns as usize)
+    };
+    let columns: Vec<_> = (0..=reach).map(|dy| (about_columns(dy), all_columns(dy))).collect();
+    let (mut at_least, mut about) = (0, 0);
+    for (cell, &observed) in observed.iter().enumerate().filter(|(_, observed)| **observed > 0) {
+        let (x, y) = (cell % side, cell / side);
+        for other_y in y.saturating_sub(reach)..=(y + reach).min(side - 1) {
+            let row = &before[other_y * (side + 1)..][..=side];
+            let nodes = |columns: usize| row[(x + columns + 1).min(side)] - row[x.saturating_sub(columns)];
+            let (about_columns, all_columns) = columns[y.abs_diff(other_y)];
+            about += observed * nodes(about_columns);
+            at_least += observed * all_columns.map_or(0, nodes);
+        }
+    }
+    // No node detects itself, and UAVs detect each other within another range.
+    let uncertain = observers + if ranges.communication < range { uavs.len().pow(2) } else { 0 };
+    DetectionEstimate { at_least: at_least.saturating_sub(uncertain), about }
+}
+
 #[inline(always)]
 fn detect(i: usize, from: Point, j: usize, to: Point, range: f64) -> Option<Detection> {
     let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
@@ -169,6 +231,31 @@ mod tests {
                     (&pairs(&points, uavs, ranges).0, &pairs(&points, uavs, ranges).1),
                     "{n} nodes, {ranges:?}"
                 );
+            }
+        }
+    }
+
+    #[test]
+    fn estimate_never_exceeds_the_detections_and_is_close_for_dense_scenes() {
+        let scenes =
+            [(50, 500, 0.28, 1.0), (10, 300, 0.04, 1.0), (99, 2000, 0.28, 1.0), (200, 200, 0.1, 30.0), (5, 60, 0.25, 0.0)];
+        for (uavs, users, range, spread) in scenes {
+            let mut rng = crate::rng::stream(7, "estimate", users);
+            let mut draw = |n: u64| (0..n).map(|_| [0, 1].map(|_| spread * rng.random::<f64>())).collect::<Vec<Point>>();
+            let (own, all) = (draw(uavs), draw(users));
+            let (aoi, nodes) = (vec![0.0; all.len()], own.len() + all.len());
+            for (communication, observers) in [(range, nodes), (0.0, nodes), (range, own.len()), (range, 0)] {
+                let ranges = Ranges { detection: range, communication };
+                let graph = crate::policy::FleetGraph::from_scene_within(&own, &all, &aoi, ranges, (observers, usize::MAX));
+                let count = graph.unwrap().detection_count();
+                let DetectionEstimate { at_least, about } = estimate_detections(&own, &all, observers, ranges);
+                assert!(at_least <= count, "{at_least} of {count}");
+                if range == 0.28 && communication == range && observers == nodes {
+                    assert!(
+                        2 * at_least > count && about * 3 > count * 2 && about * 2 < count * 3,
+                        "{at_least}, {about}, {count}"
+                    );
+                }
             }
         }
     }

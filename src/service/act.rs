@@ -8,7 +8,7 @@ mod request;
 mod sequence;
 mod session;
 
-pub use compute::OFFLOAD_NODES;
+pub use compute::{decode, decoding_cost};
 pub use request::{MemoryLocation, Request, Response, Sequence, SequenceId};
 pub use sequence::SEQUENCE_PREFIX;
 
@@ -39,7 +39,7 @@ pub async fn act(app: &App, caller: &Caller, request: Request, deadline: Option<
         }
         MemoryLocation::RecurrentState(state) => {
             let state = state.clone();
-            recurrent_state::act(app, &state, request, deadline).await
+            recurrent_state::act(app, caller.owner(), &state, request, deadline).await
         }
     }
 }

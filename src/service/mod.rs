@@ -49,6 +49,8 @@ pub struct App {
     pub retention: policies::Retention,
     /// The limit of uploads of checkpoints.
     pub uploads: policies::UploadLimit,
+    /// Maximum size of a gRPC message or HTTP body, in bytes.
+    pub max_message_size: usize,
     /// Limits of watches of jobs.
     pub watchers: WatchLimit,
     /// Wall time and monotonic time.

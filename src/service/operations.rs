@@ -73,6 +73,8 @@ impl App {
 pub struct ServerMetrics {
     /// Open sessions.
     pub sessions: usize,
+    /// Bytes that sessions take.
+    pub session_memory: usize,
     /// Hosted environments.
     pub environments: usize,
     /// Policy versions, loaded or not.
@@ -105,6 +107,7 @@ pub async fn server_metrics(app: &App) -> ServerMetrics {
     };
     ServerMetrics {
         sessions: app.sessions.len(),
+        session_memory: app.sessions.memory_used(),
         environments: app.environments.table().len(),
         policy_versions: app.registry.len(),
         policy_memory: app.registry.memory_used(),

@@ -29,6 +29,15 @@ impl FleetIds {
         (self.uavs.len(), self.users.len())
     }
 
+    /// Bytes that the ids take.
+    pub fn bytes(&self) -> usize {
+        // The allocator rounds sizes up; 16 is a typical unit.
+        let bytes = |ids: &Vec<String>| {
+            ids.capacity() * size_of::<String>() + ids.iter().map(|id| id.capacity().next_multiple_of(16)).sum::<usize>()
+        };
+        bytes(&self.uavs) + bytes(&self.users)
+    }
+
     /// A hash of the ids. Different fleets have different fingerprints.
     pub fn fingerprint(&self) -> [u8; 16] {
         let mut hash = Sha256::new();

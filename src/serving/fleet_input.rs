@@ -6,7 +6,7 @@
 use super::FleetIds;
 use crate::env::{Point, Ranges};
 use crate::invalid::Invalid;
-use crate::policy::{Detection, FleetGraph, Policy, RequiredInput};
+use crate::policy::{Detection, FleetGraph, Policy, RequiredInput, estimate_detections};
 
 /// Maximum number of nodes of one fleet.
 pub const MAX_NODES: usize = 20_000;
@@ -122,12 +122,82 @@ impl SceneOrGraph {
     /// As [`FleetInput::into_fleet_graph`].
     pub fn into_fleet_graph(self, (uavs, users): (usize, usize), policy: &dyn Policy) -> Result<FleetGraph, Invalid> {
         policy.check_fleet(uavs, users)?;
-        let ranges = policy.ranges();
+        let (ranges, observers) = (policy.ranges(), policy.observers(uavs, users));
         match self {
-            Self::Scene(Scene { uavs, users, aoi }) => FleetGraph::from_scene_within(&uavs, &users, &aoi, ranges, MAX_DETECTIONS)
-                .ok_or_else(|| too_many_detections("scene")),
-            Self::Graph(graph) => graph.into_fleet_graph(policy.needs(), ranges),
+            Self::Scene(Scene { uavs, users, aoi }) => {
+                let limits = (observers, MAX_DETECTIONS);
+                FleetGraph::from_scene_within(&uavs, &users, &aoi, ranges, limits).ok_or_else(|| too_many_detections("scene"))
+            }
+            Self::Graph(graph) => graph.into_fleet_graph(policy.needs(), observers, ranges),
         }
+    }
+
+    /// The input of a task of `policy`, for a fleet of `(uavs, users)`. Small inputs are converted here. Large ones are checked as far as
+    /// that takes time in proportion to the nodes, and converted by the engine.
+    ///
+    /// # Errors
+    /// As [`FleetInput::into_fleet_graph`]; for large inputs, only what can be found out quickly.
+    pub fn into_task_input(self, size: (usize, usize), policy: &dyn Policy) -> Result<TaskInput, Invalid> {
+        let (uavs, users) = size;
+        if uavs + users < LARGE_NODES {
+            return self.into_fleet_graph(size, policy).map(TaskInput::Graph);
+        }
+        policy.check_fleet(uavs, users)?;
+        let detections = match &self {
+            Self::Scene(Scene { uavs: own, users: all, .. }) => {
+                let estimate = estimate_detections(own, all, policy.observers(uavs, users), policy.ranges());
+                if estimate.at_least > MAX_DETECTIONS {
+                    return Err(too_many_detections("scene"));
+                }
+                estimate.about.min(MAX_DETECTIONS)
+            }
+            // Users detect each other about as often as UAVs detect users.
+            Self::Graph(graph) => 2 * graph.detections.iter().map(Vec::len).sum::<usize>(),
+        };
+        Ok(TaskInput::Large { content: Box::new(self), size, detections })
+    }
+}
+
+/// Inputs with at least this many nodes are converted by the engine, not on the threads that serve connections.
+pub const LARGE_NODES: usize = 256;
+
+/// The input of a task of the engine.
+#[derive(Clone, Debug)]
+pub enum TaskInput {
+    /// What the policy reads.
+    Graph(FleetGraph),
+    /// A large input that the engine converts.
+    Large {
+        /// Positions or detections.
+        content: Box<SceneOrGraph>,
+        /// M and N.
+        size: (usize, usize),
+        /// Estimated number of detections.
+        detections: usize,
+    },
+}
+
+impl TaskInput {
+    /// M and N.
+    pub fn size(&self) -> (usize, usize) {
+        match self {
+            Self::Graph(graph) => (graph.uavs(), graph.users()),
+            Self::Large { size, .. } => *size,
+        }
+    }
+
+    /// Number of detections, or its estimate.
+    pub fn detection_count(&self) -> usize {
+        match self {
+            Self::Graph(graph) => graph.detection_count(),
+            Self::Large { detections, .. } => *detections,
+        }
+    }
+}
+
+impl From<FleetGraph> for TaskInput {
+    fn from(graph: FleetGraph) -> Self {
+        Self::Graph(graph)
     }
 }
 
@@ -141,7 +211,7 @@ fn is_within(rel: &Point, range: f64) -> bool {
 }
 
 impl ReportedGraph {
-    fn into_fleet_graph(self, needs: RequiredInput, ranges: Ranges) -> Result<FleetGraph, Invalid> {
+    fn into_fleet_graph(self, needs: RequiredInput, observers: usize, ranges: Ranges) -> Result<FleetGraph, Invalid> {
         if needs == RequiredInput::FullScene {
             return Err(Invalid::missing("scene", "a scene instead of a graph, because this policy needs all positions"));
         }
@@ -156,11 +226,14 @@ impl ReportedGraph {
             return Err(Invalid::missing(field, "the position of the UAV, which this policy needs"));
         }
         self.check_ranges(ranges)?;
-        let derived = self.derive_user_detections(ranges.detection)?;
+        // What users detect matters to a policy only if it observes them.
+        let users = observers > uavs;
+        let derived = if users { self.derive_user_detections(ranges.detection)? } else { Vec::new() };
         let mut offsets = Vec::with_capacity(self.detections.len() + 1);
         offsets.push(0);
-        let mut detections = Vec::with_capacity(self.detections.iter().map(Vec::len).chain(derived.iter().map(Vec::len)).sum());
-        for (node, list) in self.detections.iter().enumerate() {
+        let reported = &self.detections[..observers];
+        let mut detections = Vec::with_capacity(reported.iter().map(Vec::len).chain(derived.iter().map(Vec::len)).sum());
+        for (node, list) in reported.iter().enumerate() {
             let begin = detections.len();
             detections.extend(list.iter().map(ReportedDetection::detection));
             if let Some(user) = node.checked_sub(uavs) {
@@ -172,6 +245,7 @@ impl ReportedGraph {
             }
             offsets.push(detections.len() as u32);
         }
+        offsets.resize(self.detections.len() + 1, detections.len() as u32);
         // All or none: a policy that uses positions needs the position of every UAV.
         let positions = self.positions.into_iter().collect::<Option<Vec<Point>>>();
         Ok(FleetGraph::from_flat_detections(positions, uavs, self.aoi, offsets, detections))

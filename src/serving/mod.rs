@@ -8,7 +8,9 @@ mod environments;
 mod error;
 mod fleet_ids;
 mod fleet_input;
+mod fleet_memory;
 pub(crate) mod ids;
+mod memory_budget;
 pub(crate) mod nodes;
 mod owner;
 mod recurrent_state;
@@ -20,11 +22,15 @@ mod table;
 pub use engine::{Decision, Engine, EngineConfig, OutputBuffers, Task, TaskOutput, Timings};
 pub use environments::{
     CopyObservation, CopyState, Environment, EnvironmentInfo, EnvironmentReset, EnvironmentSpec, EnvironmentState,
-    EnvironmentStep, Environments, EnvironmentsConfig, EpisodeCursor, FinishedEpisode,
+    EnvironmentStep, Environments, EpisodeCursor, FinishedEpisode,
 };
 pub use error::Error;
 pub use fleet_ids::FleetIds;
-pub use fleet_input::{FleetInput, GraphForm, MAX_DETECTIONS, MAX_NODES, ReportedDetection, ReportedGraph, Scene, SceneOrGraph};
+pub use fleet_input::{
+    FleetInput, GraphForm, LARGE_NODES, MAX_DETECTIONS, MAX_NODES, ReportedDetection, ReportedGraph, Scene, SceneOrGraph,
+    TaskInput,
+};
+pub use fleet_memory::FleetMemory;
 pub use nodes::{Node, NodeDetection};
 pub use owner::Owner;
 pub use recurrent_state::RecurrentState;

@@ -12,6 +12,7 @@ use std::time::Duration;
 
 use uuid::Uuid;
 
+use super::memory_budget::{MemoryBudget, MemoryCharge};
 use super::{Error, Owner};
 use crate::clock::Clock;
 use crate::error_code::ErrorCode;
@@ -23,6 +24,8 @@ pub struct Limits {
     pub ttl: Duration,
     /// Maximum number of entries, and of expired names that are remembered.
     pub max: usize,
+    /// Maximum number of bytes of all entries together.
+    pub memory: usize,
 }
 
 /// An entry of a table.
@@ -31,6 +34,8 @@ pub trait TableEntry {
     const KIND: &'static str;
     /// Error code for entries that have expired.
     const EXPIRED: ErrorCode;
+    /// The flag that sets [`Limits::memory`].
+    const MEMORY_FLAG: &'static str;
 
     /// Who made it.
     fn owner(&self) -> &Owner;
@@ -139,6 +144,7 @@ impl<T: TableEntry> Names<T> {
 #[derive(Debug)]
 pub struct Table<T> {
     limits: Limits,
+    memory: Arc<MemoryBudget>,
     clock: Clock,
     names: RwLock<Names<T>>,
 }
@@ -158,7 +164,8 @@ impl<T: TableEntry> Table<T> {
     pub fn new(limits: Limits, clock: Clock) -> Self {
         let (open, expired, expiries) = (HashMap::new(), HashMap::new(), VecDeque::new());
         let names = Names { open, count: 0, expired, expiries, expiry_count: 0 };
-        Self { limits, clock, names: RwLock::new(names) }
+        let memory = MemoryBudget::new(limits.memory, T::KIND, T::MEMORY_FLAG);
+        Self { limits, memory, clock, names: RwLock::new(names) }
     }
 
     fn read(&self) -> RwLockReadGuard<'_, Names<T>> {
@@ -182,6 +189,22 @@ impl<T: TableEntry> Table<T> {
     /// The clock that decides about expiry.
     pub(super) fn clock(&self) -> &Clock {
         &self.clock
+    }
+
+    /// Bytes that all entries take.
+    pub fn memory_used(&self) -> usize {
+        self.memory.used()
+    }
+
+    /// Takes `bytes` for an entry, from idle ones if necessary.
+    ///
+    /// # Errors
+    /// [`Error::Busy`] if they are not free.
+    pub(super) fn charge_memory(&self, bytes: usize) -> Result<MemoryCharge, Error> {
+        self.memory.charge(bytes).or_else(|_| {
+            self.remove_expired();
+            self.memory.charge(bytes)
+        })
     }
 
     /// Returns entry `id` of `owner`. If there is none, adds the one of this name that `make` creates.
@@ -259,6 +282,14 @@ impl<T: TableEntry> Table<T> {
         let mut names = self.write();
         if names.get(entry.owner(), entry.id()).is_some_and(|current| Arc::ptr_eq(current, entry)) {
             names.remove(entry.owner(), entry.id());
+        }
+    }
+
+    /// Removes `entry` as [`Table::remove`] does, and gives its name back to `former`, from which it was taken.
+    pub(super) fn replace_with(&self, entry: &Arc<T>, former: &Arc<T>) {
+        let mut names = self.write();
+        if names.get(entry.owner(), entry.id()).is_some_and(|current| Arc::ptr_eq(current, entry)) {
+            names.insert(former);
         }
     }
 

@@ -51,6 +51,7 @@ fn describe() {
     describe_counter!("qedgix_inference_failure_total", "Fleets sent to the engine and not answered, by policy.");
     describe_gauge!("qedgix_engine_queue_depth", "Fleets in the queue of the engine.");
     describe_gauge!("qedgix_sessions", "Open sessions.");
+    describe_gauge!("qedgix_session_memory_bytes", "Memory of all sessions together, in bytes.");
     describe_gauge!("qedgix_environments", "Hosted environments.");
     describe_gauge!("qedgix_policy_versions", "Policy versions.");
     describe_gauge!("qedgix_policy_memory_bytes", "Memory of the policy versions that were read.");

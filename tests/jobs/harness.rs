@@ -16,7 +16,7 @@ use qedgix::server::{self, DataDir, Listeners};
 use qedgix::service::keys::Keyring;
 use qedgix::service::policies::{Loads, Retention, UploadLimit};
 use qedgix::service::{App, WatchLimit};
-use qedgix::serving::{Engine, EngineConfig, Environments, EnvironmentsConfig, Limits, Sessions};
+use qedgix::serving::{Engine, EngineConfig, Environments, Limits, Sessions};
 use qedgix::store::Store;
 use qedgix::wire::v1::job_service_client::JobServiceClient;
 use qedgix::wire::v1::worker_service_client::WorkerServiceClient;
@@ -110,15 +110,16 @@ impl Server {
         let mut scheduler = SchedulerConfig::new(cpu_budget);
         adjust(&mut scheduler);
         let (clock, draining) = (Clock::system(), Draining::default());
-        let limits = Limits { ttl: config.session_ttl, max: 1 };
+        let limits = Limits { ttl: config.session_ttl, max: 1, memory: 1 << 20 };
         let app = Arc::new(App {
+            max_message_size: config.max_message_size,
             scheduler: Scheduler::open(store.clone(), scheduler, executor, clock.clone(), draining.clone()).await.unwrap(),
             store,
             registry: Arc::default(),
             loads: Loads::default(),
             retention: Retention::default(),
             sessions: Sessions::new(limits, clock.clone()),
-            environments: Environments::new(EnvironmentsConfig { limits, memory: 1 << 20 }, clock.clone()),
+            environments: Environments::new(limits, clock.clone()),
             engine: Engine::start(EngineConfig { threads: 1, queue: 1, max_batch: 1, max_batch_delay: Duration::ZERO }).unwrap(),
             keys: Keyring::new(None),
             uploads: UploadLimit::default(),

@@ -65,3 +65,77 @@ async fn thousand_uavs_and_ten_thousand_users_are_answered() {
     let by_scene = server.grpc().await.act(held("qedgix", Bytes::new(), scene)).await.unwrap().into_inner();
     assert_eq!(by_scene.actions.len(), uavs);
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn memory_of_a_large_fleet_is_small_and_is_taken_back() {
+    let server = Server::start().await;
+    let mut client = server.grpc().await;
+    for policy in ["sweep", "sweep-shared", "qedgix"] {
+        client.open_session(open(policy, policy)).await.unwrap();
+        let mut state = Bytes::new();
+        for step in 0..3 {
+            let scene = scene(100, 500, step);
+            let mut request = held(policy, state, scene.clone());
+            request.seed = (step == 0).then_some(0);
+            let answer = client.act(request).await.unwrap().into_inner();
+            let in_session = client.act(in_session(policy, Some(step), scene)).await.unwrap().into_inner();
+            assert_eq!(headings(&answer), headings(&in_session), "{policy}, step {step}");
+            state = answer.recurrent_state;
+            // Every UAV has at most five numbers per user, and 20 for the ground; or 65 numbers of a network.
+            assert!(state.len() < 400_000, "{policy}: {} bytes", state.len());
+        }
+    }
+    // The state of another fleet.
+    let state = client.act(held("sweep", Bytes::new(), scene(100, 500, 0))).await.unwrap().into_inner().recurrent_state;
+    assert_invalid(
+        client.act(held("sweep", state, scene(100, 501, 0))).await,
+        "recurrent_state",
+        "the state of 100 UAVs and 500 users",
+    );
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn state_that_no_request_could_return_is_not_handed_out() {
+    let server = Server::with(|config| config.max_message_size = 64 << 10).await;
+    let mut client = server.grpc().await;
+    let (status, code, _) = refused(client.act(held("qedgix", Bytes::new(), scene(300, 20, 0))).await);
+    assert_eq!((status, code.as_str()), (tonic::Code::ResourceExhausted, "too_large"));
+    client.open_session(open("qedgix", "s")).await.unwrap();
+    client.act(in_session("s", None, scene(300, 20, 0))).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn memory_of_all_sessions_is_bounded() {
+    let server = Server::with(|config| config.session_memory = 1 << 20).await;
+    let mut client = server.grpc().await;
+    let mut served = 0;
+    let (status, code) = loop {
+        let name = format!("s{served}");
+        client.open_session(open("qedgix", &name)).await.unwrap();
+        match client.act(in_session(&name, Some(0), scene(200, 20, 0))).await {
+            Ok(_) => served += 1,
+            refusal => {
+                let (status, code, _) = refused(refusal);
+                break (status, code);
+            }
+        }
+    };
+    assert_eq!((status, code.as_str()), (tonic::Code::ResourceExhausted, "resource_exhausted"));
+    assert!((2..20).contains(&served), "{served} sessions");
+    assert!(server.app.sessions.memory_used() <= 1 << 20);
+    // Open sessions continue, and a closed one makes room.
+    client.act(in_session("s0", Some(1), scene(200, 20, 1))).await.unwrap();
+    client.close_session(v1::CloseSessionRequest { session_id: "s1".into() }).await.unwrap();
+    client.act(in_session(&format!("s{served}"), Some(0), scene(200, 20, 0))).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn dense_scene_is_refused_only_by_policies_that_need_its_detections() {
+    let server = Server::start().await;
+    let mut client = server.grpc().await;
+    let dense = scene(100, 10_000, 0);
+    assert_invalid(client.act(held("qedgix", Bytes::new(), dense.clone())).await, "scene", "more than");
+    for policy in ["random", "nearest"] {
+        client.act(held(policy, Bytes::new(), dense.clone())).await.unwrap();
+    }
+}

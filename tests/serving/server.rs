@@ -118,6 +118,7 @@ fn settings_are_validated() {
     assert_eq!(refused(|c| c.max_sessions = 0), "--max-sessions");
     assert_eq!(refused(|c| c.max_environments = 0), "--max-environments");
     assert_eq!(refused(|c| c.environment_memory = 1), "--environment-memory");
+    assert_eq!(refused(|c| c.session_memory = 1), "--session-memory");
     assert_eq!(refused(|c| c.environment_ttl = std::time::Duration::ZERO), "--environment-ttl");
     assert_eq!(refused(|c| c.max_connections = 0), "--max-connections");
     assert_eq!(refused(|c| c.max_streams = 0), "--max-streams");

@@ -11,7 +11,6 @@ use super::{deadline, stream};
 use crate::api::auth::{caller, count_message};
 use crate::api::convert::{request::open_session, response::act_response};
 use crate::api::errors::act_error;
-use crate::api::offload;
 use crate::invalid::in_range;
 use crate::service::keys::Caller;
 use crate::service::{App, Error, PageRequest, act, policies, sessions};
@@ -38,17 +37,20 @@ async fn act_one(
     request: v1::ActRequest,
     deadline: Option<Instant>,
 ) -> Result<v1::ActResponse, Error> {
-    let return_q_values = request.return_q_values;
-    let request = offload(node_count(&request) >= act::OFFLOAD_NODES, || act::Request::try_from(request)).await??;
+    let (return_q_values, cost) = (request.return_q_values, decoding_cost(&request));
+    let decode = || act::Request::try_from(request);
+    let request = act::decode(app, caller, cost, deadline, decode).await??;
     Ok(act_response(act::act(app, caller, request, deadline).await?, return_q_values))
 }
 
-/// Number of UAVs and users in the request.
-fn node_count(request: &v1::ActRequest) -> usize {
+/// Estimated cost of converting the request.
+fn decoding_cost(request: &v1::ActRequest) -> usize {
     use v1::act_request::Observation;
     match &request.observation {
-        Some(Observation::Graph(graph)) => graph.nodes.len(),
-        Some(Observation::Scene(scene)) => scene.uavs.len() + scene.users.len(),
+        Some(Observation::Graph(v1::Graph { nodes })) => {
+            act::decoding_cost(nodes.len(), nodes.iter().map(|node| node.detections.len()).sum())
+        }
+        Some(Observation::Scene(scene)) => act::decoding_cost(scene.uavs.len() + scene.users.len(), 0),
         None => 0,
     }
 }

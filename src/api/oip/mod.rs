@@ -18,7 +18,6 @@ use self::model::{model_error, policy_spec};
 use self::outputs::OutputSelection;
 use self::parameters::Parameters;
 use super::convert::tensors::{INPUTS, Tensor, element_count, fleet_input};
-use crate::api::offload;
 use crate::invalid::Invalid;
 use crate::service::act::{self, MemoryLocation};
 use crate::service::keys::Caller;
@@ -33,8 +32,6 @@ pub const EXTENSIONS: [&str; 6] =
     ["sequence", "sequence(string_id)", "model_repository", "model_configuration", "binary_tensor_data", "parameters"];
 /// Input and output with the recurrent state that callers keep.
 const STATE: &str = "recurrent_state";
-/// Requests with more elements are decoded on a blocking thread.
-const LARGE: usize = 2048;
 
 /// A request for inference.
 #[derive(Clone, Debug, Default)]
@@ -81,7 +78,9 @@ pub async fn infer(app: &App, caller: &Caller, request: InferRequest, deadline: 
     let Parameters { sequence, step, seed, timeout } = Parameters::read(parameters)?;
     let outputs = OutputSelection::new(outputs, sequence.is_none())?;
     check_names(&inputs)?;
-    let (state, input) = offload(element_count(&inputs) >= LARGE, || read(inputs)).await??;
+    let timeout = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
+    let deadline = deadline.into_iter().chain(timeout).min();
+    let (state, input) = act::decode(app, caller, element_count(&inputs), deadline, || read(inputs)).await??;
     let memory = match (sequence, state) {
         (None, state) => MemoryLocation::RecurrentState(state.unwrap_or_default()),
         (Some(sequence), None) => MemoryLocation::Sequence(sequence),
@@ -90,8 +89,6 @@ pub async fn infer(app: &App, caller: &Caller, request: InferRequest, deadline: 
             return Err(Invalid::new(STATE, "a tensor", expected).into());
         }
     };
-    let timeout = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
-    let deadline = deadline.into_iter().chain(timeout).min();
     let request = act::Request { policy: Some(spec.clone()), input, memory, step, run_id: None, seed };
     let response = act::act(app, caller, request, deadline).await.map_err(model_error)?;
     let reference = &response.policy.reference;

@@ -18,7 +18,6 @@ use super::scene_graph::{Graph, Scene};
 use super::schemas::{self, Base64, Seconds};
 use crate::api::convert::request::ActFields;
 use crate::api::convert::response::{self, actions, degrees};
-use crate::api::offload;
 use crate::invalid::Invalid;
 use crate::service::keys::Caller;
 use crate::service::{App, Error, act};
@@ -77,8 +76,10 @@ fn example() -> serde_json::Value {
 }
 
 impl ActRequest {
-    fn is_large(&self) -> bool {
-        self.graph.as_ref().map_or(0, Graph::len) + self.scene.as_ref().map_or(0, Scene::len) >= act::OFFLOAD_NODES
+    /// Estimated cost of converting the request.
+    fn decoding_cost(&self) -> usize {
+        let (nodes, detections) = self.graph.as_ref().map_or((0, 0), Graph::len);
+        act::decoding_cost(nodes + self.scene.as_ref().map_or(0, Scene::len), detections)
     }
 }
 
@@ -170,7 +171,8 @@ async fn decide(
     caller: Caller,
     extract::Json(request): extract::Json<ActRequest>,
 ) -> Result<Json<ActResponse>, Error> {
-    let q_values = request.return_q_values;
-    let request = offload(request.is_large(), move || act::Request::try_from(request)).await??;
+    let (q_values, cost) = (request.return_q_values, request.decoding_cost());
+    let decode = move || act::Request::try_from(request);
+    let request = act::decode(&app, &caller, cost, None, decode).await??;
     Ok(Json(ActResponse::new(act::act(&app, &caller, request, None).await?, q_values)))
 }

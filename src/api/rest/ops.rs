@@ -76,6 +76,7 @@ async fn metrics(State(app): State<Arc<App>>, Extension(render): Extension<fn() 
     let metrics = operations::server_metrics(&app).await;
     for (name, value) in [
         ("qedgix_sessions", metrics.sessions),
+        ("qedgix_session_memory_bytes", metrics.session_memory),
         ("qedgix_environments", metrics.environments),
         ("qedgix_policy_versions", metrics.policy_versions),
         ("qedgix_policy_memory_bytes", metrics.policy_memory),

@@ -118,9 +118,9 @@ struct User {
 objects_only!(Serialize + Graph, Node, Detection, Position, Scene, Uav, User);
 
 impl Graph {
-    /// Number of nodes.
-    pub(super) fn len(&self) -> usize {
-        self.nodes.len()
+    /// Numbers of nodes and detections.
+    pub(super) fn len(&self) -> (usize, usize) {
+        (self.nodes.len(), self.nodes.iter().map(|node| node.detections.len()).sum())
     }
 }
 

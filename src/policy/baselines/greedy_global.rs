@@ -17,6 +17,11 @@ impl Rule for GreedyGlobal {
         0
     }
 
+    fn work(&self, uavs: usize, users: usize, _detections: usize) -> usize {
+        // Sorts all pairs.
+        2 * uavs * users + users
+    }
+
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}
 
     fn decide(&self, env: &EnvParams, graph: &FleetGraph, _step: u64, _memory: &mut [f32], headings: &mut [u8]) {

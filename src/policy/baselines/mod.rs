@@ -85,6 +85,19 @@ impl<R: Rule> Policy for Baseline<R> {
         in_range("users", users, 1..=MAX_PAIRS / uavs)
     }
 
+    fn observers(&self, uavs: usize, _users: usize) -> usize {
+        match R::NEEDS {
+            // A UAV decides by what it detects itself.
+            RequiredInput::OwnPositions => uavs,
+            // `random` looks at nothing; rules with the full scene compute what they need.
+            RequiredInput::Detections | RequiredInput::FullScene => 0,
+        }
+    }
+
+    fn work(&self, uavs: usize, users: usize, detections: usize) -> usize {
+        self.rule.work(uavs, users, detections)
+    }
+
     fn memory_len(&self, uavs: usize, users: usize) -> usize {
         self.rule.memory_len(uavs, users)
     }

@@ -16,6 +16,11 @@ pub(super) trait Rule: Default + Send + Sync {
     /// Length of a fleet's memory.
     fn memory_len(&self, uavs: usize, users: usize) -> usize;
 
+    /// As [`Policy::work`](crate::policy::Policy::work).
+    fn work(&self, uavs: usize, users: usize, detections: usize) -> usize {
+        32 * uavs + users + detections
+    }
+
     /// Initialises the memory for slot 0. All numbers are 0 before.
     fn start(&self, seed: u64, memory: &mut [f32]);
 

@@ -50,6 +50,12 @@ impl<const SHARED: bool> Rule for Sweep<SHARED> {
         uavs * uav_memory_len(users)
     }
 
+    fn work(&self, uavs: usize, users: usize, detections: usize) -> usize {
+        // Each UAV compares its blocks of ground with each other and looks at every user; then it may receive as many memories.
+        let received = if SHARED { detections * uavs / (uavs + users) } else { 0 };
+        uavs * (256 + users / 4) + detections + received * users / 8
+    }
+
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}
 
     fn decide(&self, env: &EnvParams, graph: &FleetGraph, step: u64, memory: &mut [f32], headings: &mut [u8]) {

@@ -1,35 +1,42 @@
-//! Converts the input of a fleet and runs the policy, for every location of the memory.
+//! Runs the policy, for every location of the memory.
 
-use std::sync::Arc;
 use std::time::Instant;
 
 use tracing::level_filters::LevelFilter;
 
-use crate::policy::FleetGraph;
+use crate::service::keys::Caller;
 use crate::service::{App, Error};
-use crate::serving::{LoadedPolicy, SceneOrGraph, Task, TaskOutput};
+use crate::serving::{Owner, Task, TaskOutput};
 
-/// Inputs with at least this many nodes are converted on a blocking thread, not on the threads that serve connections.
-pub const OFFLOAD_NODES: usize = 256;
+/// Decoding that costs more is done by the engine, not on the threads that serve connections: 0.2 ms.
+const MAX_INLINE_DECODING: usize = 2048;
 
-/// Converts the scene or graph of `uavs` UAVs and `users` users to the input of `policy`.
-pub(super) async fn convert(
-    content: SceneOrGraph,
-    (uavs, users): (usize, usize),
-    policy: &Arc<LoadedPolicy>,
-) -> Result<FleetGraph, Error> {
-    if uavs + users < OFFLOAD_NODES {
-        return Ok(content.into_fleet_graph((uavs, users), &*policy.implementation)?);
+/// Estimated cost of decoding a request with this many nodes and detections, in the unit of the engine.
+pub fn decoding_cost(nodes: usize, detections: usize) -> usize {
+    8 * nodes + 3 * detections
+}
+
+/// Decodes a request of `caller`. `cost`: see [`decoding_cost`].
+///
+/// # Errors
+/// [`Error::Busy`] and [`Error::Deadline`], if the engine decodes and its queue is too long.
+pub async fn decode<T: Send + 'static>(
+    app: &App,
+    caller: &Caller,
+    cost: usize,
+    deadline: Option<Instant>,
+    decode: impl FnOnce() -> T + Send + 'static,
+) -> Result<T, Error> {
+    if cost <= MAX_INLINE_DECODING {
+        return Ok(decode());
     }
-    let policy = policy.clone();
-    let converted = tokio::task::spawn_blocking(move || content.into_fleet_graph((uavs, users), &*policy.implementation));
-    Ok(converted.await.map_err(Error::internal)??)
+    Ok(app.engine.call(caller.owner(), cost, deadline, decode).await?)
 }
 
 /// Runs the policy of `task`.
-pub(super) async fn run(app: &App, task: Task, deadline: Option<Instant>) -> Result<TaskOutput, Error> {
+pub(super) async fn run(app: &App, owner: &Owner, task: Task, deadline: Option<Instant>) -> Result<TaskOutput, Error> {
     record_in_span("policy", &task.policy().reference);
-    Ok(app.engine.run(task, deadline).await?)
+    Ok(app.engine.run(owner, task, deadline).await?)
 }
 
 /// Adds a field to the span of the request, if spans are enabled.

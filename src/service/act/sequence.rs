@@ -6,7 +6,6 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::compute;
 use super::request::{Request, Response, Sequence, SequenceId};
 use super::session::{self, SessionStep};
 use crate::error_code::ErrorCode;
@@ -73,11 +72,17 @@ async fn start(
     }
     let policy = policies::resolve(app, spec).await?;
     let FleetInput { fleet, canonical_of_request, content } = request.input;
-    let graph = compute::convert(content, fleet.size(), &policy).await?;
-    let step = SessionStep { fleet, canonical_of_request, graph, step: Some(0), run_id: None };
+    let input = content.into_task_input(fleet.size(), &*policy.implementation)?;
+    let step = SessionStep { fleet, canonical_of_request, input, step: Some(0), run_id: None };
+    let former = app.sessions.get(owner, name).ok();
     let session = app.sessions.start_replacing(owner, name, policy, request.seed)?;
     let mut guard = StartGuard { app, session, completed: false };
-    let response = session::advance(app, &guard.session, step, deadline).await?;
+    let response = session::advance(app, &guard.session, step, deadline).await;
+    // Large inputs are checked when they are computed.
+    if let (Err(Error::Invalid(_)), Some(former)) = (&response, former) {
+        app.sessions.restore(&guard.session, &former);
+    }
+    let response = response?;
     guard.completed = true;
     Ok((guard.session.clone(), response))
 }

@@ -5,9 +5,10 @@ use std::time::Instant;
 use super::compute;
 use super::request::{Request, Response};
 use crate::invalid::Invalid;
-use crate::policy::FleetGraph;
 use crate::service::{App, Error};
-use crate::serving::{FleetIds, FleetInput, LoadedPolicy, PolicySpec, Session, StepStart, Task, VersionSelector};
+use crate::serving::{
+    FleetIds, FleetInput, LoadedPolicy, PolicySpec, Session, StepStart, TableEntry, Task, TaskInput, VersionSelector,
+};
 
 pub(super) async fn act(app: &App, session: &Session, request: Request, deadline: Option<Instant>) -> Result<Response, Error> {
     if let Some(spec) = &request.policy {
@@ -17,16 +18,16 @@ pub(super) async fn act(app: &App, session: &Session, request: Request, deadline
         return Err(Invalid::new("seed", seed, "no value, because a session takes its seed when it is opened").into());
     }
     let FleetInput { fleet, canonical_of_request, content } = request.input;
-    let graph = compute::convert(content, fleet.size(), session.policy()).await?;
-    let step = SessionStep { fleet, canonical_of_request, graph, step: request.step, run_id: request.run_id };
+    let input = content.into_task_input(fleet.size(), &*session.policy().implementation)?;
+    let step = SessionStep { fleet, canonical_of_request, input, step: request.step, run_id: request.run_id };
     advance(app, session, step, deadline).await
 }
 
-/// A step whose input is converted for the policy of the session.
+/// A step with the input of the session's policy.
 pub(super) struct SessionStep {
     pub(super) fleet: FleetIds,
     pub(super) canonical_of_request: Vec<u32>,
-    pub(super) graph: FleetGraph,
+    pub(super) input: TaskInput,
     pub(super) step: Option<u64>,
     pub(super) run_id: Option<String>,
 }
@@ -39,13 +40,13 @@ pub(super) async fn advance(
     deadline: Option<Instant>,
 ) -> Result<Response, Error> {
     let policy = session.policy().clone();
-    let SessionStep { fleet, canonical_of_request, graph, step, run_id } = step;
+    let SessionStep { fleet, canonical_of_request, input, step, run_id } = step;
     let decision = match session.begin_step(&fleet, step, run_id.as_deref()).await? {
         StepStart::Repeated(decision) => decision,
         StepStart::Next(mut pending) => {
             let (memory, buffers) = (std::mem::take(&mut pending.memory), std::mem::take(&mut pending.buffers));
-            let task = Task::new(policy.clone(), graph, pending.step, memory, buffers);
-            pending.commit(compute::run(app, task, deadline).await?)
+            let task = Task::new(policy.clone(), input, pending.step, memory, buffers);
+            pending.commit(compute::run(app, session.owner(), task, deadline).await?)?
         }
     };
     Ok(Response { policy, uavs: fleet.uavs, canonical_of_request, decision, recurrent_state: None })

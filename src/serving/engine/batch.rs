@@ -1,67 +1,161 @@
-//! One forward pass over a batch of fleets of one policy version. In steady state it allocates nothing: output buffers belong
-//! to the tasks, other buffers are kept between batches.
+//! What a thread computes at a time: a forward pass over a batch of fleets of one policy version, or another call. In steady state a
+//! batch allocates nothing: output buffers belong to the tasks, other buffers are kept between batches.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
-use super::metrics::EngineMetrics;
+use super::metrics::{EngineMetrics, PolicyMetrics};
 use super::task::{Task, TaskOutput, Timings};
 use crate::policy::FleetStep;
-use crate::serving::{Error, LoadedPolicy};
+use crate::serving::{Error, LoadedPolicy, Owner};
 
-/// A task in the queue.
+/// What waits in the queue.
 pub(super) struct Queued {
-    pub(super) task: Task,
+    pub(super) job: Job,
+    /// Estimated cost.
+    pub(super) work: usize,
+    pub(super) owner: Owner,
     pub(super) since: Instant,
     pub(super) deadline: Option<Instant>,
-    pub(super) reply: oneshot::Sender<Result<TaskOutput, Error>>,
+    /// Its start in virtual time, which the queue sets.
+    pub(super) start: u64,
 }
 
-/// Tasks to compute together, and buffers that are kept from one batch to the next.
+impl Queued {
+    pub(super) fn new(job: Job, work: usize, owner: &Owner, deadline: Option<Instant>) -> Self {
+        Self { job, work, owner: owner.clone(), since: Instant::now(), deadline, start: 0 }
+    }
+}
+
+/// What a thread computes.
+pub(super) enum Job {
+    /// A fleet in one slot.
+    Fleet { task: Task, reply: oneshot::Sender<Result<TaskOutput, Error>> },
+    /// Any other computation.
+    Call(Box<dyn Call>),
+}
+
+/// A computation that replies by itself.
+pub(super) trait Call: Send {
+    /// Computes and replies.
+    fn run(self: Box<Self>);
+
+    /// Replies with `error` instead.
+    fn refuse(self: Box<Self>, error: Error);
+
+    /// Whether the caller stopped waiting.
+    fn is_abandoned(&self) -> bool;
+}
+
+impl Job {
+    /// Whether the caller stopped waiting.
+    pub(super) fn is_abandoned(&self) -> bool {
+        match self {
+            Self::Fleet { reply, .. } => reply.is_closed(),
+            Self::Call(call) => call.is_abandoned(),
+        }
+    }
+
+    /// Replies with `error`.
+    pub(super) fn refuse(self, error: Error) {
+        match self {
+            Self::Fleet { reply, .. } => {
+                // Nothing to do if the caller stopped waiting.
+                let _ = reply.send(Err(error));
+            }
+            Self::Call(call) => call.refuse(error),
+        }
+    }
+
+    /// Whether both are computed in one forward pass.
+    pub(super) fn shares_batch_with(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Fleet { task, .. }, Self::Fleet { task: other, .. }) => Arc::ptr_eq(task.policy(), other.policy()),
+            _ => false,
+        }
+    }
+}
+
+/// What a thread has taken from the queue, and buffers that are kept from one batch to the next.
 #[derive(Default)]
 pub(super) struct TaskBatch {
-    pub(super) tasks: Vec<Queued>,
+    /// Fleets of one policy version, or one call.
+    pub(super) queued: Vec<Queued>,
+    fleets: Vec<Fleet>,
     fleet_steps: Vec<FleetStep<'static>>,
 }
 
+/// A fleet of a batch.
+struct Fleet {
+    task: Task,
+    since: Instant,
+    reply: oneshot::Sender<Result<TaskOutput, Error>>,
+}
+
 impl TaskBatch {
-    /// Computes all tasks whose callers still wait, and replies to them. Returns the number of tasks computed.
+    /// Computes what was taken from the queue, unless the callers stopped waiting, and replies. Returns the number of fleets computed.
     pub(super) fn run(&mut self, metrics: &EngineMetrics) -> usize {
         let started = Instant::now();
-        let Some(policy) = self.tasks.first().map(|first| first.task.policy().clone()) else { return 0 };
-        let counters = metrics.policy(&policy.reference.name);
-        let queued = self.tasks.len();
-        let in_time = |queued: &Queued| queued.deadline.is_none_or(|deadline| started < deadline);
-        if !self.tasks.iter().all(|queued| in_time(queued) && !queued.reply.is_closed()) {
-            for late in self.tasks.extract_if(.., |queued| !in_time(queued)) {
-                // Nothing to do if the caller stopped waiting.
-                let _ = late.reply.send(Err(Error::Deadline("in the engine's queue")));
+        let (mut policy, mut failed) = (None, 0);
+        for Queued { job, since, deadline, .. } in self.queued.drain(..) {
+            let late = deadline.is_some_and(|deadline| deadline <= started);
+            match job {
+                Job::Call(call) if late => call.refuse(Error::Deadline("in the engine's queue")),
+                Job::Call(call) if call.is_abandoned() => drop(call),
+                Job::Call(call) => call.run(),
+                Job::Fleet { mut task, reply } => {
+                    let counters = policy.get_or_insert_with(|| task.policy().clone());
+                    debug_assert!(Arc::ptr_eq(counters, task.policy()));
+                    let prepared = if late { Err(Error::Deadline("in the engine's queue")) } else { Ok(()) };
+                    if reply.is_closed() {
+                        failed += 1;
+                    } else if let Err(error) = prepared.and_then(|()| prepare(&mut task)) {
+                        failed += 1;
+                        // Nothing to do if the caller stopped waiting.
+                        let _ = reply.send(Err(error));
+                    } else {
+                        self.fleets.push(Fleet { task, since, reply });
+                    }
+                }
             }
-            self.tasks.retain(|queued| !queued.reply.is_closed());
         }
-        let size = self.tasks.len();
-        counters.failure.increment((queued - size) as u64);
+        let Some(policy) = policy else { return 0 };
+        let counters = metrics.policy(&policy.reference.name);
+        counters.failure.increment(failed);
+        self.run_fleets(&policy, &counters, metrics, started)
+    }
+
+    /// Computes all fleets of the batch in one forward pass.
+    fn run_fleets(
+        &mut self,
+        policy: &LoadedPolicy,
+        counters: &PolicyMetrics,
+        metrics: &EngineMetrics,
+        started: Instant,
+    ) -> usize {
+        let size = self.fleets.len();
         if size == 0 {
             return 0;
         }
         let mut fleet_steps = recycle(std::mem::take(&mut self.fleet_steps));
-        fleet_steps.extend(self.tasks.iter_mut().map(|queued| queued.task.as_fleet_step()));
+        fleet_steps.extend(self.fleets.iter_mut().map(|fleet| fleet.task.as_fleet_step()));
         // Unwind safe: after a panic, the outputs are dropped below.
         let result = catch_unwind(AssertUnwindSafe(|| policy.implementation.act(&mut fleet_steps)));
         self.fleet_steps = recycle(fleet_steps);
         let compute = started.elapsed();
         if result.is_err() {
             counters.failure.increment(size as u64);
-            for queued in self.tasks.drain(..) {
-                let _ = queued.reply.send(Err(panicked(&policy)));
+            for fleet in self.fleets.drain(..) {
+                let _ = fleet.reply.send(Err(panicked(policy)));
             }
             return size;
         }
-        metrics.record_batch(&counters, size);
+        metrics.record_batch(counters, size);
         let mut received = 0;
-        for Queued { task, since, reply, .. } in self.tasks.drain(..) {
+        for Fleet { task, since, reply } in self.fleets.drain(..) {
             let timings = Timings { queue: started - since, compute, batch_size: size as u32 };
             metrics.record_times(timings.queue, timings.compute);
             // The caller may have stopped waiting during the forward pass.
@@ -73,11 +167,24 @@ impl TaskBatch {
     }
 }
 
+/// As [`Task::prepare`]; a panic is an error as well.
+fn prepare(task: &mut Task) -> Result<(), Error> {
+    // Unwind safe: after a panic, the task is dropped.
+    match catch_unwind(AssertUnwindSafe(|| task.prepare())) {
+        Ok(prepared) => Ok(prepared?),
+        Err(_) => Err(panicked(task.policy())),
+    }
+}
+
 /// Computes one task on the caller's thread.
 pub(super) fn run_single(mut task: Task, metrics: &EngineMetrics) -> Result<TaskOutput, Error> {
     let started = Instant::now();
     let policy = task.policy().clone();
     let counters = metrics.policy(&policy.reference.name);
+    if let Err(error) = prepare(&mut task) {
+        counters.failure.increment(1);
+        return Err(error);
+    }
     // Unwind safe: after a panic, the output is dropped.
     let result = catch_unwind(AssertUnwindSafe(|| policy.implementation.act(&mut [task.as_fleet_step()])));
     if result.is_err() {

@@ -1,33 +1,39 @@
 //! Runs policies on threads of its own behind a bounded queue, so that a large fleet does not delay I/O.
 //!
-//! A thread takes the task that has waited longest, adds waiting tasks of the same policy version, and computes them in one
-//! forward pass; results are bit-identical to computing each alone. By default a batch consists of the tasks that arrived
-//! while the threads were busy; no task waits for others to join.
+//! A thread takes the next task (`queue` owns the order: fair by work, among callers and among sizes of fleets), adds waiting tasks of
+//! the same policy version, and computes them in one forward pass; results are bit-identical to computing each alone. By default a
+//! batch consists of the tasks that arrived while the threads were busy; no task waits for others to join. One thread more than
+//! configured exists, and never computes heavy tasks.
 //!
 //! Handing a task to another thread and its result back takes longer than the forward pass of a small fleet. Small fleets are
-//! therefore computed inline, on the thread of the first caller among them, as long as no more than `threads` computations
-//! run at once.
+//! therefore computed inline, on the thread of the first caller among them, as long as no more than `threads`
+//! light computations run at once.
+//!
+//! Large requests wait unconverted and with packed memory, so that what waits takes little memory; a thread converts them when it
+//! computes them. [`Engine::call`] runs other work of large requests in the same order.
 //!
 //! A task is not computed if its caller stopped waiting (its future was dropped, or its deadline passed). If a policy panics,
 //! all callers of the batch receive [`Error::Internal`] and the thread continues.
 
 mod batch;
 mod metrics;
+mod queue;
 mod task;
 
 pub use task::{Decision, OutputBuffers, Task, TaskOutput, Timings};
 
-use std::collections::VecDeque;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use batch::{Queued, TaskBatch};
+use batch::{Call, Job, Queued, TaskBatch};
 use metrics::EngineMetrics;
+use queue::{Lane, Queue};
 use tokio::sync::oneshot;
 use tokio::sync::oneshot::error::TryRecvError;
 
-use super::Error;
+use super::{Error, Owner};
 
 /// Maximum work of a batch. A higher limit would delay small fleets that share a batch with large ones.
 const MAX_BATCH_WORK: usize = 1 << 17;
@@ -53,19 +59,44 @@ pub struct EngineConfig {
     pub max_batch_delay: Duration,
 }
 
-#[derive(Default)]
-struct Queue {
-    waiting: VecDeque<Queued>,
-    /// Batches that are being computed.
-    running: usize,
+/// What callers and threads share under one lock.
+struct State {
+    queue: Queue,
+    /// Batches that are being computed inline. Threads do not wait for these.
+    inline_running: usize,
+    /// Light batches that threads are computing.
+    light_running: usize,
+    /// Heavy tasks that threads are computing.
+    heavy_running: usize,
     /// Batches that were computed inline, kept for their buffers.
     spare_batches: Vec<TaskBatch>,
     closed: bool,
 }
 
+impl State {
+    /// The lane with the next task that a thread may compute now. `threads` of them compute at once; one more computes light tasks if heavy
+    /// ones occupy all.
+    fn next_lane(&self, threads: usize) -> Option<Lane> {
+        let light = self.light_running == 0 || self.light_running + self.heavy_running < threads;
+        self.queue.next_lane(light, self.heavy_running < threads)
+    }
+
+    /// Whether one more batch may be computed inline.
+    fn may_run_inline(&self, threads: usize) -> bool {
+        self.inline_running + self.light_running < threads
+    }
+
+    fn running(&mut self, lane: Lane) -> &mut usize {
+        match lane {
+            Lane::Light => &mut self.light_running,
+            Lane::Heavy => &mut self.heavy_running,
+        }
+    }
+}
+
 /// State that callers and threads share.
 struct EngineState {
-    queue: Mutex<Queue>,
+    state: Mutex<State>,
     /// Notified when a thread may have work.
     queued: Condvar,
     /// Inline batches of one since the last inline batch of several.
@@ -75,68 +106,68 @@ struct EngineState {
 }
 
 impl EngineState {
-    fn lock(&self) -> MutexGuard<'_, Queue> {
+    fn lock(&self) -> MutexGuard<'_, State> {
         // Policies run outside the lock, and nothing else panics while holding it.
-        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Waits for work and moves tasks of one policy version into `batch`, the oldest first. Returns false if the engine was
-    /// dropped.
-    fn next_batch(&self, batch: &mut TaskBatch) -> bool {
-        let EngineConfig { max_batch, max_batch_delay, .. } = self.config;
-        let mut queue = self.lock();
+    /// Waits for work and moves the next task, and tasks of its policy version, into `batch`. Returns their lane, or `None` if the engine
+    /// was dropped.
+    fn next_batch(&self, batch: &mut TaskBatch) -> Option<Lane> {
+        let EngineConfig { threads, max_batch, max_batch_delay, .. } = self.config;
+        let mut state = self.lock();
         loop {
-            if queue.closed {
-                return false;
+            if state.closed {
+                return None;
             }
-            let Some(oldest) = queue.waiting.front() else {
-                queue = self.queued.wait(queue).unwrap_or_else(PoisonError::into_inner);
+            let Some(lane) = state.next_lane(threads) else {
+                state = self.queued.wait(state).unwrap_or_else(PoisonError::into_inner);
                 continue;
             };
-            let rest = max_batch_delay.saturating_sub(oldest.since.elapsed());
-            let same_policy = |q: &&Queued| Arc::ptr_eq(q.task.policy(), oldest.task.policy());
-            if !rest.is_zero() && queue.waiting.iter().filter(same_policy).count() < max_batch {
-                queue = self.queued.wait_timeout(queue, rest).unwrap_or_else(PoisonError::into_inner).0;
+            let waiting = state.queue.lane(lane);
+            let rest = waiting.front().map_or(Duration::ZERO, |next| max_batch_delay.saturating_sub(next.since.elapsed()));
+            let joins = |other: &&Queued| waiting.front().is_some_and(|next| other.job.shares_batch_with(&next.job));
+            if lane == Lane::Light && !rest.is_zero() && waiting.iter().filter(joins).count() < max_batch {
+                state = self.queued.wait_timeout(state, rest).unwrap_or_else(PoisonError::into_inner).0;
                 continue;
             }
-            self.fill(&mut queue, batch, MAX_BATCH_WORK);
+            state.queue.take(lane, max_batch, MAX_BATCH_WORK, &mut batch.queued);
+            *state.running(lane) += 1;
             // This thread may have consumed the notification for a task that is still in the queue.
-            if !queue.waiting.is_empty() {
+            if state.next_lane(threads).is_some() {
                 self.queued.notify_one();
             }
-            return true;
+            return Some(lane);
         }
     }
 
-    /// Moves the oldest task and the tasks of its policy version into `batch`, up to `max_work`. Other tasks keep their order.
-    fn fill(&self, queue: &mut Queue, batch: &mut TaskBatch, max_work: usize) {
-        let Some(oldest) = queue.waiting.pop_front() else { return };
-        queue.running += 1;
-        let mut work = oldest.task.work();
-        let tasks = &mut batch.tasks;
-        tasks.push(oldest);
-        let mut i = 0;
-        while i < queue.waiting.len() && tasks.len() < self.config.max_batch {
-            let next = &queue.waiting[i].task;
-            if Arc::ptr_eq(next.policy(), tasks[0].task.policy()) && work + next.work() <= max_work {
-                work += next.work();
-                tasks.extend(queue.waiting.remove(i));
-            } else {
-                i += 1;
+    /// Computes batches until the engine is dropped.
+    fn work(&self) {
+        let mut batch = TaskBatch::default();
+        while let Some(lane) = self.next_batch(&mut batch) {
+            let work = batch.queued.iter().map(|queued| queued.work).sum();
+            let started = Instant::now();
+            batch.run(&self.metrics);
+            let mut state = self.lock();
+            *state.running(lane) -= 1;
+            if lane == Lane::Heavy {
+                state.queue.measure(work, started.elapsed());
             }
         }
     }
 
-    /// Counts a task that leaves the queue without being computed.
-    fn count_failure(&self, task: &Task) {
-        self.metrics.policy(&task.policy().reference.name).failure.increment(1);
+    /// Counts what leaves the queue without being computed.
+    fn count_failure(&self, job: &Job) {
+        if let Job::Fleet { task, .. } = job {
+            self.metrics.policy(&task.policy().reference.name).failure.increment(1);
+        }
     }
 
-    /// Reserves one of the concurrent computations for [`EngineState::run_inline`], if nothing waits.
+    /// Reserves one of the light computations for [`EngineState::run_inline`], if nothing light waits.
     fn reserve_inline(&self) -> bool {
-        let mut queue = self.lock();
-        let free = queue.waiting.is_empty() && queue.running < self.config.threads;
-        queue.running += usize::from(free);
+        let mut state = self.lock();
+        let free = state.queue.lane(Lane::Light).is_empty() && state.may_run_inline(self.config.threads);
+        state.inline_running += usize::from(free);
         free
     }
 
@@ -144,21 +175,23 @@ impl EngineState {
     fn run_inline(&self, task: Task) -> Result<TaskOutput, Error> {
         let output = batch::run_single(task, &self.metrics);
         self.single_batches.fetch_add(1, Ordering::Relaxed);
-        self.lock().running -= 1;
+        self.lock().inline_running -= 1;
         output
     }
 
-    /// Computes a batch on this thread, if the oldest task is small and fewer than `threads` computations run. Returns
+    /// Computes a batch on this thread, if the next light task is small and fewer than `threads` light computations run. Returns
     /// whether it did.
     fn run_batch_inline(&self) -> bool {
         let mut batch = {
-            let mut queue = self.lock();
-            let small = queue.waiting.front().is_some_and(|oldest| is_small(&oldest.task));
-            if !small || queue.running >= self.config.threads {
+            let mut state = self.lock();
+            let next = state.queue.lane(Lane::Light).front();
+            let small = next.is_some_and(|next| matches!(&next.job, Job::Fleet { task, .. } if is_small(task)));
+            if !small || !state.may_run_inline(self.config.threads) {
                 return false;
             }
-            let mut batch = queue.spare_batches.pop().unwrap_or_default();
-            self.fill(&mut queue, &mut batch, MAX_INLINE_WORK);
+            let mut batch = state.spare_batches.pop().unwrap_or_default();
+            state.queue.take(Lane::Light, self.config.max_batch, MAX_INLINE_WORK, &mut batch.queued);
+            state.inline_running += 1;
             batch
         };
         let size = batch.run(&self.metrics);
@@ -167,9 +200,9 @@ impl EngineState {
         } else {
             self.single_batches.fetch_add(1, Ordering::Relaxed);
         }
-        let mut queue = self.lock();
-        queue.running -= 1;
-        queue.spare_batches.push(batch);
+        let mut state = self.lock();
+        state.inline_running -= 1;
+        state.spare_batches.push(batch);
         true
     }
 
@@ -180,32 +213,20 @@ impl EngineState {
         single_batches < SINGLES_BEFORE_SKIP || single_batches.is_multiple_of(BATCHING_PROBE_INTERVAL)
     }
 
-    fn enqueue(&self, task: Task, deadline: Option<Instant>) -> Result<oneshot::Receiver<Result<TaskOutput, Error>>, Error> {
-        let mut queue = self.lock();
-        let capacity = self.config.queue;
-        if queue.waiting.len() >= capacity {
-            // Remove tasks whose callers stopped waiting.
-            queue.waiting.retain(|queued| {
-                let closed = queued.reply.is_closed();
-                if closed {
-                    self.count_failure(&queued.task);
-                }
-                !closed
-            });
+    /// Adds `queued` to the queue.
+    fn enqueue(&self, queued: Queued) -> Result<(), Error> {
+        let removed = self.lock().queue.push(queued, self.config.threads)?;
+        for Queued { job, .. } in removed {
+            self.count_failure(&job);
+            job.refuse(Error::Busy("the engine's queue is full, mostly of requests of this caller".into()));
         }
-        if queue.waiting.len() >= capacity {
-            self.count_failure(&task);
-            return Err(Error::Busy(format!("the engine's queue is full ({capacity} fleets)")));
-        }
-        let (reply, receiver) = oneshot::channel();
-        queue.waiting.push_back(Queued { task, since: Instant::now(), deadline, reply });
-        Ok(receiver)
+        Ok(())
     }
 }
 
 /// Whether a task may be computed inline.
 fn is_small(task: &Task) -> bool {
-    task.policy().implementation.is_cheap() && task.work() <= MAX_INLINE_WORK
+    task.is_prepared() && task.policy().implementation.is_cheap() && task.work() <= MAX_INLINE_WORK
 }
 
 /// The error of a caller whose task was dropped without a reply: a bug in the engine.
@@ -238,39 +259,35 @@ impl Engine {
     /// # Errors
     /// If the system cannot create a thread.
     pub fn start(config: EngineConfig) -> std::io::Result<Self> {
+        let queue = Queue::new(config.queue);
+        let state =
+            State { queue, inline_running: 0, light_running: 0, heavy_running: 0, spare_batches: Vec::new(), closed: false };
         let shared = Arc::new(EngineState {
-            queue: Mutex::default(),
+            state: Mutex::new(state),
             queued: Condvar::new(),
             single_batches: AtomicU32::new(0),
             config,
             metrics: EngineMetrics::new(),
         });
         let engine = Self { shared: shared.clone() };
-        for i in 0..config.threads {
+        for i in 0..=config.threads {
             let shared = shared.clone();
-            let work = move || {
-                let mut batch = TaskBatch::default();
-                while shared.next_batch(&mut batch) {
-                    batch.run(&shared.metrics);
-                    shared.lock().running -= 1;
-                }
-            };
-            std::thread::Builder::new().name(format!("engine-{i}")).spawn(work)?;
+            std::thread::Builder::new().name(format!("engine-{i}")).spawn(move || shared.work())?;
         }
         Ok(engine)
     }
 
     /// Number of tasks in the queue.
     pub fn waiting(&self) -> usize {
-        self.shared.lock().waiting.len()
+        self.shared.lock().queue.len()
     }
 
-    /// Runs the policy of `task`.
+    /// Runs the policy of `task`, which `owner` sent.
     ///
     /// # Errors
-    /// [`Error::Busy`] if the queue is full, [`Error::Deadline`] if the deadline passes, [`Error::Internal`] if the policy
-    /// panics.
-    pub async fn run(&self, task: Task, deadline: Option<Instant>) -> Result<TaskOutput, Error> {
+    /// [`Error::Busy`] if the queue is full, or so long that the deadline would pass; [`Error::Invalid`] if the policy does not accept the
+    /// input; [`Error::Deadline`] if the deadline passes; [`Error::Internal`] if the policy panics.
+    pub async fn run(&self, owner: &Owner, task: Task, deadline: Option<Instant>) -> Result<TaskOutput, Error> {
         let shared = &*self.shared;
         if deadline.is_some_and(|deadline| deadline <= Instant::now()) {
             return Err(Error::Deadline("before the engine's queue"));
@@ -281,7 +298,11 @@ impl Engine {
             return shared.run_inline(task);
         }
         let mut guard = AbandonGuard { shared, replied: false };
-        let mut receiver = shared.enqueue(task, deadline)?;
+        let (reply, mut receiver) = oneshot::channel();
+        let (work, policy) = (task.work(), task.policy().clone());
+        shared.enqueue(Queued::new(Job::Fleet { task, reply }, work, owner, deadline)).inspect_err(|_| {
+            shared.metrics.policy(&policy.reference.name).failure.increment(1);
+        })?;
         if small {
             if expects_batch {
                 // Lets other callers that are ready enqueue their tasks before the first of them computes all.
@@ -301,16 +322,67 @@ impl Engine {
         }
         // Only now is a thread needed.
         shared.queued.notify_one();
-        let result = match deadline {
-            None => receiver.await,
-            Some(deadline) => match tokio::time::timeout_at(deadline.into(), receiver).await {
-                Ok(result) => result,
-                Err(_) => Ok(Err(Error::Deadline("in the engine's queue"))),
-            },
-        };
-        let result = result.unwrap_or_else(|_| Err(lost_request()));
+        let result = reply_of(receiver, deadline).await;
         guard.replied = !matches!(result, Err(Error::Deadline(_)));
         result
+    }
+
+    /// Runs `work` of `owner`, which costs about `cost` (see [`Policy::work`](crate::policy::Policy::work)), on a thread of the engine, in
+    /// the same order as fleets.
+    ///
+    /// # Errors
+    /// As [`Engine::run`].
+    pub async fn call<T: Send + 'static>(
+        &self,
+        owner: &Owner,
+        cost: usize,
+        deadline: Option<Instant>,
+        work: impl FnOnce() -> T + Send + 'static,
+    ) -> Result<T, Error> {
+        let (reply, receiver) = oneshot::channel();
+        let job = Job::Call(Box::new(CallWithReply { work, reply }));
+        let mut guard = AbandonGuard { shared: &self.shared, replied: false };
+        self.shared.enqueue(Queued::new(job, cost, owner, deadline))?;
+        self.shared.queued.notify_one();
+        let result = reply_of(receiver, deadline).await;
+        guard.replied = !matches!(result, Err(Error::Deadline(_)));
+        result
+    }
+}
+
+/// Waits for a reply until the deadline.
+async fn reply_of<T>(receiver: oneshot::Receiver<Result<T, Error>>, deadline: Option<Instant>) -> Result<T, Error> {
+    let result = match deadline {
+        None => receiver.await,
+        Some(deadline) => match tokio::time::timeout_at(deadline.into(), receiver).await {
+            Ok(result) => result,
+            Err(_) => return Err(Error::Deadline("in the engine's queue")),
+        },
+    };
+    result.unwrap_or_else(|_| Err(lost_request()))
+}
+
+/// A computation that is not a fleet, and where its result goes.
+struct CallWithReply<T, F> {
+    work: F,
+    reply: oneshot::Sender<Result<T, Error>>,
+}
+
+impl<T: Send, F: FnOnce() -> T + Send> Call for CallWithReply<T, F> {
+    fn run(self: Box<Self>) {
+        // Unwind safe: after a panic, nothing of the work remains.
+        let result = catch_unwind(AssertUnwindSafe(self.work)).map_err(|_| Error::Internal("a request panicked".into()));
+        // Nothing to do if the caller stopped waiting.
+        let _ = self.reply.send(result);
+    }
+
+    fn refuse(self: Box<Self>, error: Error) {
+        // Nothing to do if the caller stopped waiting.
+        let _ = self.reply.send(Err(error));
+    }
+
+    fn is_abandoned(&self) -> bool {
+        self.reply.is_closed()
     }
 }
 

@@ -3,25 +3,32 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use crate::invalid::Invalid;
 use crate::policy::{FleetGraph, FleetStep};
-use crate::serving::LoadedPolicy;
-
-/// Cost of a UAV in units of work. A detection or a user costs one unit.
-const UAV_WORK: usize = 32;
+use crate::serving::{FleetMemory, LoadedPolicy, SceneOrGraph, TaskInput};
 
 /// One fleet in one slot, with buffers for the output.
 #[derive(Debug)]
 pub struct Task {
     policy: Arc<LoadedPolicy>,
     graph: FleetGraph,
-    output: TaskOutput,
+    /// A large scene or graph, of which [`Task::prepare`] makes `graph`.
+    unconverted: Option<Box<SceneOrGraph>>,
+    /// M and N.
+    size: (usize, usize),
+    /// The memory before the slot, until [`Task::prepare`] moves it to `numbers`.
+    memory: FleetMemory,
+    /// The memory that the policy works on.
+    numbers: Vec<f32>,
+    decision: Decision,
+    work: usize,
 }
 
 /// Result of a task.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct TaskOutput {
     /// The fleet's memory after the slot.
-    pub memory: Vec<f32>,
+    pub memory: FleetMemory,
     /// The decision of the policy.
     pub decision: Decision,
 }
@@ -61,14 +68,20 @@ pub struct OutputBuffers {
 
 impl Task {
     /// A task for slot `step` of a fleet with this memory.
-    pub fn new(policy: Arc<LoadedPolicy>, graph: FleetGraph, step: u64, memory: Vec<f32>, buffers: OutputBuffers) -> Self {
+    pub fn new(policy: Arc<LoadedPolicy>, input: TaskInput, step: u64, memory: FleetMemory, buffers: OutputBuffers) -> Self {
+        let (uavs, users) = input.size();
         let OutputBuffers { mut headings, mut q_values } = buffers;
         headings.clear();
-        headings.resize(graph.uavs(), 0);
+        headings.resize(uavs, 0);
         q_values.clear();
-        q_values.resize(graph.uavs() * policy.implementation.actions(), f32::NAN);
+        q_values.resize(uavs * policy.implementation.actions(), f32::NAN);
         let decision = Decision { step, headings, q_values, timings: Timings::default() };
-        Self { policy, graph, output: TaskOutput { memory, decision } }
+        let work = policy.implementation.work(uavs, users, input.detection_count());
+        let (graph, unconverted) = match input {
+            TaskInput::Graph(graph) => (graph, None),
+            TaskInput::Large { content, .. } => (FleetGraph::default(), Some(content)),
+        };
+        Self { policy, graph, unconverted, size: (uavs, users), memory, numbers: Vec::new(), decision, work }
     }
 
     /// The policy version to run.
@@ -76,21 +89,38 @@ impl Task {
         &self.policy
     }
 
-    /// The arguments of the policy for this task.
+    /// Converts a large input and unpacks a large memory. Until now they were small, so that waiting tasks take little memory.
+    ///
+    /// # Errors
+    /// [`Invalid`] for an input or a memory that the policy does not accept.
+    pub(super) fn prepare(&mut self) -> Result<(), Invalid> {
+        let policy = &*self.policy.implementation;
+        if let Some(content) = self.unconverted.take() {
+            self.graph = content.into_fleet_graph(self.size, policy)?;
+        }
+        self.numbers = std::mem::take(&mut self.memory).unpack(policy, self.size)?;
+        Ok(())
+    }
+
+    /// The arguments of the policy for this task. [`Task::prepare`] has succeeded.
     pub(super) fn as_fleet_step(&mut self) -> FleetStep<'_> {
-        let TaskOutput { memory, decision } = &mut self.output;
+        let Self { policy, graph, numbers, decision, .. } = self;
         let Decision { step, headings, q_values, .. } = decision;
-        let env = self.policy.implementation.env();
-        FleetStep { env, graph: &self.graph, step: *step, memory, headings, q_values: Some(q_values) }
+        FleetStep { env: policy.implementation.env(), graph, step: *step, memory: numbers, headings, q_values: Some(q_values) }
     }
 
     pub(super) fn finish(self, timings: Timings) -> TaskOutput {
-        let TaskOutput { memory, decision } = self.output;
-        TaskOutput { memory, decision: Decision { timings, ..decision } }
+        let memory = FleetMemory::pack(self.numbers, &*self.policy.implementation, self.size);
+        TaskOutput { memory, decision: Decision { timings, ..self.decision } }
     }
 
-    /// Estimated cost. A detection costs one unit.
+    /// Estimated cost in the unit of [`Policy::work`](crate::policy::Policy::work).
     pub(super) fn work(&self) -> usize {
-        UAV_WORK * self.graph.uavs() + self.graph.users() + self.graph.detection_count()
+        self.work
+    }
+
+    /// Whether the input is converted and the memory unpacked.
+    pub(super) fn is_prepared(&self) -> bool {
+        self.unconverted.is_none() && self.memory.is_plain()
     }
 }

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex as SyncMutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use jiff::Timestamp;
-use tokio::sync::{Mutex, OwnedMutexGuard, OwnedSemaphorePermit};
+use tokio::sync::{Mutex, OwnedMutexGuard};
 
 use super::simulation::{EpisodeCursor, Simulation};
 use super::spec::{EnvironmentSpec, check_seed};
@@ -14,6 +14,7 @@ use super::state::EnvironmentState;
 use crate::clock::Clock;
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
+use crate::serving::memory_budget::MemoryCharge;
 use crate::serving::table::{LastUse, TableEntry};
 use crate::serving::{Error, Owner};
 
@@ -74,7 +75,7 @@ pub struct Environment {
     /// Set while `simulation` is locked, so that the next holder of the lock sees the flag.
     deleted: AtomicBool,
     /// The environment's share of the memory for environments.
-    _memory_permit: OwnedSemaphorePermit,
+    _memory: MemoryCharge,
 }
 
 impl Environment {
@@ -82,7 +83,7 @@ impl Environment {
         (owner, id): (Owner, String),
         spec: EnvironmentSpec,
         simulation: Simulation,
-        memory_permit: OwnedSemaphorePermit,
+        memory: MemoryCharge,
         clock: Clock,
     ) -> Self {
         let created_at = clock.now();
@@ -96,7 +97,7 @@ impl Environment {
             cursor: SyncMutex::new(simulation.cursor()),
             simulation: Arc::new(Mutex::new(simulation)),
             deleted: AtomicBool::new(false),
-            _memory_permit: memory_permit,
+            _memory: memory,
         }
     }
 
@@ -220,6 +221,7 @@ impl Environment {
 impl TableEntry for Environment {
     const KIND: &'static str = "environment";
     const EXPIRED: ErrorCode = ErrorCode::EnvironmentExpired;
+    const MEMORY_FLAG: &'static str = "--environment-memory";
 
     fn owner(&self) -> &Owner {
         &self.owner

@@ -1,5 +1,5 @@
-//! Environments that the server hosts for callers that train elsewhere. This file owns their creation, their deletion and the
-//! memory that they may use together; `environment` owns the requests to one of them.
+//! Environments that the server hosts for callers that train elsewhere. This file owns their creation and their deletion;
+//! `environment` owns the requests to one of them.
 
 mod environment;
 mod simulation;
@@ -13,43 +13,21 @@ pub use state::{CopyObservation, CopyState, EnvironmentState, FinishedEpisode};
 
 use std::sync::Arc;
 
-use tokio::sync::Semaphore;
-
 use super::table::{Lookup, Table, generate_id};
 use super::{Error, Limits, Owner};
 use crate::clock::Clock;
 use simulation::Simulation;
 
-/// Unit of memory accounting, in bytes.
-const MEMORY_UNIT: usize = 1024;
-
-/// Limits of environments.
-#[derive(Clone, Copy, Debug)]
-pub struct EnvironmentsConfig {
-    /// Their number and time to live.
-    pub limits: Limits,
-    /// Maximum number of bytes of all environments together.
-    pub memory: usize,
-}
-
 /// All environments of this server.
 #[derive(Debug)]
 pub struct Environments {
     table: Table<Environment>,
-    /// One permit per free unit.
-    memory_units: Arc<Semaphore>,
-    memory: usize,
 }
 
 impl Environments {
     /// An empty set of environments.
-    pub fn new(config: EnvironmentsConfig, clock: Clock) -> Self {
-        let memory_units = (config.memory / MEMORY_UNIT).min(Semaphore::MAX_PERMITS);
-        Self {
-            table: Table::new(config.limits, clock),
-            memory_units: Arc::new(Semaphore::new(memory_units)),
-            memory: config.memory,
-        }
+    pub fn new(limits: Limits, clock: Clock) -> Self {
+        Self { table: Table::new(limits, clock) }
     }
 
     /// The environments by name.
@@ -76,17 +54,7 @@ impl Environments {
     }
 
     async fn build(&self, name: (Owner, String), spec: EnvironmentSpec) -> Result<Arc<Environment>, Error> {
-        let memory_units = u32::try_from(spec.bytes().div_ceil(MEMORY_UNIT)).unwrap_or(u32::MAX);
-        let acquire = || self.memory_units.clone().try_acquire_many_owned(memory_units);
-        let memory_permit = acquire().or_else(|_| {
-            // Removing idle environments frees memory.
-            self.table.remove_expired();
-            acquire()
-        });
-        let memory_permit = memory_permit.map_err(|_| {
-            let (size, memory) = (spec.bytes() >> 10, self.memory >> 10);
-            Error::Busy(format!("no memory for an environment of {size} KiB; all environments together may take {memory} KiB"))
-        })?;
+        let memory = self.table.charge_memory(spec.bytes())?;
         let requested = spec.clone();
         let simulation = if spec.work() <= environment::MAX_INLINE_WORK {
             Simulation::new(&requested)?
@@ -95,7 +63,7 @@ impl Environments {
             built.await.map_err(|e| Error::Internal(e.to_string()))??
         };
         let clock = self.table.clock().clone();
-        let make = || Environment::new(name.clone(), spec.clone(), simulation, memory_permit, clock);
+        let make = || Environment::new(name.clone(), spec.clone(), simulation, memory, clock);
         match self.table.find_or_add(&name.0, &name.1, make)? {
             Lookup::Added(environment) => Ok(environment),
             // A concurrent call created it.

@@ -4,6 +4,7 @@
 mod seed;
 mod session;
 
+use session::EMPTY_SESSION;
 pub use session::{PendingStep, Session, SessionInfo, SessionOptions, StepStart};
 
 use std::sync::Arc;
@@ -21,12 +22,19 @@ impl Sessions {
     /// has no step. With a new `run_id` the call restarts that session, on the version that it is pinned to.
     ///
     /// # Errors
-    /// [`Error::Conflict`] if the name is taken, `run_fenced` if `run_id` names a former run, [`Error::Busy`] if the number of
-    /// sessions is exhausted.
+    /// [`Error::Conflict`] if the name is taken, `run_fenced` if `run_id` names a former run, [`Error::Busy`] if the number or
+    /// the memory of sessions is exhausted.
     pub async fn open(&self, owner: &Owner, policy: Arc<LoadedPolicy>, options: SessionOptions) -> Result<SessionInfo, Error> {
         let id = options.id.clone().unwrap_or_else(generate_id);
-        let make = || Session::new((owner.clone(), id.clone()), policy.clone(), &options, self.clock().clone());
-        let session = match self.find_or_add(owner, &id, make)? {
+        // Checked first, so that a retry succeeds even if no memory is left.
+        let session = if let Ok(session) = self.get(owner, &id) {
+            Lookup::Found(session)
+        } else {
+            let charge = self.charge_memory(EMPTY_SESSION)?;
+            let make = || Session::new((owner.clone(), id.clone()), policy.clone(), &options, charge, self.clock().clone());
+            self.find_or_add(owner, &id, make)?
+        };
+        let session = match session {
             Lookup::Added(session) => session,
             Lookup::Found(session) => {
                 session.retry_or_restart(&policy, &options).await?;
@@ -40,7 +48,7 @@ impl Sessions {
     /// flight complete.
     ///
     /// # Errors
-    /// [`Error::Busy`] if the number of sessions is exhausted.
+    /// [`Error::Busy`] if the number or the memory of sessions is exhausted.
     pub fn start_replacing(
         &self,
         owner: &Owner,
@@ -50,12 +58,18 @@ impl Sessions {
     ) -> Result<Arc<Session>, Error> {
         let options = SessionOptions { seed, ..SessionOptions::default() };
         let name = (owner.clone(), id.to_owned());
-        self.replace(owner, id, || Session::new(name, policy, &options, self.clock().clone()))
+        let charge = self.charge_memory(EMPTY_SESSION)?;
+        self.replace(owner, id, || Session::new(name, policy, &options, charge, self.clock().clone()))
     }
 
     /// Removes a session that [`Sessions::start_replacing`] started, unless another session has taken its name.
     pub fn discard(&self, session: &Arc<Session>) {
         self.remove(session);
+    }
+
+    /// Puts the session that [`Sessions::start_replacing`] replaced with `session` back in its place.
+    pub fn restore(&self, session: &Arc<Session>, former: &Arc<Session>) {
+        self.replace_with(session, former);
     }
 
     /// Describes session `id` of `owner`, and counts as a use of it.

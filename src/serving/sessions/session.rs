@@ -12,11 +12,14 @@ use tokio::sync::{Mutex, MutexGuard};
 use super::seed::{run_hash, session_seed};
 use crate::clock::Clock;
 use crate::error_code::ErrorCode;
+use crate::serving::memory_budget::MemoryCharge;
 use crate::serving::table::{LastUse, TableEntry};
-use crate::serving::{Decision, Error, FleetIds, LoadedPolicy, OutputBuffers, Owner, PolicyRef, TaskOutput};
+use crate::serving::{Decision, Error, FleetIds, FleetMemory, LoadedPolicy, OutputBuffers, Owner, PolicyRef, TaskOutput};
 
 /// Maximum number of former runs that a session remembers, in order to reject them.
 const MAX_FORMER_RUNS: usize = 64;
+/// Bytes of a session without steps: its fields, names, former runs, and its place in the table.
+pub(super) const EMPTY_SESSION: usize = 2048;
 
 /// Description of a session.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -76,11 +79,15 @@ struct SessionState {
     steps: u64,
     /// The ids of the run's first step.
     fleet: Option<FleetIds>,
-    memory: Vec<f32>,
+    /// Bytes of `fleet`.
+    fleet_bytes: usize,
+    memory: FleetMemory,
     last: Option<Decision>,
     /// Buffers of earlier steps, for reuse.
     spare_memory: Vec<f32>,
     spare_buffers: OutputBuffers,
+    /// The session's share of the memory for sessions.
+    charge: MemoryCharge,
 }
 
 /// How [`Session::begin_step`] classifies a request.
@@ -105,13 +112,20 @@ pub struct PendingStep<'a> {
     /// The step's index.
     pub step: u64,
     /// A copy of the memory before the step.
-    pub memory: Vec<f32>,
+    pub memory: FleetMemory,
     /// Buffers for the output.
     pub buffers: OutputBuffers,
 }
 
 impl Session {
-    pub(super) fn new((owner, id): (Owner, String), policy: Arc<LoadedPolicy>, options: &SessionOptions, clock: Clock) -> Self {
+    /// `charge`: [`EMPTY_SESSION`] bytes.
+    pub(super) fn new(
+        (owner, id): (Owner, String),
+        policy: Arc<LoadedPolicy>,
+        options: &SessionOptions,
+        charge: MemoryCharge,
+        clock: Clock,
+    ) -> Self {
         let opened_at = clock.now();
         let state = SessionState {
             closed: false,
@@ -121,10 +135,12 @@ impl Session {
             seed: options.seed,
             steps: 0,
             fleet: None,
-            memory: Vec::new(),
+            fleet_bytes: 0,
+            memory: FleetMemory::default(),
             last: None,
             spare_memory: Vec::new(),
             spare_buffers: OutputBuffers::default(),
+            charge,
         };
         let last_use = LastUse::at(clock.monotonic());
         let (steps, ended) = (AtomicU64::new(0), AtomicBool::new(false));
@@ -142,7 +158,8 @@ impl Session {
     ///
     /// # Errors
     /// `wrong_step` if the step is neither the last nor the next, `run_fenced` if `run_id` names a former run,
-    /// [`Error::Invalid`] if the ids differ from those of the run's first step, [`Error::NotFound`] if the session is closed.
+    /// [`Error::Invalid`] if the ids differ from those of the run's first step, [`Error::NotFound`] if the session is closed,
+    /// [`Error::Busy`] if the memory of all sessions is exhausted.
     pub async fn begin_step<'a>(
         &'a self,
         fleet: &FleetIds,
@@ -173,17 +190,20 @@ impl Session {
             return Err(wrong_step(&self.id, steps, step, new_run.is_some()));
         }
         let first = new_run.is_some() || state.fleet.is_none();
-        let mut memory = std::mem::take(&mut state.spare_memory);
-        memory.clear();
-        if first {
+        let buffer = std::mem::take(&mut state.spare_memory);
+        let memory = if first {
             let run = new_run.as_deref().or(state.run_id.as_deref());
             let seed = state.seed.unwrap_or_else(|| session_seed(&self.id, run));
             let (uavs, users) = (fleet.uavs.len(), fleet.users.len());
-            memory.resize(self.policy.implementation.memory_len(uavs, users), 0.0);
-            self.policy.implementation.start(uavs, users, seed, &mut memory);
+            let memory = FleetMemory::initial(&*self.policy.implementation, (uavs, users), seed, buffer);
+            // The step needs at least this much, so it is refused before it is computed. The charge of a former run remains.
+            let needed = EMPTY_SESSION + fleet.bytes() + state_bytes(&memory, uavs, self.policy.implementation.actions());
+            let charge = state.charge.bytes().max(needed);
+            state.charge.resize(charge)?;
+            memory
         } else {
-            memory.extend_from_slice(&state.memory);
-        }
+            state.memory.copy(buffer)
+        };
         let buffers = std::mem::take(&mut state.spare_buffers);
         let fleet = first.then(|| fleet.clone());
         Ok(StepStart::Next(PendingStep { session: self, state, new_run, fleet, step, memory, buffers }))
@@ -209,6 +229,8 @@ impl Session {
         match state.new_run(&self.id, options.run_id.as_deref())? {
             Some(run) => {
                 state.start_run(run);
+                // Less than before, so this succeeds.
+                state.charge.resize(EMPTY_SESSION)?;
                 state.seed = options.seed;
             }
             None if state.steps > 0 => return taken(&format!("and has {} steps", state.steps)),
@@ -247,6 +269,7 @@ impl Session {
 impl TableEntry for Session {
     const KIND: &'static str = "session";
     const EXPIRED: ErrorCode = ErrorCode::SessionExpired;
+    const MEMORY_FLAG: &'static str = "--session-memory";
 
     fn owner(&self) -> &Owner {
         &self.owner
@@ -287,31 +310,44 @@ impl SessionState {
         }
         self.steps = 0;
         self.fleet = None;
-        self.memory = Vec::new();
+        self.memory = FleetMemory::default();
         self.last = None;
     }
 }
 
 impl PendingStep<'_> {
     /// Completes the step with `output`. Returns the decision.
-    pub fn commit(mut self, output: TaskOutput) -> Decision {
-        if let Some(run) = self.new_run.take() {
-            self.state.start_run(run);
-        }
+    ///
+    /// # Errors
+    /// [`Error::Busy`] if the memory of all sessions is exhausted. The session is unchanged.
+    pub fn commit(mut self, output: TaskOutput) -> Result<Decision, Error> {
         let TaskOutput { memory, decision } = output;
         let state = &mut *self.state;
+        let fleet_bytes = self.fleet.as_ref().map_or(state.fleet_bytes, FleetIds::bytes);
+        let decided = state_bytes(&memory, decision.headings.len(), self.session.policy.implementation.actions());
+        state.charge.resize(EMPTY_SESSION + fleet_bytes + decided)?;
+        if let Some(run) = self.new_run.take() {
+            state.start_run(run);
+        }
         if let Some(fleet) = self.fleet.take() {
             state.fleet = Some(fleet);
+            state.fleet_bytes = fleet_bytes;
         }
-        state.spare_memory = std::mem::replace(&mut state.memory, memory);
+        state.spare_memory = std::mem::replace(&mut state.memory, memory).into_buffer();
         state.steps = self.step + 1;
         if let Some(Decision { headings, q_values, .. }) = state.last.replace(decision.clone()) {
             state.spare_buffers = OutputBuffers { headings, q_values };
         }
         self.session.steps.store(state.steps, Ordering::Relaxed);
         self.session.last_use.touch(self.session.clock.monotonic());
-        decision
+        Ok(decision)
     }
+}
+
+/// Bytes of a memory, its copy for the next step if it is plain, and two sets of output buffers.
+fn state_bytes(memory: &FleetMemory, uavs: usize, actions: usize) -> usize {
+    let copies = if memory.is_plain() { 2 } else { 1 };
+    copies * memory.bytes() + 2 * uavs * (1 + actions * size_of::<f32>())
 }
 
 fn wrong_step(id: &str, steps: u64, step: u64, new_run: bool) -> Error {

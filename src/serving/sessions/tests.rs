@@ -2,11 +2,12 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
+use super::seed::session_seed;
 use super::*;
 use crate::clock::ManualClock;
 use crate::invalid::Invalid;
 use crate::policy::{EnvParams, Policy, RequiredInput};
-use crate::serving::{Decision, FleetIds, Limits, PolicyRef, TaskOutput};
+use crate::serving::{Decision, FleetIds, FleetMemory, Limits, PolicyRef, TaskOutput};
 
 /// Its memory is the seed at first; it decides nothing.
 struct SeedPolicy;
@@ -40,7 +41,7 @@ fn policy(name: &str) -> Arc<LoadedPolicy> {
 
 fn sessions(max: usize) -> (Sessions, impl Fn(u64)) {
     let time = ManualClock::new(Timestamp::UNIX_EPOCH);
-    let sessions = Sessions::new(Limits { ttl: Duration::from_secs(600), max }, time.clock());
+    let sessions = Sessions::new(Limits { ttl: Duration::from_secs(600), max, memory: 1 << 20 }, time.clock());
     (sessions, move |seconds| time.advance(Duration::from_secs(seconds)))
 }
 
@@ -68,10 +69,12 @@ async fn step_once(session: &Session, step: Option<u64>, run: Option<&str>) -> R
         Err(error) => Err(code(&error)),
         Ok(StepStart::Repeated(answer)) => Ok((answer.step, answer.q_values)),
         Ok(StepStart::Next(next)) => {
-            let memory: Vec<f32> = next.memory.iter().map(|m| m + 1.0).collect();
+            let memory = next.memory.clone().unpack(&SeedPolicy, (2, 1)).unwrap();
+            let memory: Vec<f32> = memory.iter().map(|m| m + 1.0).collect();
             let decision = Decision { step: next.step, headings: vec![0, 0], q_values: memory.clone(), ..Decision::default() };
-            let answer = next.commit(TaskOutput { memory, decision });
-            Ok((answer.step, answer.q_values))
+            next.commit(TaskOutput { memory: FleetMemory::Plain(memory), decision })
+                .map(|answer| (answer.step, answer.q_values))
+                .map_err(|e| code(&e))
         }
     }
 }
@@ -176,7 +179,7 @@ async fn idle_session_expires_with_its_own_error() {
 #[tokio::test]
 async fn corrected_wall_time_neither_expires_nor_keeps_sessions() {
     let time = ManualClock::new(Timestamp::UNIX_EPOCH);
-    let sessions = Sessions::new(Limits { ttl: Duration::from_secs(600), max: 2 }, time.clock());
+    let sessions = Sessions::new(Limits { ttl: Duration::from_secs(600), max: 2, memory: 1 << 20 }, time.clock());
     sessions.open(&Owner::NOBODY, policy("p"), named("s")).await.unwrap();
     time.set_wall(Timestamp::from_second(1_000_000).unwrap());
     sessions.get(&Owner::NOBODY, "s").unwrap();
@@ -209,4 +212,44 @@ async fn step_of_a_closed_session_is_rejected() {
     let s = sessions.get(&Owner::NOBODY, "s").unwrap();
     sessions.close(&Owner::NOBODY, "s").await.unwrap();
     assert_eq!(step_once(&s, None, None).await, Err("unknown"));
+}
+
+#[tokio::test]
+async fn memory_of_all_sessions_is_bounded_in_bytes() {
+    let time = ManualClock::new(Timestamp::UNIX_EPOCH);
+    let limits = Limits { ttl: Duration::from_secs(600), max: 1000, memory: 16 << 10 };
+    let sessions = Sessions::new(limits, time.clock());
+    let mut opened = 0;
+    while sessions.open(&Owner::NOBODY, policy("p"), named(&opened.to_string())).await.is_ok() {
+        opened += 1;
+    }
+    assert!((4..=8).contains(&opened), "{opened} sessions");
+    assert!(sessions.memory_used() <= 16 << 10);
+    // A retry succeeds although no memory is left.
+    assert!(sessions.open(&Owner::NOBODY, policy("p"), named("0")).await.is_ok());
+    let session = sessions.get(&Owner::NOBODY, "0").unwrap();
+    let mut taken = sessions.charge_memory((16 << 10) - sessions.memory_used()).unwrap();
+    assert_eq!(step_once(&session, Some(0), None).await, Err("busy"), "the first step needs memory");
+    assert_eq!(sessions.describe(&Owner::NOBODY, "0").unwrap().steps, 0);
+    sessions.close(&Owner::NOBODY, "1").await.unwrap();
+    assert_eq!(step_once(&session, Some(0), None).await, Ok((0, vec![session_seed("0", None) as f32 + 1.0; 2])));
+    // The memory of a policy may grow. Refused, the step leaves the session as it was.
+    taken.resize(taken.bytes() + (16 << 10) - sessions.memory_used()).unwrap();
+    let StepStart::Next(next) = session.begin_step(&fleet(["a", "b"]), Some(1), None).await.unwrap() else {
+        panic!("the next step")
+    };
+    let decision = Decision { step: 1, headings: vec![0, 0], ..Decision::default() };
+    let memory = FleetMemory::Plain(vec![0.0; 100]);
+    assert_eq!(next.commit(TaskOutput { memory: memory.clone(), decision: decision.clone() }).map_err(|e| code(&e)), Err("busy"));
+    drop(taken);
+    let StepStart::Next(next) = session.begin_step(&fleet(["a", "b"]), Some(1), None).await.unwrap() else {
+        panic!("the next step")
+    };
+    assert!(next.memory.bytes() < 100);
+    next.commit(TaskOutput { memory, decision }).unwrap();
+    drop(session);
+    // Idle sessions give way to new ones.
+    time.advance(Duration::from_secs(601));
+    drop(sessions.charge_memory(16 << 10).unwrap());
+    assert_eq!((sessions.len(), sessions.memory_used()), (0, 0));
 }

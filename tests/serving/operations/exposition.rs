@@ -144,6 +144,7 @@ async fn the_exposition_is_valid_and_contains_every_family() {
         "qedgix_inference_success_total",
         "qedgix_inference_failure_total",
         "qedgix_engine_queue_depth",
+        "qedgix_session_memory_bytes",
         "qedgix_sessions",
         "qedgix_environments",
         "qedgix_policy_versions",

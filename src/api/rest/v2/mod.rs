@@ -18,14 +18,14 @@ use super::extract::{Path, Raw, parse};
 use super::json::object;
 use crate::api::convert::tensors::TensorShape;
 use crate::api::errors::Problem;
-use crate::api::{offload, oip};
+use crate::api::oip;
 use crate::service::keys::Caller;
-use crate::service::{App, Error};
+use crate::service::{App, Error, act};
 
 /// Header with the length of the JSON before the binary data, in requests and responses.
 const HEADER_LENGTH: HeaderName = HeaderName::from_static("inference-header-content-length");
-/// Larger bodies are parsed on a blocking thread.
-const LARGE: usize = 64 << 10;
+/// Bytes of a body that are decoded at the cost of 1.
+const BYTES_PER_COST: usize = 32;
 
 type Shared = State<Arc<App>>;
 
@@ -142,9 +142,9 @@ async fn infer(
     Raw(body): Raw,
 ) -> Result<Response, Error> {
     let ModelPath { model, version } = path;
-    let large = body.len() > LARGE;
+    let cost = body.len() / BYTES_PER_COST;
     let decode = move || request::decode(&headers, body, model, version);
-    let (request, binary) = offload(large, decode).await??;
+    let (request, binary) = act::decode(&app, &caller, cost, None, decode).await??;
     Ok(response::encode(oip::infer(&app, &caller, request, None).await?, &binary))
 }
 

@@ -37,6 +37,11 @@ impl Rule for Tour {
         2 * uavs + 2 * users + capacity(uavs, users)
     }
 
+    fn work(&self, uavs: usize, users: usize, _detections: usize) -> usize {
+        // That of planning, which takes longer than all other slots. A plan for few users is improved by simulation.
+        8 * uavs * users + 1000 * users.min(64) + 64 * (uavs + users)
+    }
+
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}
 
     fn decide(&self, env: &EnvParams, graph: &FleetGraph, step: u64, memory: &mut [f32], headings: &mut [u8]) {
