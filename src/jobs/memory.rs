@@ -87,7 +87,7 @@ mod tests {
     fn a_run_that_cannot_fit_is_refused() {
         let mut config = TrainConfig::preset(Algorithm::Qedgix, Preset::Practical);
         check(&config, 1, 1 << 30).unwrap();
-        config.training.buffer = 1_000_000;
+        (config.training.buffer, config.training.steps) = (1_000_000, 1_000_000_000);
         let error = check(&config, 1, 1 << 30).unwrap_err();
         assert_eq!(error.field, "training.buffer");
         assert!(error.expected.contains("1024 MiB"), "{error}");

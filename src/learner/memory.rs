@@ -106,7 +106,7 @@ mod tests {
             assert!(estimate.total() > 1 << 30, "{estimate:?}");
             estimate.largest_field(&config)
         };
-        assert_eq!(field(&|c| c.training.buffer = 1_000_000), "training.buffer");
+        assert_eq!(field(&|c| (c.training.buffer, c.training.steps) = (1_000_000, 1_000_000_000)), "training.buffer");
         assert_eq!(
             field(&|c| (c.environment.uavs, c.environment.users, c.training.buffer) = (200, 2000, 100)),
             "environment.users"
