@@ -325,13 +325,11 @@ impl Body for IncomingBody {
     }
 
     fn is_end_stream(&self) -> bool {
-        match &self.http1 {
-            Some(body) => body.body.is_end_stream(),
-            None => {
-                let state = self.exchange.state();
-                state.stream.is_none() && state.buffer.is_empty() && state.failure.is_none()
-            }
+        if let Some(body) = &self.http1 {
+            return body.body.is_end_stream();
         }
+        let state = self.exchange.state();
+        state.stream.is_none() && state.buffer.is_empty() && state.failure.is_none()
     }
 
     fn size_hint(&self) -> SizeHint {

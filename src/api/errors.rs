@@ -35,13 +35,12 @@ fn statuses(error: &Error) -> (Code, StatusCode) {
         Error::TooLarge { .. } => (Code::ResourceExhausted, StatusCode::PAYLOAD_TOO_LARGE),
         Error::Overloaded => (Code::ResourceExhausted, StatusCode::SERVICE_UNAVAILABLE),
         Error::MediaType(_) => (Code::Unimplemented, StatusCode::UNSUPPORTED_MEDIA_TYPE),
-        Error::CrossSite(_) => (Code::PermissionDenied, StatusCode::FORBIDDEN),
         Error::Deadline(_) => (Code::DeadlineExceeded, StatusCode::GATEWAY_TIMEOUT),
         Error::Draining | Error::Unavailable(_) => (Code::Unavailable, StatusCode::SERVICE_UNAVAILABLE),
         Error::Storage(WriteFailure::Full) => (Code::ResourceExhausted, StatusCode::INSUFFICIENT_STORAGE),
         Error::Storage(_) => (Code::Unavailable, StatusCode::INSUFFICIENT_STORAGE),
         Error::Unauthenticated(_) => (Code::Unauthenticated, StatusCode::UNAUTHORIZED),
-        Error::PermissionDenied { .. } => (Code::PermissionDenied, StatusCode::FORBIDDEN),
+        Error::PermissionDenied { .. } | Error::CrossSite(_) => (Code::PermissionDenied, StatusCode::FORBIDDEN),
         Error::Internal(_) => (Code::Internal, StatusCode::INTERNAL_SERVER_ERROR),
     }
 }

@@ -36,6 +36,7 @@ struct Cli {
 }
 
 #[derive(Debug, Subcommand)]
+#[allow(clippy::large_enum_variant, reason = "one value per process")]
 enum Command {
     /// Serve policies and run training jobs
     Serve(serve::ServeArgs),

@@ -99,6 +99,7 @@ struct Serving<'a, IO, S> {
 
 type Accepted = Option<Result<(Request<RecvStream>, SendResponse<Bytes>), h2::Error>>;
 
+#[allow(clippy::large_enum_variant, reason = "one value at a time, on the stack")]
 enum Event {
     Accepted(Accepted),
     Stop,
@@ -224,10 +225,8 @@ impl KeepAlive {
     fn is_lost(&mut self) -> bool {
         match self.asked {
             Some(asked) => return asked.elapsed() >= KEEPALIVE_TIMEOUT,
-            None if self.silent_since.elapsed() >= KEEPALIVE_INTERVAL => {
-                if self.pings.send_ping(Ping::opaque()).is_ok() {
-                    self.asked = Some(Instant::now());
-                }
+            None if self.silent_since.elapsed() >= KEEPALIVE_INTERVAL && self.pings.send_ping(Ping::opaque()).is_ok() => {
+                self.asked = Some(Instant::now());
             }
             None => {}
         }

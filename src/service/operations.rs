@@ -10,6 +10,7 @@ const DATABASE_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Health of the server's components.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(clippy::struct_excessive_bools, reason = "one per component")]
 pub struct ServerHealth {
     /// The database responds.
     pub database: bool,

@@ -260,7 +260,7 @@ mod tests {
         let bytes = pack(&numbers, 5000);
         assert!(bytes.len() < 100 * 10 * 8, "{} bytes for {} numbers", bytes.len(), numbers.len());
         assert_eq!(unpack(&bytes, numbers.len(), 5000), Some(numbers));
-        assert_eq!(pack(&[0.0; 10_240], 3).len(), 20);
+        assert_eq!(pack(&vec![0.0; 10_240], 3).len(), 20);
     }
 
     #[test]

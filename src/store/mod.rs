@@ -128,8 +128,9 @@ impl Error {
     pub fn write_failure(&self) -> Option<WriteFailure> {
         match self {
             Self::Write(failure) => Some(*failure),
-            Self::Sqlx(error) => WriteFailure::of(error),
-            Self::Migrate(MigrateError::Execute(error) | MigrateError::ExecuteMigration(error, _)) => WriteFailure::of(error),
+            Self::Sqlx(error) | Self::Migrate(MigrateError::Execute(error) | MigrateError::ExecuteMigration(error, _)) => {
+                WriteFailure::of(error)
+            }
             Self::Migrate(_) | Self::Newer { .. } | Self::Corrupt { .. } => None,
         }
     }

@@ -144,7 +144,7 @@ impl Store {
             let sql = "DELETE FROM policy_versions WHERE name = ? AND version = ?";
             sqlx::query(sql).bind(name).bind(version as i64).execute(&mut *tx).await?;
         }
-        Ok(tx.commit().await?)
+        tx.commit().await
     }
 
     /// The version `version` of policy `name`.

@@ -289,9 +289,9 @@ mod tests {
             sqlx::query("PRAGMA max_page_count = 1").execute(&mut *writer).await.unwrap();
             drop(writer);
             // Large enough to fail within the transaction, which SQLite then rolls back on its own.
-            let failed = publish(&store, &[7; 1 << 20]).await.unwrap_err();
+            let failed = publish(&store, &vec![7; 1 << 20]).await.unwrap_err();
             assert_eq!(failed.write_failure(), Some(WriteFailure::Full), "{failed}");
-            publish(&store, &[7; 1 << 20]).await.unwrap();
+            publish(&store, &vec![7; 1 << 20]).await.unwrap();
         }
         assert_eq!(store.policy_versions().await.unwrap().len(), 3);
     }

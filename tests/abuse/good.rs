@@ -53,7 +53,7 @@ impl Good {
         std::thread::spawn(move || {
             let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
             runtime.block_on(async {
-                let client = Client { client: PolicyServiceClient::new(endpoint.connect_lazy()), key, now: shared };
+                let client = Client { policies: PolicyServiceClient::new(endpoint.connect_lazy()), key, now: shared };
                 let mut sessions: JoinSet<()> = (0..SESSIONS).map(|number| client.clone().fly(number)).collect();
                 tokio::select! {
                     // Its end is the end of `Good`.
@@ -73,7 +73,7 @@ impl Good {
 
 #[derive(Clone)]
 struct Client {
-    client: PolicyServiceClient<Channel>,
+    policies: PolicyServiceClient<Channel>,
     key: MetadataValue<Ascii>,
     now: Arc<Mutex<Experience>>,
 }
@@ -90,7 +90,7 @@ impl Client {
         let id = format!("good-{number}");
         let open = v1::OpenSessionRequest { policy: "qedgix".into(), session_id: id.clone(), run_id: None, seed: Some(number) };
         let request = self.signed(open);
-        if let Err(status) = self.client.open_session(request).await {
+        if let Err(status) = self.policies.open_session(request).await {
             self.fail("opening a session", &status);
         }
         // The sessions take turns.
@@ -105,7 +105,7 @@ impl Client {
                 step: Some(step),
                 ..Default::default()
             });
-            match self.client.act(request).await {
+            match self.policies.act(request).await {
                 Ok(_) => self.now.lock().unwrap().latencies.push(due.elapsed()),
                 Err(status) => self.fail("a slot", &status),
             }

@@ -10,7 +10,7 @@ use reqwest::Method;
 use sqlx::{Connection, SqliteConnection};
 
 use super::{Chaos, LEASE};
-use crate::process::signal;
+use crate::process::{Process, signal};
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
@@ -126,7 +126,7 @@ impl Chaos {
 
     /// Stops the server for longer than a lease, now and then for longer than its workers wait for it.
     async fn pause_server(&mut self) {
-        let Some(pid) = self.server.as_ref().map(|server| server.pid()) else { return };
+        let Some(pid) = self.server.as_ref().map(Process::pid) else { return };
         signal("STOP", pid);
         let long = self.full && self.rng.random_range(0..4) == 0;
         let seconds = if long { 13.0 } else { LEASE.as_secs_f64() + self.rng.random_range(0.3..1.5) };
@@ -152,7 +152,7 @@ impl Chaos {
 
     /// The server cannot open one more file.
     async fn exhaust_descriptors(&mut self) {
-        let Some(pid) = self.server.as_ref().map(|server| server.pid()) else { return };
+        let Some(pid) = self.server.as_ref().map(Process::pid) else { return };
         let open = std::fs::read_dir(format!("/proc/{pid}/fd")).map_or(0, Iterator::count);
         let limits = std::fs::read_to_string(format!("/proc/{pid}/limits")).unwrap_or_default();
         let soft = limits.lines().find_map(|line| line.strip_prefix("Max open files")?.split_whitespace().next()?.parse().ok());

@@ -331,7 +331,9 @@ impl Chaos {
         }
         let left = self.monitor.workers();
         if !left.is_empty() {
-            left.iter().for_each(|worker| drop(process::signal("KILL", worker.pid)));
+            for worker in &left {
+                let _ = process::signal("KILL", worker.pid);
+            }
             self.violation(format!("workers are left over: {left:?}"));
         }
         for problem in damage(&self.disk.data_dir().join(qedgix::store::FILE)).await {

@@ -58,7 +58,7 @@ async fn deleted_jobs_leave_no_space_in_the_file() {
         let lease = running(&store).await;
         add_checkpoint(&store, lease, CheckpointKind::Best, vec![i; 100_000]).await;
         let mut snapshot = store.begin_snapshot(lease, 1, NOW).await.unwrap().unwrap();
-        store.append_snapshot(&mut snapshot, &[i; 200_000]).await.unwrap();
+        store.append_snapshot(&mut snapshot, &vec![i; 200_000]).await.unwrap();
         end(&store, lease).await;
         jobs.push(lease.job_id);
     }

@@ -228,7 +228,7 @@ const COPY: usize = 64 << 10;
 /// Pieces of one message.
 #[derive(Default)]
 struct Pieces {
-    pieces: Vec<Bytes>,
+    whole: Vec<Bytes>,
     /// Small pieces after these.
     tail: BytesMut,
     len: usize,
@@ -247,7 +247,7 @@ impl Pieces {
         self.len += piece.len();
         if piece.len() >= SMALL_PIECE {
             self.end_tail();
-            self.pieces.push(piece);
+            self.whole.push(piece);
         } else {
             self.tail.extend_from_slice(&piece);
             if self.tail.len() >= COPY {
@@ -258,13 +258,13 @@ impl Pieces {
 
     fn end_tail(&mut self) {
         if !self.tail.is_empty() {
-            self.pieces.push(self.tail.split().freeze());
+            self.whole.push(self.tail.split().freeze());
         }
     }
 
     fn take(&mut self) -> Vec<Bytes> {
         self.end_tail();
-        let Self { pieces, .. } = std::mem::take(self);
+        let Self { whole: pieces, .. } = std::mem::take(self);
         pieces
     }
 }

@@ -54,12 +54,11 @@ impl Middleware {
         // Tests call the router without a connection.
         let exchange = request.extensions().get::<Arc<Exchange>>().cloned();
         let admitted = exchange.as_ref().map_or(Ok(()), |exchange| admit(exchange, &request));
-        let mut response = match admitted {
-            Err(exhausted) => Error::from(exhausted).into_response(),
-            Ok(()) => {
-                let response = AssertUnwindSafe(next.run(request).instrument(span.clone())).catch_unwind().await;
-                response.unwrap_or_else(|_| Error::internal("a handler panicked").into_response())
-            }
+        let mut response = if let Err(exhausted) = admitted {
+            Error::from(exhausted).into_response()
+        } else {
+            let response = AssertUnwindSafe(next.run(request).instrument(span.clone())).catch_unwind().await;
+            response.unwrap_or_else(|_| Error::internal("a handler panicked").into_response())
         };
         if let Some(exchange) = exchange {
             response = held(response, exchange);

@@ -80,5 +80,5 @@ fn memory_of(state: RecurrentState, fleet: &FleetIds, policy: &LoadedPolicy) -> 
     if state.fleet != fleet.fingerprint() {
         return Err(wrong("the state of UAVs or users with other ids"));
     }
-    Ok(state.memory.unpack_small(&*policy.implementation, (uavs, users))?)
+    state.memory.unpack_small(&*policy.implementation, (uavs, users))
 }

@@ -223,9 +223,10 @@ pub async fn fill_registry(app: &App) -> Result<(), Error> {
     for version in app.store.policy_versions().await? {
         let (name, version, digest) = (version.name, version.version, version.digest);
         let mut bytes = [0; 32];
-        match hex::decode_to_slice(&digest, &mut bytes) {
-            Ok(()) => app.registry.add(PolicyRef { name, version, digest: bytes }),
-            Err(_) => tracing::error!(policy = name, version, digest, "the digest of a version cannot be read"),
+        if hex::decode_to_slice(&digest, &mut bytes).is_ok() {
+            app.registry.add(PolicyRef { name, version, digest: bytes });
+        } else {
+            tracing::error!(policy = name, version, digest, "the digest of a version cannot be read");
         }
     }
     for (name, bytes) in BUNDLED {

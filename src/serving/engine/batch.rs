@@ -31,6 +31,7 @@ impl Queued {
 }
 
 /// What a thread computes.
+#[allow(clippy::large_enum_variant, reason = "fleets are the common case, and a box would be an allocation per task")]
 pub(super) enum Job {
     /// A fleet in one slot.
     Fleet { task: Task, reply: oneshot::Sender<Result<TaskOutput, Error>> },

@@ -55,7 +55,7 @@ impl<'a> Caller<'a> {
             all.extend(page[what].as_array().unwrap().iter().map(|item| item[field].clone()));
             match page["next_page_token"].as_str().unwrap() {
                 "" => return all,
-                next => token = next.to_owned(),
+                next => next.clone_into(&mut token),
             }
         }
     }
