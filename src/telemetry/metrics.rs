@@ -54,6 +54,7 @@ fn describe() {
     describe_gauge!("qedgix_session_memory_bytes", "Memory of all sessions together, in bytes.");
     describe_gauge!("qedgix_environments", "Hosted environments.");
     describe_gauge!("qedgix_policy_versions", "Policy versions.");
+    describe_gauge!("qedgix_inflight_bytes", "Bytes of requests and responses that the server holds.");
     describe_gauge!("qedgix_policy_memory_bytes", "Memory of the policy versions that were read.");
     describe_counter!("qedgix_policy_loads_total", "Policy versions read into memory.");
     describe_gauge!("qedgix_jobs", "Jobs, by state.");

@@ -110,7 +110,8 @@ async fn version_references_are_accepted_wherever_a_path_has_a_policy() {
     let document = document(&server).await;
     let mut tried = 0;
     for (path, item) in paths(&document).filter(|(path, _)| path.contains("{policy}")) {
-        for verb in item.keys() {
+        // A policy is deleted by its name alone.
+        for verb in item.keys().filter(|verb| *verb != "delete") {
             let verb = Method::from_bytes(verb.to_uppercase().as_bytes()).unwrap();
             let response = Client::new().request(verb, server.url(&path.replace("{policy}", "qedgix:1"))).send().await.unwrap();
             assert_eq!(response.status(), StatusCode::OK, "{path}");

@@ -50,7 +50,8 @@ async fn an_alias_is_set_moved_and_deleted_and_that_is_remembered() {
     assert_eq!((status.as_u16(), &problem["code"]), (409, &json!("alias_moved")), "{problem}");
     let (status, problem) = put(9, None).await;
     assert_eq!((status.as_u16(), &problem["detail"]), (404, &json!("no policy \"mine:9\"")));
-    assert_eq!(rest.get("/v1/policies/mine/aliases").await.1, json!({"aliases": [{"alias": "live", "version": 2}]}));
+    let aliases = json!({"aliases": [{"alias": "live", "version": 2}], "next_page_token": ""});
+    assert_eq!(rest.get("/v1/policies/mine/aliases").await.1, aliases);
     assert_eq!(rest.get("/v1/policies/mine@live").await.1["ref"]["version"], 2);
     assert_eq!(rest.send(Method::PUT, "/v1/policies/mine/aliases/old", r#"{"version": 1}"#).await.0, StatusCode::CREATED);
     assert_eq!(rest.send(Method::DELETE, &format!("{path}?expected=1"), "").await.1["code"], "alias_moved");
