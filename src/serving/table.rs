@@ -277,6 +277,12 @@ impl<T: TableEntry> Table<T> {
         Err(Error::precondition(T::EXPIRED, message))
     }
 
+    /// Returns entry `id` of `owner` if it is open. This does not count as a use of it.
+    pub(super) fn peek(&self, owner: &Owner, id: &str) -> Option<Arc<T>> {
+        let now = self.clock.monotonic();
+        self.read().get(owner, id).filter(|entry| !self.is_idle(entry, now)).cloned()
+    }
+
     /// Removes `entry`, unless another entry has taken its name.
     pub(super) fn remove(&self, entry: &Arc<T>) {
         let mut names = self.write();

@@ -109,7 +109,7 @@ async fn errors_of_invalid_scenes_name_the_field() {
         assert_invalid(client.act(request).await, field, value);
     }
     // As many nodes as are allowed, all in one place: refused for what they would cost, not for their number.
-    let mut request = held("sweep", Bytes::new(), scene(100, 3996, 1));
+    let mut request = held("qedgix", Bytes::new(), scene(100, 3996, 1));
     in_scene(&mut request).uavs.iter_mut().for_each(|u| (u.x, u.y) = (0.5, 0.5));
     in_scene(&mut request).users.iter_mut().for_each(|u| (u.x, u.y) = (0.5, 0.5));
     assert_invalid(client.act(request).await, "scene", "more than");

@@ -99,7 +99,10 @@ async fn an_alias_is_set_moved_and_deleted_and_that_is_remembered() {
     let server = with_timeout(server.restarted()).await;
     let rest = Rest::new(&server);
     assert_eq!(rest.get(history).await.1["history"], json!(all));
-    assert_eq!(rest.get("/v1/policies/mine/aliases").await.1, json!({"aliases": [{"alias": "old", "version": 1}]}));
+    assert_eq!(
+        rest.get("/v1/policies/mine/aliases").await.1,
+        json!({"aliases": [{"alias": "old", "version": 1}], "next_page_token": ""})
+    );
 }
 
 #[tokio::test]

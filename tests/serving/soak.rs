@@ -343,6 +343,8 @@ impl SoakCaller {
                     Err(status) if matches!(status.code(), Code::DeadlineExceeded | Code::Cancelled) => {
                         self.counts.add("missed deadlines");
                     }
+                    // The queue cannot reach it in time.
+                    Err(status) if code(&status) == "resource_exhausted" => self.counts.add("deadlines refused at once"),
                     Err(status) => return Err(unexpected("a short deadline")(status)),
                 }
             }

@@ -252,7 +252,9 @@ mod tests {
 
         /// Adds a task of `uavs` UAVs, identified by `step`.
         fn push(&mut self, owner: &str, uavs: usize, step: u64, deadline: Option<Duration>) -> Result<usize, Error> {
-            let graph = FleetGraph::from_scene(&vec![[0.0, 0.0]; uavs], &[[9.0, 9.0]], &[0.0], 0.0);
+            // Far from each other, so that a large fleet has no detections.
+            let places: Vec<_> = (0..uavs).map(|i| [i as f64, 0.0]).collect();
+            let graph = FleetGraph::from_scene(&places, &[[0.0, 9.0]], &[0.0], 0.5);
             let task = Task::new(self.policy.clone(), graph.into(), step, FleetMemory::default(), OutputBuffers::default());
             let (reply, caller) = oneshot::channel();
             self.callers.push(caller);

@@ -27,7 +27,7 @@ impl Sessions {
     pub async fn open(&self, owner: &Owner, policy: Arc<LoadedPolicy>, options: SessionOptions) -> Result<SessionInfo, Error> {
         let id = options.id.clone().unwrap_or_else(generate_id);
         // Checked first, so that a retry succeeds even if no memory is left.
-        let session = if let Ok(session) = self.get(owner, &id) {
+        let session = if let Some(session) = self.peek(owner, &id) {
             Lookup::Found(session)
         } else {
             let charge = self.charge_memory(EMPTY_SESSION)?;

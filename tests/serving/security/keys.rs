@@ -242,7 +242,9 @@ async fn job_event_streams_end_when_their_key_is_revoked() {
     std::fs::write(&idle, "#!/bin/sh\nexec sleep 1000\n").unwrap();
     std::fs::set_permissions(&idle, std::fs::Permissions::from_mode(0o755)).unwrap();
     let server = Server::with(|config| config.worker = Some(idle)).await;
-    let (owner, reader) = (key(&server, "jobs").await, make(&server, "read", |_| {}).await);
+    let owner = make(&server, "jobs", |_| {}).await;
+    let reader = make(&server, "read", |new| new.owner = Some(owner.info.owner.clone())).await;
+    let owner = owner.key;
     let client = reqwest::Client::new();
     let post = async |path: &str, body: &'static str| {
         let request = client.post(server.url(path)).bearer_auth(&owner).header("content-type", "application/json").body(body);
@@ -261,8 +263,8 @@ async fn job_event_streams_end_when_their_key_is_revoked() {
     post(&format!("/v1/jobs/{id}/cancel"), "").await;
     let status = with_timeout(async {
         loop {
-            // The worker ignores the cancellation: time passes until the server kills it.
-            server.advance(60);
+            // The worker ignores the cancellation: time passes until the server kills it. Longer steps would be pauses of the server.
+            server.advance(5);
             if let Ok(Err(status)) = tokio::time::timeout(Duration::from_millis(50), events.message()).await {
                 return status;
             }

@@ -166,7 +166,7 @@ fn job(name: Option<&str>) -> Value {
 
 #[tokio::test]
 async fn jobs_belong_to_their_key() {
-    let server = Server::with(|config| config.worker = Some("/bin/false".into())).await;
+    let server = Server::with(|config| config.worker = Some("/no/such/worker".into())).await;
     let [a, b, admin] = three(&server).await;
     let submit = async |caller: &Caller<'_>, body: Value| {
         let request = Client::new().post(server.url("/v1/jobs")).bearer_auth(&caller.key).header("content-type", JSON);
@@ -207,7 +207,7 @@ async fn jobs_belong_to_their_key() {
 
 #[tokio::test]
 async fn a_name_of_another_owner_or_of_a_bundled_policy_needs_admin() {
-    let server = Server::with(|config| config.worker = Some("/bin/false".into())).await;
+    let server = Server::with(|config| config.worker = Some("/no/such/worker".into())).await;
     let [a, b, admin] = three(&server).await;
     let upload = Client::new().post(server.url("/v1/policies/mine/versions")).bearer_auth(&admin.key);
     let upload = upload.header("content-type", "application/octet-stream").body(numbered(1).to_bytes());
