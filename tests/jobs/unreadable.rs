@@ -27,9 +27,10 @@ const NO_JSON: &str = "UPDATE jobs SET spec = '{\"kind\": ' WHERE id = ?";
 async fn jobs_that_cannot_be_read_are_shown_cancelled_and_deleted() {
     let dir = tempfile::tempdir().unwrap();
     let mut server = Server::start(dir.path(), 1).await;
-    // Holds the CPU budget, so that the others stay in the queue.
+    // One job holds the CPU budget, and another one is the head of the queue, so that those behind it stay where they are.
     server.submit(&tiny()).await;
     server.worker().await;
+    server.submit(&tiny()).await;
     for change_of_spec in [UNKNOWN_FIELD, NO_JSON] {
         let id = server.submit(&named("of-the-future")).await;
         change(dir.path(), change_of_spec, &id).await;
