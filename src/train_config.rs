@@ -69,7 +69,7 @@ pub struct Training {
     pub normalise: bool,
     /// What a UAV remembers: `none`, as in the paper; `own`, what it detected itself; `shared`, also what UAVs in communication range
     /// remember.
-    #[serde(default, skip_serializing_if = "Memory::is_none")]
+    #[serde(default)]
     pub memory: Memory,
     /// Mixer.
     pub mixer: MixerKind,
@@ -120,10 +120,10 @@ pub struct Training {
     pub augment: bool,
     /// Baseline that flies some of the UAVs while episodes are collected, so that they show the policy what the rule does. Absent: the
     /// policy explores by random headings only, as in the paper.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default)]
     pub teacher: Option<String>,
     /// With a teacher: smallest probability that it flies a UAV for an episode. The probability is epsilon while that is larger.
-    #[serde(default = "default_teacher_share", skip_serializing_if = "is_default_teacher_share")]
+    #[serde(default = "default_teacher_share")]
     pub teacher_share: f64,
     /// Environment steps between evaluations.
     pub eval_every: u64,
@@ -356,11 +356,6 @@ fn default_hops() -> usize {
 
 fn default_teacher_share() -> f64 {
     0.2
-}
-
-#[allow(clippy::trivially_copy_pass_by_ref, clippy::float_cmp, reason = "the form that serde calls; the default is exact")]
-fn is_default_teacher_share(share: &f64) -> bool {
-    *share == default_teacher_share()
 }
 
 fn default_factor() -> f64 {

@@ -86,7 +86,6 @@ pub struct EnvConfig {
     /// d, range within which nodes detect each other; at least t.
     pub detection_range: f64,
     /// Range within which UAVs exchange messages and learn each other's positions; absent: d. In the paper it is d.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub communication_range: Option<f64>,
     /// Adds a ninth action that stays in place.
     pub hover: bool,

@@ -89,7 +89,7 @@ pub struct AgentConfig {
     /// Number of links over which a UAV observes. More than 1 only without a graph layer.
     pub hops: usize,
     /// What a UAV remembers.
-    #[serde(default, skip_serializing_if = "Memory::is_none")]
+    #[serde(default)]
     pub memory: Memory,
     /// Whether flat observations have relative positions in units of d, and own positions are scaled to [-1, 1].
     pub normalise: bool,
@@ -97,9 +97,8 @@ pub struct AgentConfig {
 
 impl Memory {
     /// Whether UAVs have no memory.
-    #[allow(clippy::trivially_copy_pass_by_ref, reason = "the form that serde calls")]
-    pub fn is_none(&self) -> bool {
-        *self == Self::None
+    pub fn is_none(self) -> bool {
+        self == Self::None
     }
 
     /// How memories are shared; `None` without memory.
