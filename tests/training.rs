@@ -10,6 +10,7 @@ use qedgix::env::{BatchEnv, EnvConfig, EpisodeMetrics, Layout};
 use qedgix::learner::{
     Algorithm, Event, Learner, Preset, Rollout, SnapshotError, Symmetry, TrainConfig, Trainer, evaluate, layout_list,
 };
+use qedgix::policy::{Gnn, Memory, ObservationKind};
 
 /// A run of a few iterations with updates, target copies, a full replay and evaluations.
 fn small_config(algorithm: Algorithm) -> TrainConfig {
@@ -43,8 +44,11 @@ fn opposite_config(algorithm: Algorithm) -> TrainConfig {
     t.learning_rate_decay = if t.learning_rate_decay < 1.0 { 1.0 } else { 0.1 };
     t.normalise = !t.normalise;
     t.hyper_init = 0.5;
-    t.observation = qedgix::policy::ObservationKind::Flat;
+    t.observation = ObservationKind::Flat;
     config.environment.user_speed = 0.02;
+    t.memory = if algorithm.gnn() == Gnn::None { Memory::Own } else { Memory::Shared };
+    t.teacher = Some("sweep-shared".into());
+    config.environment.communication_range = Some(0.5);
     config
 }
 
