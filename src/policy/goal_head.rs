@@ -33,8 +33,8 @@ pub(super) struct GoalCache<T: Real> {
     hidden: Batch<T>,
     /// (rows, A) the best goal of each heading, or [`NONE`].
     best: Vec<u32>,
-    /// Row and goal of each derivative that is not zero.
-    chosen: Vec<(u32, u32)>,
+    /// Row, goal and value of each derivative that is not zero.
+    chosen: Vec<(u32, u32, T)>,
     d_hidden: Batch<T>,
     d_context: Batch<T>,
     chosen_features: Batch<T>,
@@ -114,15 +114,11 @@ impl GoalHead {
         let value: &[T; HIDDEN] = self.value.weight(params).try_into().expect("one value per hidden unit");
         c.d_context.resize_zero(HIDDEN, dq.len);
         c.chosen.clear();
-        let mut d_scores = Vec::with_capacity(dq.len);
         for (r, dq) in dq.data.chunks(dq.stride).take(dq.len).enumerate() {
             for (h, &d) in dq[..actions].iter().enumerate().filter(|(_, d)| **d != T::ZERO) {
                 match c.best[r * actions + h] {
                     NONE => grads[self.none] += d,
-                    goal => {
-                        c.chosen.push((r as u32, goal));
-                        d_scores.push(d);
-                    }
+                    goal => c.chosen.push((r as u32, goal, d)),
                 }
             }
         }
@@ -130,7 +126,7 @@ impl GoalHead {
         c.chosen_features.resize(FEATURES, c.chosen.len());
         let mut d_value = [T::ZERO; HIDDEN];
         let mut d_bias = T::ZERO;
-        for (i, (&(r, g), &d)) in c.chosen.iter().zip(&d_scores).enumerate() {
+        for (i, &(r, g, d)) in c.chosen.iter().enumerate() {
             let hidden = c.hidden.row(g as usize);
             let (out, d_context) = (c.d_hidden.row_mut(i), c.d_context.row_mut(r as usize));
             for k in 0..HIDDEN {
