@@ -3,6 +3,7 @@
 //! Shutdown has four steps: the server reports not ready and refuses new work; workers snapshot their jobs, which return to the
 //! queue; streams end and requests in flight are answered; the listeners close and the data directory is unlocked.
 
+mod background;
 mod connections;
 mod housekeeping;
 mod http2;
@@ -24,6 +25,7 @@ use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tower::ServiceExt;
 
+use self::background::Background;
 use self::connections::{Connections, Protocol};
 pub use self::http2::{CONNECTION_WINDOW, KEEPALIVE_INTERVAL, STREAM_WINDOW};
 use self::lifetime::LifeLimits;
@@ -88,6 +90,9 @@ pub enum Error {
     /// The threads of the engine cannot be started.
     #[error("cannot start the engine: {0}")]
     Engine(#[source] std::io::Error),
+    /// The background thread cannot be started.
+    #[error("cannot start the background thread: {0}")]
+    Background(#[source] std::io::Error),
     /// The address of a listener cannot be read.
     #[error("cannot read the address of a listener: {0}")]
     Listener(#[source] std::io::Error),
@@ -256,7 +261,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
 /// Serves until `shutdown` resolves, then drains.
 ///
 /// # Errors
-/// [`Error::Listener`] when the address of a listener cannot be read.
+/// [`Error::Listener`] when the address of a listener cannot be read, [`Error::Background`] when a thread cannot be started.
 pub async fn run(
     config: &Config,
     data: &DataDir,
@@ -271,7 +276,8 @@ pub async fn run(
     let health = grpc::Health::new(app.draining.clone(), stop.clone());
     health.report(operations::server_health(&app).await);
 
-    let connections = connections(config, &listeners, &app, &stop);
+    let background = Background::start().map_err(Error::Background)?;
+    let connections = connections(config, &listeners, &app, (&stop, &background));
     // Workers share nothing with other callers: no caller can keep them out.
     let worker_connections = Connections {
         places: Places::new(MAX_WORKER_CONNECTIONS, MAX_WORKER_CONNECTIONS, Budget::new(WORKER_INFLIGHT_BYTES)),
@@ -281,7 +287,7 @@ pub async fn run(
     };
     let services = grpc::services(&app, &health, config.max_message_size, stop.clone());
     let hosts = AllowedHosts::new(endpoints.http.ip(), &config.allow_hosts);
-    let router = rest::router(app.clone(), telemetry::render_metrics, config.max_message_size, hosts);
+    let router = rest::router(app.clone(), telemetry::render_metrics, config.max_message_size, hosts, background.handle());
     let router = router.map_request(|mut request: Request<IncomingBody>| {
         let exchange = request.body().exchange().clone();
         request.extensions_mut().insert(exchange);
@@ -333,7 +339,12 @@ pub async fn run(
 }
 
 /// What the connections of both public listeners share.
-fn connections(config: &Config, listeners: &Listeners, app: &App, stop: &CancellationToken) -> Connections {
+fn connections(
+    config: &Config,
+    listeners: &Listeners,
+    app: &App,
+    (stop, background): (&CancellationToken, &Background),
+) -> Connections {
     let limits = TimeLimits { read: config.read_timeout, write: config.write_timeout };
     let shortest = limits.read.min(limits.write).min(config.connection_idle).min(config.connection_grace);
     let life = LifeLimits {
@@ -350,6 +361,7 @@ fn connections(config: &Config, listeners: &Listeners, app: &App, stop: &Cancell
         max_streams: config.max_streams,
         clock: app.clock.clone(),
         stop: stop.clone(),
+        background: background.handle(),
     }
 }
 

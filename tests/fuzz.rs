@@ -309,6 +309,7 @@ impl Subject {
                     telemetry::render_metrics,
                     LARGEST,
                     AllowedHosts::new(Ipv4Addr::LOCALHOST.into(), &[]),
+                    tokio::runtime::Handle::current(),
                 );
                 (app, BoxCloneSyncService::new(rest), BoxCloneSyncService::new(grpc), None)
             }

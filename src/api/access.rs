@@ -85,6 +85,20 @@ pub fn rest_requirement(method: &Method, route: Option<&str>) -> Requirement {
     route.map_or(Requirement::AnyKey, |route| rest_rule(method, route).unwrap_or(UNLISTED))
 }
 
+/// Whether a gRPC call may wait for others: all calls may, except acting and probes. Workers may wait as well.
+pub fn grpc_may_wait(path: &str) -> bool {
+    path.starts_with("/qedgix.v1.WorkerService/") || may_wait(grpc_rule(path))
+}
+
+/// Whether a request to a registered route may wait for others: all may, except acting and probes.
+pub fn rest_may_wait(method: &Method, route: Option<&str>) -> bool {
+    may_wait(route.and_then(|route| rest_rule(method, route)))
+}
+
+fn may_wait(rule: Option<Requirement>) -> bool {
+    !matches!(rule, Some(ACT | OPEN) | None)
+}
+
 /// The requirement of a gRPC method, if it is listed.
 pub fn grpc_rule(path: &str) -> Option<Requirement> {
     static RULES: LazyLock<HashMap<String, Requirement>> = LazyLock::new(|| {

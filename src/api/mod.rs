@@ -15,6 +15,8 @@ pub mod rest;
 pub use browser::AllowedHosts;
 pub use errors::{Problem, retry_after_seconds};
 
+use tokio_util::task::AbortOnDropHandle;
+
 use crate::service::Error;
 
 /// Whether a path is a probe, by which supervisors and balancers decide whether the server is alive or ready.
@@ -37,15 +39,5 @@ async fn offload<T: Send + 'static>(large: bool, work: impl FnOnce() -> T + Send
     if !large {
         return Ok(work());
     }
-    let task = tokio::task::spawn_blocking(work);
-    let _dropped_with_the_call = AbortOnDrop(task.abort_handle());
-    task.await.map_err(Error::internal)
-}
-
-struct AbortOnDrop(tokio::task::AbortHandle);
-
-impl Drop for AbortOnDrop {
-    fn drop(&mut self) {
-        self.0.abort();
-    }
+    AbortOnDropHandle::new(tokio::task::spawn_blocking(work)).await.map_err(Error::internal)
 }

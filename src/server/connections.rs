@@ -18,6 +18,7 @@ use hyper::service::service_fn;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream};
+use tokio::runtime::Handle;
 use tokio::task::JoinSet;
 use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
@@ -71,6 +72,8 @@ pub(super) struct Connections {
     pub(super) clock: Clock,
     /// Cancelled when the server stops accepting.
     pub(super) stop: CancellationToken,
+    /// Answers the calls that may wait.
+    pub(super) background: Handle,
 }
 
 impl Connections {
@@ -172,7 +175,7 @@ impl Connections {
         let lifetime = Lifetime::new(self.life, self.clock.clone(), self.stop.clone(), place.reserved, jitter);
         if let Version::Http2 { date } = version {
             let (max_streams, limits, purse) = (self.max_streams, self.limits, place.purse.clone());
-            let settings = http2::Settings { max_streams, limits, purse, date };
+            let settings = http2::Settings { max_streams, limits, purse, date, background: self.background.clone() };
             if let Err(error) = http2::serve(io, service, &settings, lifetime).await {
                 tracing::debug!(%error, "connection failed");
             }

@@ -17,12 +17,14 @@ use h2::{Ping, PingPong, Reason, RecvStream, SendStream};
 use hyper::body::Body;
 use pin_project_lite::pin_project;
 use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::runtime::Handle;
 use tokio::time::{Interval, MissedTickBehavior};
 use tower::util::Oneshot;
 use tower::{Service, ServiceExt};
 
 use super::lifetime::{Lifetime, Verdict};
 use crate::api::body::{Exchange, IncomingBody, TimeLimits};
+use crate::api::access::grpc_may_wait;
 use crate::inflight::Purse;
 
 /// Flow-control window of a stream in bytes: holds the observation of a large fleet. Also the most that is kept of a stream whose
@@ -56,6 +58,8 @@ pub(super) struct Settings {
     pub(super) purse: Arc<Purse>,
     /// Whether responses have a date, as HTTP requires and gRPC does not use.
     pub(super) date: bool,
+    /// Answers the calls that may wait.
+    pub(super) background: Handle,
 }
 
 /// Serves a connection until it ends.
@@ -165,12 +169,18 @@ where
             self.connection.graceful_shutdown();
         }
         let (head, stream) = request.into_parts();
+        let may_wait = grpc_may_wait(head.uri.path());
         let exchange = Exchange::http2(self.settings.purse.clone(), reserved, stream);
         self.exchanges.add(&exchange);
         let request = Request::from_parts(head, IncomingBody::http2(exchange.clone()));
         let work = self.service.clone().oneshot(request);
         let stage = Stage::<Oneshot<S, Request<IncomingBody>>, B>::Service { work };
-        tokio::spawn(StreamTask { reply, exchange, date: self.settings.date, stage });
+        let task = StreamTask { reply, exchange, date: self.settings.date, stage };
+        if may_wait {
+            self.settings.background.spawn(task);
+        } else {
+            tokio::spawn(task);
+        }
     }
 
     /// Says goodbye and closes the connection, with all its streams.

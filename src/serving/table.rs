@@ -196,14 +196,14 @@ impl<T: TableEntry> Table<T> {
         self.memory.used()
     }
 
-    /// Takes `bytes` for an entry, from idle ones if necessary.
+    /// Takes `bytes` for an entry of `owner`, from idle ones if necessary.
     ///
     /// # Errors
-    /// [`Error::Busy`] if they are not free.
-    pub(super) fn charge_memory(&self, bytes: usize) -> Result<MemoryCharge, Error> {
-        self.memory.charge(bytes).or_else(|_| {
+    /// [`Error::Busy`] if they are not free, or the owner may not take so many.
+    pub(super) fn charge_memory(&self, owner: &Owner, bytes: usize) -> Result<MemoryCharge, Error> {
+        self.memory.charge(owner, bytes).or_else(|_| {
             self.remove_expired();
-            self.memory.charge(bytes)
+            self.memory.charge(owner, bytes)
         })
     }
 

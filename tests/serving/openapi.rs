@@ -52,7 +52,8 @@ fn routes(router: &axum::Router) -> BTreeMap<String, BTreeSet<String>> {
 #[tokio::test]
 async fn every_route_is_described_and_no_other() {
     let server = Server::start().await;
-    let served = routes(&qedgix::api::rest::router(server.app.clone(), String::new, 1 << 20, localhost()));
+    let background = tokio::runtime::Handle::current();
+    let served = routes(&qedgix::api::rest::router(server.app.clone(), String::new, 1 << 20, localhost(), background));
     assert!(served.len() > 30 && served["/v1/sessions"].len() == 2, "the router writes itself down otherwise: {served:?}");
     let document = document(&server).await;
     let described = paths(&document).map(|(path, item)| (path.clone(), item.keys().cloned().collect()));

@@ -17,10 +17,12 @@ use bytes::Bytes;
 use futures::FutureExt;
 use http_body::{Body as HttpBody, Frame, SizeHint};
 use metrics::{Counter, Histogram};
+use tokio::runtime::Handle;
+use tokio_util::task::AbortOnDropHandle;
 use tracing::Instrument;
 
 use super::v2;
-use crate::api::access::{Requirement, rest_requirement};
+use crate::api::access::{Requirement, rest_may_wait, rest_requirement};
 use crate::api::body::Exchange;
 use crate::api::browser;
 use crate::api::errors::LogDetail;
@@ -34,11 +36,13 @@ pub(super) struct Middleware {
     metrics: RouteMetrics,
     ids: RequestIds,
     log_limiter: LogLimiter,
+    /// Answers the requests that may wait.
+    background: Handle,
 }
 
 impl Middleware {
-    pub(super) fn new() -> Self {
-        Self { metrics: RouteMetrics::default(), ids: RequestIds::new(), log_limiter: LogLimiter::new() }
+    pub(super) fn new(background: Handle) -> Self {
+        Self { metrics: RouteMetrics::default(), ids: RequestIds::new(), log_limiter: LogLimiter::new(), background }
     }
 
     /// Handles one request.
@@ -57,8 +61,11 @@ impl Middleware {
         let mut response = if let Err(exhausted) = admitted {
             Error::from(exhausted).into_response()
         } else {
-            let response = AssertUnwindSafe(next.run(request).instrument(span.clone())).catch_unwind().await;
-            response.unwrap_or_else(|_| Error::internal("a handler panicked").into_response())
+            let may_wait = rest_may_wait(request.method(), matched.as_ref().map(MatchedPath::as_str));
+            let work = AssertUnwindSafe(next.run(request).instrument(span.clone())).catch_unwind();
+            let done = if may_wait { AbortOnDropHandle::new(self.background.spawn(work)).await.map_err(drop) } else { Ok(work.await) };
+            // A task ends without a result only with the server.
+            done.ok().and_then(Result::ok).unwrap_or_else(|| Error::internal("a handler panicked").into_response())
         };
         if let Some(exchange) = exchange {
             response = held(response, exchange);

@@ -23,6 +23,7 @@ use axum::extract::Request;
 use axum::http::StatusCode;
 use axum::response::IntoResponse;
 use axum::{Extension, Router};
+use tokio::runtime::Handle;
 use utoipa_axum::router::OpenApiRouter;
 
 use super::auth::authorize_rest;
@@ -33,9 +34,9 @@ use crate::service::{App, Error};
 use middleware::Middleware;
 
 /// The router with all routes. Refuses bodies larger than `max_body` bytes. `metrics` renders the Prometheus text.
-/// `hosts`: the hosts that requests may name while the server has no keys.
-pub fn router(app: Arc<App>, metrics: fn() -> String, max_body: usize, hosts: AllowedHosts) -> Router {
-    let (auth_app, hosts, middleware) = (app.clone(), Arc::new(hosts), Arc::new(Middleware::new()));
+/// `hosts`: the hosts that requests may name while the server has no keys. `background` answers the requests that may wait.
+pub fn router(app: Arc<App>, metrics: fn() -> String, max_body: usize, hosts: AllowedHosts, background: Handle) -> Router {
+    let (auth_app, hosts, middleware) = (app.clone(), Arc::new(hosts), Arc::new(Middleware::new(background)));
     // The OpenAPI document contains the routes that are merged here.
     let (router, document) = OpenApiRouter::with_openapi(openapi::document())
         .merge(ops::router())

@@ -54,7 +54,7 @@ impl Environments {
     }
 
     async fn build(&self, name: (Owner, String), spec: EnvironmentSpec) -> Result<Arc<Environment>, Error> {
-        let memory = self.table.charge_memory(spec.bytes())?;
+        let memory = self.table.charge_memory(&name.0, spec.bytes())?;
         let requested = spec.clone();
         let simulation = if spec.work() <= environment::MAX_INLINE_WORK {
             Simulation::new(&requested)?

@@ -30,7 +30,7 @@ impl Sessions {
         let session = if let Some(session) = self.peek(owner, &id) {
             Lookup::Found(session)
         } else {
-            let charge = self.charge_memory(EMPTY_SESSION)?;
+            let charge = self.charge_memory(owner, EMPTY_SESSION)?;
             let make = || Session::new((owner.clone(), id.clone()), policy.clone(), &options, charge, self.clock().clone());
             self.find_or_add(owner, &id, make)?
         };
@@ -58,7 +58,7 @@ impl Sessions {
     ) -> Result<Arc<Session>, Error> {
         let options = SessionOptions { seed, ..SessionOptions::default() };
         let name = (owner.clone(), id.to_owned());
-        let charge = self.charge_memory(EMPTY_SESSION)?;
+        let charge = self.charge_memory(owner, EMPTY_SESSION)?;
         self.replace(owner, id, || Session::new(name, policy, &options, charge, self.clock().clone()))
     }
 

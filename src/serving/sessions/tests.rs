@@ -228,7 +228,7 @@ async fn memory_of_all_sessions_is_bounded_in_bytes() {
     // A retry succeeds although no memory is left.
     assert!(sessions.open(&Owner::NOBODY, policy("p"), named("0")).await.is_ok());
     let session = sessions.get(&Owner::NOBODY, "0").unwrap();
-    let mut taken = sessions.charge_memory((16 << 10) - sessions.memory_used()).unwrap();
+    let mut taken = sessions.charge_memory(&Owner::NOBODY, (16 << 10) - sessions.memory_used()).unwrap();
     assert_eq!(step_once(&session, Some(0), None).await, Err("busy"), "the first step needs memory");
     assert_eq!(sessions.describe(&Owner::NOBODY, "0").unwrap().steps, 0);
     sessions.close(&Owner::NOBODY, "1").await.unwrap();
@@ -250,6 +250,6 @@ async fn memory_of_all_sessions_is_bounded_in_bytes() {
     drop(session);
     // Idle sessions give way to new ones.
     time.advance(Duration::from_secs(601));
-    drop(sessions.charge_memory(16 << 10).unwrap());
+    drop(sessions.charge_memory(&Owner::NOBODY, 16 << 10).unwrap());
     assert_eq!((sessions.len(), sessions.memory_used()), (0, 0));
 }

@@ -276,7 +276,8 @@ async fn damaged_bodies_are_no_fault() {
     use tower::ServiceExt;
     let server = server().await;
     let app = server.app.clone();
-    let router = qedgix::api::rest::router(app, qedgix::telemetry::render_metrics, 1 << 20, localhost());
+    let background = tokio::runtime::Handle::current();
+    let router = qedgix::api::rest::router(app, qedgix::telemetry::render_metrics, 1 << 20, localhost(), background);
     let mut ask = slot(json!({"sequence_id": 3, "sequence_start": true}));
     ask["inputs"][2].as_object_mut().unwrap().remove("data");
     ask["inputs"][2]["parameters"] = json!({"binary_data_size": 4});
