@@ -18,7 +18,9 @@ impl Background {
             .worker_threads(1)
             .thread_name("background")
             // Linux lowers the priority of this thread only. Without permission it stays as it is.
-            .on_thread_start(|| drop(rustix::process::nice(NICE)))
+            .on_thread_start(|| {
+                let _ = rustix::process::nice(NICE);
+            })
             .enable_all()
             .build()?;
         Ok(Self(Some(runtime)))
