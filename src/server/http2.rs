@@ -23,8 +23,8 @@ use tower::util::Oneshot;
 use tower::{Service, ServiceExt};
 
 use super::lifetime::{Lifetime, Verdict};
-use crate::api::body::{Exchange, IncomingBody, TimeLimits};
 use crate::api::access::grpc_may_wait;
+use crate::api::body::{Exchange, IncomingBody, TimeLimits};
 use crate::inflight::Purse;
 
 /// Flow-control window of a stream in bytes: holds the observation of a large fleet. Also the most that is kept of a stream whose

@@ -63,7 +63,8 @@ impl Middleware {
         } else {
             let may_wait = rest_may_wait(request.method(), matched.as_ref().map(MatchedPath::as_str));
             let work = AssertUnwindSafe(next.run(request).instrument(span.clone())).catch_unwind();
-            let done = if may_wait { AbortOnDropHandle::new(self.background.spawn(work)).await.map_err(drop) } else { Ok(work.await) };
+            let done =
+                if may_wait { AbortOnDropHandle::new(self.background.spawn(work)).await.map_err(drop) } else { Ok(work.await) };
             // A task ends without a result only with the server.
             done.ok().and_then(Result::ok).unwrap_or_else(|| Error::internal("a handler panicked").into_response())
         };
