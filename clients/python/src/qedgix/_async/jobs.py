@@ -1,0 +1,358 @@
+"""Training jobs."""
+
+from __future__ import annotations
+
+import json
+import os
+import uuid
+from collections.abc import AsyncIterator, Mapping
+from datetime import datetime
+from pathlib import Path
+from time import monotonic
+from typing import TYPE_CHECKING, Any
+
+from .._files import replace_file
+from .._progress import Bar
+from ..errors import DeadlineExceeded, JobEnded, NotFound, QedgixError, Unavailable, from_http
+from ..results import Attempt, Checkpoint, JobEvent, Metric, Metrics, given_instant, instant
+from ._platform import sleep
+from .transport import AsyncTransport
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+# Seconds without any byte, also no heartbeat of the server, after which a stream of events is opened again.
+_SILENCE = 60.0
+
+
+class AsyncJob:
+    """A training job of a server. Its properties are those of the last answer; `refresh` asks again.
+
+    Obtain one from `client.jobs.submit`, `get` or `list`.
+    """
+
+    def __init__(self, transport: AsyncTransport, document: Mapping[str, Any]) -> None:
+        self._transport = transport
+        self.document = document
+        """Everything that the server tells, as JSON: all fields of docs of the REST interface."""
+
+    @property
+    def id(self) -> str:
+        """Id of the job."""
+        return str(self.document["id"])
+
+    @property
+    def state(self) -> str:
+        """queued, running, paused, cancelled, succeeded or failed."""
+        return str(self.document["state"])
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the state is cancelled, succeeded or failed."""
+        return self.state in ("cancelled", "succeeded", "failed")
+
+    @property
+    def reason(self) -> str | None:
+        """Why the job failed, or why its last attempt ended."""
+        return self.document["reason"]  # type: ignore[no-any-return]
+
+    @property
+    def name(self) -> str | None:
+        """Name of the job and of the policy that it publishes."""
+        return self.document["name"]  # type: ignore[no-any-return]
+
+    @property
+    def policy(self) -> str | None:
+        """NAME:VERSION of the published policy; None: it has published none."""
+        return self.document["policy"]  # type: ignore[no-any-return]
+
+    @property
+    def step(self) -> int:
+        """Environment steps completed."""
+        return int(self.document["progress"]["step"])
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of the whole job."""
+        return int(self.document["progress"]["steps"])
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The resolved configuration: `algorithm`, `preset`, `environment`, `training`, `threads`, `seed`, ..."""
+        names = ("algorithm", "preset", "environment", "training", "threads", "priority", "seed", "labels")
+        return {name: self.document.get(name) for name in names}
+
+    @property
+    def created_at(self) -> datetime:
+        """When it was submitted."""
+        return given_instant(self.document["created_at"])
+
+    @property
+    def _path(self) -> str:
+        return f"/v1/jobs/{self.id}"
+
+    async def refresh(self) -> Self:
+        """Asks the server for the state of the job.
+
+        Raises:
+            NotFound: the job was deleted.
+        """
+        self.document = await self._transport.json("GET", self._path)
+        return self
+
+    async def _change(self, verb: str, done: tuple[str, ...]) -> Self:
+        try:
+            self.document = await self._transport.json("POST", f"{self._path}/{verb}")
+        except QedgixError as error:
+            # A repetition of a change that has happened is refused; what matters is that it has happened.
+            if error.code != "wrong_state" or not done or (await self.refresh()).state not in done:
+                raise
+        return self
+
+    async def cancel(self) -> Self:
+        """Cancels the job; a running job is cancelled when its worker has stopped.
+
+        Raises:
+            FailedPrecondition: `wrong_state`: the job has ended otherwise.
+        """
+        return await self._change("cancel", ())
+
+    async def pause(self) -> Self:
+        """Pauses the job; a running job is paused when its worker has stored a snapshot.
+
+        Raises:
+            FailedPrecondition: `wrong_state`: the job has ended.
+        """
+        return await self._change("pause", ())
+
+    async def resume(self) -> Self:
+        """Puts a paused job back into the queue; it continues from its snapshot. A job that is queued or running stays so.
+
+        Raises:
+            FailedPrecondition: `wrong_state`: the job has ended.
+        """
+        return await self._change("resume", ("queued", "running"))
+
+    async def retry(self) -> Self:
+        """Puts a failed job back into the queue; it continues from its snapshot.
+
+        Raises:
+            FailedPrecondition: `wrong_state`: the job has ended otherwise.
+        """
+        return await self._change("retry", ())
+
+    async def delete(self) -> None:
+        """Deletes the job with its metrics and checkpoints. The policy that it has published stays.
+
+        Raises:
+            FailedPrecondition: `wrong_state`: the job has not ended.
+        """
+        await self._transport.request("DELETE", self._path)
+
+    async def events(self, after: int = 0, *, patience: float = 60.0) -> AsyncIterator[JobEvent]:
+        """All events of the job in order, past ones first, until the job ends. Continues after a lost connection and after a
+        restart of the server, without loss or repetition.
+
+        Args:
+            after: only events with a greater id.
+            patience: seconds without a server after which to give up.
+
+        Raises:
+            NotFound: the job was deleted.
+            Unavailable: there was no server for `patience` seconds.
+        """
+        async for event in self._follow(after, patience, None):
+            yield event
+
+    async def _follow(self, after: int, patience: float, deadline: float | None) -> AsyncIterator[JobEvent]:
+        import httpx
+
+        retry = self._transport.settings.retry
+        last_success = monotonic()
+        while True:
+            failure: QedgixError | None = None
+            silence = _SILENCE if deadline is None else min(_SILENCE, max(deadline - monotonic(), 0.001))
+            limits = httpx.Timeout(self._transport.settings.timeout, read=silence)
+            try:
+                request = self._transport.http.stream("GET", f"{self._path}/events", params={"after": after}, timeout=limits)
+                async with request as response:
+                    if response.status_code == 204:
+                        return
+                    if not response.is_success:
+                        await response.aread()
+                        raise from_http(response)
+                    kind = data = event_id = ""
+                    async for line in response.aiter_lines():
+                        last_success = monotonic()
+                        name, _, value = line.partition(":")
+                        value = value.removeprefix(" ")
+                        if name == "id":
+                            event_id = value
+                        elif name == "event":
+                            kind = value
+                        elif name == "data":
+                            data = value
+                        elif not line and data:
+                            after = int(event_id)
+                            event = JobEvent.of(after, kind, json.loads(data))
+                            kind = data = event_id = ""
+                            yield event
+            except (httpx.TransportError, OSError) as error:
+                failure = Unavailable(str(error) or type(error).__name__, code="unavailable")
+            except QedgixError as error:
+                failure = error
+            if deadline is not None and monotonic() >= deadline:
+                raise DeadlineExceeded(f"job {self.id} has not ended in time", code="deadline_exceeded")
+            remaining = last_success + patience - monotonic()
+            # A stream that ended by itself is opened again: the answer says whether the job has ended.
+            wait = 0.0 if failure is None else retry.wait(failure, 1, remaining)
+            if wait is None:
+                assert failure is not None
+                raise failure
+            await sleep(wait)
+
+    async def wait(
+        self,
+        timeout: float | None = None,
+        *,
+        progress: bool = False,
+        check: bool = True,
+        patience: float = 60.0,
+    ) -> Self:
+        """Waits until the job has ended.
+
+        Args:
+            timeout: seconds to wait. Default: no limit.
+            progress: whether to show a bar with tqdm, if tqdm is installed.
+            check: whether to raise JobEnded if the job fails or is cancelled.
+            patience: seconds without a server after which to give up.
+
+        Raises:
+            JobEnded: the job has failed or was cancelled.
+            DeadlineExceeded: it has not ended within `timeout`. It goes on; wait again.
+            Unavailable: there was no server for `patience` seconds.
+        """
+        deadline = None if timeout is None else monotonic() + timeout
+        with Bar(self.name or self.id, self.steps, enabled=progress) as bar:
+            async for event in self._follow(0, patience, deadline):
+                bar.show(event)
+        await self.refresh()
+        if check and self.state != "succeeded":
+            raise JobEnded(self.id, self.state, self.reason or "")
+        return self
+
+    async def metrics(self, name: str | None = None) -> Metrics:
+        """The metrics of the job: all, or one such as `eval/mean_aoi`. `to_pandas` makes a DataFrame of them."""
+        rows = await self._transport.pages(f"{self._path}/metrics", "metrics", name=name, page_size=100_000)
+        return Metrics([Metric.of(row) for row in rows])
+
+    async def checkpoints(self) -> list[Checkpoint]:
+        """The best and the last checkpoint, oldest first."""
+        document = await self._transport.json("GET", f"{self._path}/checkpoints")
+        return [Checkpoint.of(one) for one in document["checkpoints"]]
+
+    async def download(self, path: str | os.PathLike[str], kind: str = "best", *, timeout: float | None = None) -> Path:
+        """Writes a checkpoint to a safetensors file, which appears complete or not at all.
+
+        Args:
+            path: the file.
+            kind: `best` or `last`.
+            timeout: seconds for all attempts. Default: that of the client.
+
+        Raises:
+            NotFound: the job has no such checkpoint.
+            Internal: the bytes do not have their digest.
+        """
+        found = [one for one in await self.checkpoints() if one.kind == kind]
+        if not found:
+            raise NotFound(f"job {self.id} has no checkpoint {kind}", code="not_found", field="kind")
+        response = await self._transport.request("GET", f"/v1/checkpoints/{found[-1].id}", timeout=timeout)
+        return replace_file(path, response.content, found[-1].sha256)
+
+    async def attempts(self) -> list[Attempt]:
+        """The attempts at the job with the last output of their workers, oldest first."""
+        document = await self._transport.json("GET", f"{self._path}/logs")
+        return [
+            Attempt(
+                one["attempt"],
+                one["outcome"],
+                one["reason"],
+                one["log"],
+                given_instant(one["started_at"]),
+                instant(one["ended_at"]),
+            )
+            for one in document["attempts"]
+        ]
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.id}: {self.state}, {self.step} of {self.steps} environment steps>"
+
+
+class AsyncJobs:
+    """The jobs of a server, as `client.jobs`."""
+
+    def __init__(self, transport: AsyncTransport) -> None:
+        self._transport = transport
+
+    async def submit(
+        self,
+        *,
+        algorithm: str | None = None,
+        preset: str | None = None,
+        environment: Mapping[str, Any] | None = None,
+        training: Mapping[str, Any] | None = None,
+        name: str | None = None,
+        seed: int | None = None,
+        threads: int | None = None,
+        priority: int | None = None,
+        labels: Mapping[str, str] | None = None,
+        idempotency_key: str | None = None,
+        **more: Any,
+    ) -> AsyncJob:
+        """Adds a job to the queue. When this returns, the job is in the database of the server.
+
+        Args:
+            algorithm: qmix, vdn, iql, qedgix, agggnn or rgcn. Default: qedgix.
+            preset: paper, authors or practical. Default: practical.
+            environment: fields that replace those of the preset, such as `{"uavs": 3, "users": 5}`.
+            training: fields that replace those of the preset, such as `{"steps": 250_000}`.
+            name: name of the job and of the policy that it publishes.
+            seed: configuration and seed determine every metric and weight. Default: 1.
+            threads: threads that the job may use.
+            priority: -100 to 100; jobs with a higher one start first. Default: 0.
+            labels: labels, which the server does not interpret.
+            idempotency_key: a second submission with this key returns the same job. Default: a random key.
+            more: further fields of the body of `POST /v1/jobs`.
+
+        Raises:
+            InvalidArgument: a field is not accepted; `field` says which.
+            AlreadyExists: `idempotency_conflict`: the key belongs to another job.
+        """
+        fields = {
+            "algorithm": algorithm,
+            "preset": preset,
+            "environment": environment,
+            "training": training,
+            "name": name,
+            "seed": seed,
+            "threads": threads,
+            "priority": priority,
+            "labels": labels,
+            **more,
+        }
+        body = {field: value for field, value in fields.items() if value is not None}
+        headers = {"idempotency-key": idempotency_key or uuid.uuid4().hex}
+        return AsyncJob(self._transport, await self._transport.json("POST", "/v1/jobs", json=body, headers=headers))
+
+    async def get(self, job_id: str) -> AsyncJob:
+        """A job.
+
+        Raises:
+            NotFound: there is no such job.
+        """
+        return await AsyncJob(self._transport, {"id": job_id}).refresh()
+
+    async def list(self, state: str | None = None) -> list[AsyncJob]:
+        """All jobs, or those in a state, newest first. `config` of a listed job lacks environment and training."""
+        rows = await self._transport.pages("/v1/jobs", "jobs", state=state)
+        return [AsyncJob(self._transport, row) for row in rows]

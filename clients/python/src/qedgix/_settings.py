@@ -1,0 +1,168 @@
+"""What a client knows of its server: addresses, certificates, API key, deadline and retries."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import random
+import ssl
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import grpc
+
+from .errors import DeadlineExceeded, QedgixError, ResourceExhausted, Unavailable, invalid
+
+
+@dataclass(frozen=True)
+class Retry:
+    """When a call that failed is sent again.
+
+    A call is repeated if there was no connection, if the server was busy or shutting down, or if one attempt took too long,
+    and only if repeating it is safe: steps, resets and submissions are numbered or named, so the server does nothing twice. All
+    attempts share the deadline of the call.
+
+    Attributes:
+        attempts: maximum number of attempts, at least 1.
+        initial: seconds to wait before the second attempt. The wait doubles with every attempt.
+        maximum: longest wait in seconds. A longer wait that the server asks for is respected.
+        attempt_timeout: seconds for one attempt; None: until the deadline. Set it on networks that lose packets.
+    """
+
+    attempts: int = 8
+    initial: float = 0.05
+    maximum: float = 2.0
+    attempt_timeout: float | None = None
+
+    def wait(self, failure: QedgixError, attempt: int, remaining: float) -> float | None:
+        """Seconds to wait after attempt number `attempt` (from 1) failed; None: give up."""
+        if attempt >= self.attempts or not isinstance(failure, (Unavailable, ResourceExhausted, DeadlineExceeded)):
+            return None
+        backoff = min(self.initial * 2.0 ** min(attempt - 1, 32), self.maximum) * random.uniform(0.5, 1.0)
+        wait = max(backoff, failure.retry_after or 0.0)
+        return wait if wait < remaining else None
+
+    def limit(self, remaining: float) -> float:
+        """Seconds for the next attempt."""
+        return remaining if self.attempt_timeout is None else min(remaining, self.attempt_timeout)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that determines the connections of a client."""
+
+    grpc_url: str
+    http_url: str
+    api_key: str | None
+    ca_cert: Path | None
+    client_cert: Path | None
+    client_key: Path | None
+    timeout: float
+    retry: Retry
+
+    @staticmethod
+    def resolve(
+        grpc: str,
+        http: str,
+        *,
+        api_key: str | None,
+        ca_cert: str | os.PathLike[str] | None,
+        client_cert: str | os.PathLike[str] | None,
+        client_key: str | os.PathLike[str] | None,
+        timeout: float,
+        retry: Retry,
+        environ: Mapping[str, str] | None = None,
+    ) -> Settings:
+        """Adds what the environment has, and checks the addresses."""
+        environ = os.environ if environ is None else environ
+
+        def path(given: str | os.PathLike[str] | None, name: str) -> Path | None:
+            found = given if given is not None else environ.get(name)
+            return Path(found) if found else None
+
+        ca = path(ca_cert, "QEDGIX_CA_CERT")
+        certificate = path(client_cert, "QEDGIX_CLIENT_CERT")
+        key = path(client_key, "QEDGIX_CLIENT_KEY")
+        if (certificate is None) != (key is None):
+            raise invalid("client_cert", certificate, "both client_cert and client_key, or neither")
+        scheme = "https" if ca or certificate else "http"
+        secret = api_key if api_key is not None else environ.get("QEDGIX_API_KEY")
+        settings = Settings(
+            grpc_url=_url("grpc", grpc, scheme),
+            http_url=_url("http", http, scheme),
+            api_key=secret.strip() if secret else None,
+            ca_cert=ca,
+            client_cert=certificate,
+            client_key=key,
+            timeout=timeout,
+            retry=retry,
+        )
+        if settings.api_key and any(_readable_by_others(url) for url in (settings.grpc_url, settings.http_url)):
+            warnings.warn("the API key is sent to another machine without encryption; use https://", stacklevel=4)
+        return settings
+
+    @property
+    def metadata(self) -> tuple[tuple[str, str], ...]:
+        """Metadata of every gRPC call; headers of every REST request."""
+        return (("authorization", f"Bearer {self.api_key}"),) if self.api_key else ()
+
+    @property
+    def target(self) -> str:
+        """The gRPC target: HOST:PORT."""
+        return urlsplit(self.grpc_url).netloc
+
+    def credentials(self) -> grpc.ChannelCredentials | None:
+        """The TLS credentials of gRPC; None: no TLS."""
+        if not self.grpc_url.startswith("https:"):
+            return None
+        ca, key, certificate = (
+            path.read_bytes() if path else None for path in (self.ca_cert, self.client_key, self.client_cert)
+        )
+        return grpc.ssl_channel_credentials(ca, key, certificate)
+
+    def tls(self) -> ssl.SSLContext | bool:
+        """The TLS context of REST; True: that of the machine."""
+        if not (self.ca_cert or self.client_cert):
+            return True
+        context = ssl.create_default_context(cafile=str(self.ca_cert) if self.ca_cert else None)
+        if self.client_cert:
+            context.load_cert_chain(self.client_cert, self.client_key)
+        return context
+
+
+# Responses may be large (batches, many environments). Retries are those of `Retry`. A connection whose peer is gone is
+# noticed within 40 s, also while a stream waits. A server that starts again is found within 2 s.
+CHANNEL_OPTIONS: tuple[tuple[str, int], ...] = (
+    ("grpc.max_receive_message_length", -1),
+    ("grpc.enable_retries", 0),
+    ("grpc.keepalive_time_ms", 30_000),
+    ("grpc.keepalive_timeout_ms", 10_000),
+    ("grpc.initial_reconnect_backoff_ms", 100),
+    ("grpc.max_reconnect_backoff_ms", 2_000),
+)
+
+
+def _url(field: str, address: str, scheme: str) -> str:
+    """`http://HOST:PORT` or `https://HOST:PORT`."""
+    text = address if "://" in address else f"{scheme}://{address}"
+    expected = "HOST:PORT, http://HOST:PORT or https://HOST:PORT"
+    try:
+        parts = urlsplit(text)
+        complete = parts.port is not None
+    except ValueError:
+        raise invalid(field, address, expected) from None
+    if parts.scheme not in ("http", "https") or not parts.hostname or not complete or parts.path.strip("/"):
+        raise invalid(field, address, expected)
+    return f"{parts.scheme}://{parts.netloc}"
+
+
+def _readable_by_others(url: str) -> bool:
+    host = urlsplit(url).hostname or ""
+    try:
+        local = ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        local = host == "localhost"
+    return url.startswith("http:") and not local

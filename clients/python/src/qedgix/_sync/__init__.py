@@ -1,0 +1,2 @@
+# Generated from _async by `generate`. Do not edit.
+"""The synchronous client."""

@@ -1,0 +1,237 @@
+# Generated from _async by `generate`. Do not edit.
+"""The synchronous client."""
+
+from __future__ import annotations
+
+import json
+import os
+import uuid
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from .._settings import Retry, Settings
+from ..errors import QedgixError
+from ..observations import Observation, put
+from ..results import Decision, SessionInfo
+from ..v1 import policy_pb2 as pb
+from . import sessions
+from .environments import Environment, create_request
+from .jobs import Jobs
+from .policies import Policies
+from .sessions import ActStream, Fleet, LocalSession, Session
+from .transport import Transport
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+class Client:
+    """A client of one server. Connections are opened when they are first used, and kept.
+
+    Args:
+        grpc: address of gRPC, HOST:PORT or a URL: sessions, `act`, environments.
+        http: address of REST, HOST:PORT or a URL: `jobs` and `policies`.
+        api_key: an API key. Default: the environment variable QEDGIX_API_KEY.
+        ca_cert: certificate authorities to trust (PEM), which means TLS. Default: QEDGIX_CA_CERT, or those of the machine for
+            addresses that begin with https://.
+        client_cert: client certificate (PEM). Default: QEDGIX_CLIENT_CERT.
+        client_key: private key of the client certificate (PEM). Default: QEDGIX_CLIENT_KEY.
+        timeout: seconds that a call may take with all its attempts. Every call can set its own.
+        retry: when calls are repeated.
+
+    Raises:
+        InvalidArgument: an address is not one.
+
+    Example:
+        >>> with Client() as client, client.session("qedgix") as session:
+        ...     decision = session.act(Scene(uavs, users, aoi))
+    """
+
+    def __init__(
+        self,
+        grpc: str = "127.0.0.1:50051",
+        http: str = "127.0.0.1:8080",
+        *,
+        api_key: str | None = None,
+        ca_cert: str | os.PathLike[str] | None = None,
+        client_cert: str | os.PathLike[str] | None = None,
+        client_key: str | os.PathLike[str] | None = None,
+        timeout: float = 30.0,
+        retry: Retry | None = None,
+    ) -> None:
+        settings = Settings.resolve(
+            grpc,
+            http,
+            api_key=api_key,
+            ca_cert=ca_cert,
+            client_cert=client_cert,
+            client_key=client_key,
+            timeout=timeout,
+            retry=retry or Retry(),
+        )
+        self._transport = Transport(settings)
+        self.jobs = Jobs(self._transport)
+        """Training jobs."""
+        self.policies = Policies(self._transport)
+        """Policies, versions and aliases."""
+
+    @classmethod
+    def of_data_dir(cls, data_dir: str | os.PathLike[str] = "qedgix-data", **options: Any) -> Self:
+        """A client of the server on this machine that uses a data directory: its addresses are in `endpoints.json`.
+
+        Args:
+            data_dir: `--data-dir` of the server.
+            options: as for the class.
+
+        Raises:
+            FileNotFoundError: no server runs on this directory.
+        """
+        endpoints = json.loads((Path(data_dir) / "endpoints.json").read_text())
+        return cls(endpoints["grpc"], endpoints["http"], **options)
+
+    def session(
+        self,
+        policy: str,
+        *,
+        session_id: str | None = None,
+        run_id: str | None = None,
+        seed: int | None = None,
+    ) -> Session:
+        """A session for `with`, which opens it on the server and closes it at the end.
+
+        Args:
+            policy: NAME (the newest version), NAME@ALIAS or NAME:VERSION. The session keeps the version of its opening.
+            session_id: a name of your own. Default: a random one.
+            run_id: name of the first run, see `restart`. With a new one, an open session of this id starts again at slot 0.
+            seed: seed of the random choices of the policy. Default: derived from `session_id` and `run_id`.
+        """
+        request = pb.OpenSessionRequest(policy=policy, session_id=session_id or uuid.uuid4().hex, run_id=run_id, seed=seed)
+        return Session(self._transport, request)
+
+    def open_session(self, policy: str, *, timeout: float | None = None, **options: Any) -> Session:
+        """Opens a session, which you close yourself. Arguments and errors: as `session` and `Session.open`."""
+        return self.session(policy, **options).open(timeout)
+
+    def get_session(self, session_id: str) -> Session:
+        """An open session, to continue it.
+
+        Raises:
+            NotFound, FailedPrecondition: the session is closed or has expired.
+        """
+        found = self._transport.call(sessions.GET, pb.GetSessionRequest(session_id=session_id))
+        session = Session(self._transport, pb.OpenSessionRequest(session_id=session_id))
+        session.info = SessionInfo.of(found)
+        session.step = found.steps
+        return session
+
+    def list_sessions(self) -> list[SessionInfo]:
+        """All open sessions, by id."""
+        found: list[SessionInfo] = []
+        token = ""
+        while True:
+            page = self._transport.call(sessions.LIST, pb.ListSessionsRequest(page_token=token))
+            found += map(SessionInfo.of, page.sessions)
+            token = page.next_page_token
+            if not token:
+                return found
+
+    def local_session(
+        self, policy: str, *, seed: int | None = None, recurrent_state: bytes = b"", step: int = 0
+    ) -> LocalSession:
+        """A fleet whose memory is kept here and not on the server. Nothing is sent before `act`.
+
+        Args:
+            policy: NAME (the newest version), NAME@ALIAS or NAME:VERSION. The episode keeps the version of its slot 0.
+            seed: seed of the random choices of the policy. Default: 0.
+            recurrent_state: that of an earlier object, to continue its episode.
+            step: that of the earlier object.
+        """
+        session = LocalSession(self._transport, policy, seed, recurrent_state)
+        session.step = step
+        return session
+
+    def act(
+        self,
+        observation: Observation,
+        *,
+        policy: str,
+        seed: int | None = None,
+        q_values: bool = False,
+        timeout: float | None = None,
+    ) -> Decision:
+        """The headings for one observation of a fleet without a past. For more than one slot use a session.
+
+        Raises:
+            QedgixError: as `act` of a session.
+        """
+        request = pb.ActRequest(policy=policy, seed=seed, return_q_values=q_values)
+        put(observation, request)
+        return Decision(self._transport.call(sessions.ACT, request, timeout))
+
+    def act_batch(
+        self,
+        slots: Iterable[tuple[Fleet, Observation]],
+        *,
+        q_values: bool = False,
+        timeout: float | None = None,
+    ) -> list[Decision | QedgixError]:
+        """The headings of several fleets in one call, in their order. Each succeeds or fails on its own.
+
+        Args:
+            slots: pairs of a session or local session and what its fleet observes: at most 1024, each fleet once.
+            q_values: whether to return Q-values.
+            timeout: seconds for all attempts. Default: that of the client.
+
+        Returns:
+            For each fleet its decision, or the exception, which is not raised.
+
+        Raises:
+            QedgixError: the whole call failed.
+        """
+        return sessions.act_batch(self._transport, list(slots), q_values, timeout)
+
+    def stream(self) -> ActStream:
+        """A stream for `with`: slots of many fleets without a call for each."""
+        return ActStream(self._transport)
+
+    def environment(
+        self,
+        environment: Mapping[str, Any] | None = None,
+        *,
+        count: int = 1,
+        seed: int = 0,
+        auto_reset: bool = False,
+        environment_id: str | None = None,
+    ) -> Environment:
+        """A hosted environment for `with`, which creates it on the server and deletes it at the end.
+
+        Args:
+            environment: the configuration, such as `{"uavs": 3, "users": 5}` or `{"M": 3, "N": 5}`. Every field has a default.
+            count: B, the number of copies, 1 to 1024.
+            seed: episode 0 of copy b has the seed `seed` + b. 0 to 2^53 - 1.
+            auto_reset: whether the last step of an episode also starts the next episode.
+            environment_id: a name of your own. Default: a random one.
+        """
+        name = environment_id or uuid.uuid4().hex
+        return Environment(self._transport, create_request(name, environment, count, seed, auto_reset))
+
+    def create_environment(
+        self, environment: Mapping[str, Any] | None = None, *, timeout: float | None = None, **options: Any
+    ) -> Environment:
+        """Creates a hosted environment, which you delete yourself. Arguments and errors: as `environment` and
+        `Environment.create`."""
+        return self.environment(environment, **options).create(timeout)
+
+    def close(self) -> None:
+        """Closes the connections. Sessions and environments stay on the server until they expire."""
+        self._transport.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

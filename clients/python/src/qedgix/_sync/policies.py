@@ -1,0 +1,138 @@
+# Generated from _async by `generate`. Do not edit.
+"""Policies, their versions and their aliases."""
+
+from __future__ import annotations
+
+import builtins
+import os
+from pathlib import Path
+from urllib.parse import quote
+
+from .._files import replace_file
+from ..results import AliasMove, Policy, PolicyRef, PolicyVersion, given_instant
+from .transport import Transport
+
+
+class Policies:
+    """The policies of a server, as `client.policies`.
+
+    A policy is named NAME (its newest version), NAME@ALIAS or NAME:VERSION. Every method raises NotFound if there is no such
+    policy, version or alias, and PermissionDenied if the API key does not allow the operation.
+    """
+
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
+
+    def list(self) -> list[Policy]:
+        """All policies by name, each in its newest version."""
+        return [Policy.of(one) for one in self._transport.pages("/v1/policies", "policies")]
+
+    def get(self, policy: str) -> Policy:
+        """A policy version."""
+        return Policy.of(self._transport.json("GET", _path(policy)))
+
+    def versions(self, name: str) -> builtins.list[PolicyVersion]:
+        """All versions of a policy, newest first."""
+        rows = self._transport.pages(_path(name, "versions"), "versions")
+        return [PolicyVersion(PolicyRef(**row["ref"]), row["loaded"], row["aliases"]) for row in rows]
+
+    def upload(
+        self,
+        name: str,
+        checkpoint: bytes | str | os.PathLike[str],
+        *,
+        alias: str | None = None,
+        timeout: float | None = None,
+    ) -> Policy:
+        """Publishes a checkpoint as the next version of a policy; identical bytes return the existing version.
+
+        Args:
+            name: NAME of the policy.
+            checkpoint: a safetensors file, or its bytes.
+            alias: an alias to point to the version.
+            timeout: seconds for all attempts. Default: that of the client.
+
+        Raises:
+            InvalidArgument: it is no checkpoint.
+            TooLarge: it is larger than the server accepts.
+        """
+        content = checkpoint if isinstance(checkpoint, bytes) else Path(checkpoint).read_bytes()
+        headers = {"content-type": "application/octet-stream"}
+        params = {"alias": alias}
+        path = _path(name, "versions")
+        return Policy.of(
+            self._transport.json("POST", path, content=content, headers=headers, params=params, timeout=timeout)
+        )
+
+    def publish(self, name: str, checkpoint_id: str, *, alias: str | None = None) -> Policy:
+        """Publishes a checkpoint of a job as the next version of a policy."""
+        body = {"checkpoint_id": checkpoint_id}
+        return Policy.of(self._transport.json("POST", _path(name, "versions"), json=body, params={"alias": alias}))
+
+    def export(self, policy: str, path: str | os.PathLike[str], *, timeout: float | None = None) -> Path:
+        """Writes the checkpoint of a version to a safetensors file, which appears complete or not at all.
+
+        Raises:
+            FailedPrecondition: `no_checkpoint`: the policy is a baseline.
+            Internal: the bytes do not have their digest.
+        """
+        response = self._transport.request("GET", _path(policy, "export"), timeout=timeout)
+        return replace_file(path, response.content, response.headers["etag"].strip('"'))
+
+    def delete(self, name: str, version: int | None = None) -> None:
+        """Deletes a version, or all versions of a policy.
+
+        Raises:
+            FailedPrecondition: an alias points to it, a session uses it, or it is bundled with the server.
+        """
+        path = _path(name) if version is None else _path(name, "versions", str(version))
+        self._transport.request("DELETE", path)
+
+    def load(self, policy: str) -> Policy:
+        """Loads all versions of NAME, or NAME:VERSION."""
+        return Policy.of(self._transport.json("POST", _path(policy, "load")))
+
+    def unload(self, policy: str) -> Policy:
+        """Unloads all versions of NAME, or NAME:VERSION: requests are refused until it is loaded, open sessions continue."""
+        return Policy.of(self._transport.json("POST", _path(policy, "unload")))
+
+    def aliases(self, name: str) -> dict[str, int]:
+        """The version that each alias of a policy points to."""
+        rows = self._transport.pages(_path(name, "aliases"), "aliases")
+        return {row["alias"]: row["version"] for row in rows}
+
+    def set_alias(self, name: str, alias: str, version: int, *, expected: int | None = None) -> int | None:
+        """Points an alias to a version, for all requests at once. Returns the version that it pointed to before.
+
+        Args:
+            name: NAME of the policy.
+            alias: the alias; it is made if it does not exist.
+            version: the version.
+            expected: move it only if it points to this version now; 0: only if it does not exist.
+
+        Raises:
+            FailedPrecondition: `alias_moved`: it points to another version than expected.
+        """
+        body = {"version": version, "expected": expected}
+        # With `expected`, a repetition of a move that has happened would be refused.
+        repeatable = expected is None
+        moved = self._transport.json("PUT", _path(name, "aliases", alias), json=body, repeatable=repeatable)
+        previous: int | None = moved["previous"]
+        return previous
+
+    def delete_alias(self, name: str, alias: str, *, expected: int | None = None) -> None:
+        """Deletes an alias, with `expected` only if it points to this version.
+
+        Raises:
+            FailedPrecondition: `alias_moved`: it points to another version than expected.
+        """
+        self._transport.request("DELETE", _path(name, "aliases", alias), params={"expected": expected})
+
+    def history(self, name: str, alias: str | None = None) -> builtins.list[AliasMove]:
+        """All moves of the aliases of a policy, or of one alias, newest first."""
+        rows = self._transport.pages(_path(name, "history"), "history", alias=alias)
+        return [AliasMove(row["alias"], row["version"], row["previous"], given_instant(row["at"]), row["by"]) for row in rows]
+
+
+def _path(*parts: str) -> str:
+    return "/v1/policies/" + "/".join(quote(part, safe="@:") for part in parts)

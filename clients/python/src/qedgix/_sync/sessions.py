@@ -1,0 +1,360 @@
+# Generated from _async by `generate`. Do not edit.
+"""Fleets that act slot by slot: sessions of the server, sessions of the caller, and streams."""
+
+from __future__ import annotations
+
+import uuid
+from collections import deque
+from time import monotonic
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+import grpc
+
+from ..errors import (
+    DeadlineExceeded,
+    InvalidArgument,
+    NotFound,
+    QedgixError,
+    Unavailable,
+    from_act_error,
+    from_grpc,
+)
+from ..observations import Observation, put
+from ..results import Decision, PolicyRef, SessionInfo
+from ..v1 import policy_pb2 as pb
+from ._platform import RawStream, sleep
+from .transport import Transport, Method
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+_SERVICE = "/qedgix.v1.PolicyService/"
+ACT = Method(_SERVICE + "Act", pb.ActRequest, pb.ActResponse)
+ACT_BATCH = Method(_SERVICE + "ActBatch", pb.ActBatchRequest, pb.ActBatchResponse)
+ACT_STREAM = Method(_SERVICE + "ActStream", pb.ActRequest, pb.ActResult)
+OPEN = Method(_SERVICE + "OpenSession", pb.OpenSessionRequest, pb.Session)
+GET = Method(_SERVICE + "GetSession", pb.GetSessionRequest, pb.Session)
+LIST = Method(_SERVICE + "ListSessions", pb.ListSessionsRequest, pb.ListSessionsResponse)
+CLOSE = Method(_SERVICE + "CloseSession", pb.CloseSessionRequest, pb.Session)
+
+
+class Fleet:
+    """A fleet whose policy remembers earlier slots. `Session` keeps that memory on the server, `LocalSession` here.
+
+    One fleet is used by one task or thread at a time.
+    """
+
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
+        self.step = 0
+        """Index of the next slot, from 0."""
+
+    def act(self, observation: Observation, *, q_values: bool = False, timeout: float | None = None) -> Decision:
+        """Returns the headings for what the fleet observes in this slot, and goes on to the next slot.
+
+        A lost answer is asked for again with the same step, which the server does not compute twice. If this raises, the
+        fleet is still in this slot: call again with the same observation.
+
+        Args:
+            observation: a `Scene`, a `Graph`, their message or a dict.
+            q_values: whether to return Q-values.
+            timeout: seconds for all attempts. Default: that of the client.
+
+        Raises:
+            InvalidArgument: `field` says what is not accepted.
+            FailedPrecondition: `session_expired` and others: the session cannot go on.
+            NotFound: there is no such session or policy; a server that was restarted has no sessions.
+            Unavailable, ResourceExhausted, DeadlineExceeded: no answer within the deadline.
+        """
+        response = self._transport.call(ACT, self.request(observation, q_values=q_values), timeout)
+        return self.accept(response)
+
+    def request(self, observation: Observation, *, q_values: bool = False) -> pb.ActRequest:
+        """The request of this slot."""
+        raise NotImplementedError
+
+    def accept(self, response: pb.ActResponse) -> Decision:
+        """Takes the answer of this slot and goes on to the next slot."""
+        self.step = response.step + 1
+        return Decision(response)
+
+
+class Session(Fleet):
+    """A session: the server keeps the memory of the fleet. Closes itself at the end of `with`.
+
+    Obtain one from `Client.session`, `open_session` or `get_session`.
+    """
+
+    def __init__(self, transport: Transport, request: pb.OpenSessionRequest) -> None:
+        super().__init__(transport)
+        self._open_request = request
+        self._run_id: str | None = None
+        self.id: str = request.session_id
+        """Id of the session."""
+        self.info: SessionInfo | None = None
+        """What the server said when it opened the session."""
+
+    @property
+    def policy(self) -> PolicyRef:
+        """The policy version of the session. It never changes.
+
+        Raises:
+            RuntimeError: the session is not open yet.
+        """
+        if self.info is None:
+            raise RuntimeError("the session is not open")
+        return self.info.policy
+
+    def open(self, timeout: float | None = None) -> Self:
+        """Opens the session; `with` does this itself.
+
+        Raises:
+            NotFound: there is no such policy.
+            AlreadyExists: a session with this id is open and has steps, or other options.
+            ResourceExhausted: the server has no room for another session.
+        """
+        self.info = SessionInfo.of(self._transport.call(OPEN, self._open_request, timeout))
+        self.step = self.info.steps
+        return self
+
+    def request(self, observation: Observation, *, q_values: bool = False) -> pb.ActRequest:
+        """The request of this slot."""
+        request = pb.ActRequest(session_id=self.id, step=self.step, run_id=self._run_id, return_q_values=q_values)
+        put(observation, request)
+        return request
+
+    def restart(self, run_id: str | None = None) -> None:
+        """Starts again at slot 0, for example when the simulator is reset. The next `act` tells the server.
+
+        Args:
+            run_id: a name of the new run that the session has not had. Default: a random one.
+        """
+        self._run_id = run_id or uuid.uuid4().hex
+        self.step = 0
+
+    def close(self, timeout: float | None = None) -> None:
+        """Closes the session, if the server still has it."""
+        try:
+            self._transport.call(CLOSE, pb.CloseSessionRequest(session_id=self.id), timeout, gone=NotFound)
+        except QedgixError as error:
+            if error.code not in ("not_found", "session_expired"):
+                raise
+
+    def __enter__(self) -> Self:
+        return self if self.info else self.open()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.close()
+        except QedgixError:
+            # The session expires by itself. The error of the block, if there is one, matters more.
+            if kind is None:
+                raise
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.id}, step {self.step}>"
+
+
+class LocalSession(Fleet):
+    """A session without the server: this object keeps the memory of the fleet, and any replica of the server can answer.
+
+    It survives a restart of the server. Save `recurrent_state` and `step` to continue in another process.
+    """
+
+    def __init__(self, transport: Transport, policy: str, seed: int | None, recurrent_state: bytes) -> None:
+        super().__init__(transport)
+        self.policy = policy
+        """NAME, NAME@ALIAS or NAME:VERSION. The episode keeps the version of its slot 0."""
+        self.seed = seed
+        """Seed of the random choices of the policy."""
+        self.recurrent_state = recurrent_state
+        """The memory of the fleet after the last slot; empty before slot 0."""
+
+    def request(self, observation: Observation, *, q_values: bool = False) -> pb.ActRequest:
+        """The request of this slot."""
+        request = pb.ActRequest(policy=self.policy, recurrent_state=self.recurrent_state, return_q_values=q_values)
+        if not self.recurrent_state and self.seed is not None:
+            request.seed = self.seed
+        put(observation, request)
+        return request
+
+    def accept(self, response: pb.ActResponse) -> Decision:
+        """Takes the answer of this slot and goes on to the next slot."""
+        self.recurrent_state = response.recurrent_state
+        return super().accept(response)
+
+    def restart(self, seed: int | None = None) -> None:
+        """Starts again at slot 0.
+
+        Args:
+            seed: a new seed. Default: the same seed.
+        """
+        self.recurrent_state = b""
+        self.step = 0
+        if seed is not None:
+            self.seed = seed
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        return None
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self.policy}, step {self.step}>"
+
+
+class ActStream:
+    """Slots of many fleets on one stream. Requests can be sent before earlier ones are answered; answers keep their order.
+
+    When the connection ends, the stream opens again and sends what has no answer yet. A stream is used by one task or thread.
+
+    Example:
+        >>> with client.stream() as stream:
+        ...     for fleet, scene in zip(fleets, scenes):
+        ...         stream.send(fleet, scene)
+        ...     decisions = [stream.receive() for _ in fleets]
+    """
+
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
+        self._raw: RawStream | None = None
+        self._pending: deque[tuple[Fleet, pb.ActRequest]] = deque()
+
+    @property
+    def pending(self) -> int:
+        """Number of requests without an answer."""
+        return len(self._pending)
+
+    def act(self, fleet: Fleet, observation: Observation, *, q_values: bool = False) -> Decision:
+        """Sends one slot and returns its answer. As `act` of the fleet.
+
+        Raises:
+            RuntimeError: other requests wait for their answers.
+        """
+        if self._pending:
+            raise RuntimeError("requests wait for their answers; receive them first")
+        self.send(fleet, observation, q_values=q_values)
+        return self.receive()
+
+    def send(self, fleet: Fleet, observation: Observation, *, q_values: bool = False) -> None:
+        """Sends the slot of a fleet without waiting for the answer.
+
+        Raises:
+            RuntimeError: the fleet waits for an answer.
+        """
+        if any(waiting is fleet for waiting, _ in self._pending):
+            raise RuntimeError(f"{fleet!r} waits for an answer; receive it first")
+        request = fleet.request(observation, q_values=q_values)
+        self._pending.append((fleet, request))
+        if self._raw is None:
+            self._raw = self._transport.open_stream(ACT_STREAM)
+        self._raw.write(request)
+
+    def receive(self, timeout: float | None = None) -> Decision:
+        """Returns the answer to the oldest request without one.
+
+        Args:
+            timeout: seconds for all attempts. Default: that of the client.
+
+        Raises:
+            RuntimeError: there is no request without an answer.
+            QedgixError: as `act` of the fleet. The stream goes on with the next request. After DeadlineExceeded, Unavailable
+                or ResourceExhausted the fleet is still in its slot.
+        """
+        if not self._pending:
+            raise RuntimeError("there is no request without an answer")
+        settings = self._transport.settings
+        deadline = monotonic() + (settings.timeout if timeout is None else timeout)
+        attempt = 1
+        while True:
+            failure: QedgixError
+            broken = True
+            try:
+                if self._raw is None:
+                    self._resend()
+                assert self._raw is not None
+                result = self._raw.read(settings.retry.limit(deadline - monotonic()))
+            except TimeoutError:
+                failure = DeadlineExceeded("no answer in time", code="deadline_exceeded")
+            except EOFError:
+                failure = Unavailable("the stream has ended", code="unavailable")
+            except grpc.RpcError as error:
+                failure = from_grpc(error)
+            else:
+                if result.WhichOneof("result") == "response":
+                    fleet, _ = self._pending.popleft()
+                    return fleet.accept(result.response)
+                failure, broken = from_act_error(result.error), False
+            wait = settings.retry.wait(failure, attempt, deadline - monotonic())
+            # A request that was refused is sent again on a new stream, because later ones keep their order.
+            if broken or wait is not None:
+                self._drop()
+            if wait is None:
+                self._pending.popleft()
+                raise failure
+            sleep(wait)
+            attempt += 1
+
+    def _resend(self) -> None:
+        self._raw = self._transport.open_stream(ACT_STREAM)
+        for _, request in self._pending:
+            self._raw.write(request)
+
+    def _drop(self) -> None:
+        if self._raw is not None:
+            self._raw.close()
+        self._raw = None
+
+    def close(self) -> None:
+        """Ends the stream. Requests without an answer are forgotten; their fleets are still in their slots."""
+        self._drop()
+        self._pending.clear()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def act_batch(
+    transport: Transport,
+    slots: list[tuple[Fleet, Observation]],
+    q_values: bool,
+    timeout: float | None,
+) -> list[Decision | QedgixError]:
+    """See `Client.act_batch`."""
+    if len({id(fleet) for fleet, _ in slots}) < len(slots):
+        raise InvalidArgument("a fleet has several slots in one batch", code="invalid_argument", field="slots")
+    deadline = monotonic() + (transport.settings.timeout if timeout is None else timeout)
+    requests = [fleet.request(observation, q_values=q_values) for fleet, observation in slots]
+    results: list[Decision | QedgixError | None] = [None] * len(slots)
+    open_slots = list(range(len(slots)))
+    attempt = 1
+    while open_slots:
+        batch = pb.ActBatchRequest(requests=[requests[i] for i in open_slots])
+        response = transport.call(ACT_BATCH, batch, deadline - monotonic())
+        again: list[int] = []
+        wait = 0.0
+        for i, result in zip(open_slots, response.results):
+            if result.WhichOneof("result") == "response":
+                results[i] = slots[i][0].accept(result.response)
+                continue
+            failure = results[i] = from_act_error(result.error)
+            pause = transport.settings.retry.wait(failure, attempt, deadline - monotonic())
+            if pause is not None:
+                again.append(i)
+                wait = max(wait, pause)
+        if again:
+            sleep(wait)
+        open_slots = again
+        attempt += 1
+    return [result for result in results if result is not None]

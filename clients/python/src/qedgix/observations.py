@@ -1,0 +1,278 @@
+"""What a fleet observes in a slot, from arrays or from dicts: a `Scene` or a `Graph`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .errors import invalid
+from .v1 import policy_pb2 as pb
+
+__all__ = ["Graph", "Observation", "Scene"]
+
+Points: TypeAlias = ArrayLike | Mapping[str, Sequence[float]]
+Numbers: TypeAlias = ArrayLike | Mapping[str, float]
+
+
+class Scene:
+    """Absolute positions of all UAVs and users, from which the server derives who detects whom.
+
+    Args:
+        uavs: positions of the M UAVs in units of the side of the square: an array (M, 2), or a mapping from id to (x, y).
+        users: positions of the N users: an array (N, 2), or a mapping from id to (x, y).
+        aoi: AoI of the users in slots: an array (N,) in the order of `users`, or a mapping from id. Default: 0.
+        uav_ids: ids of the UAVs, if `uavs` is an array. Default: uav-0, uav-1, ... A UAV has the same id in every slot.
+        user_ids: ids of the users, if `users` is an array. Default: user-0, user-1, ...
+
+    Raises:
+        InvalidArgument: an array has another shape, or ids do not fit. The server checks the values.
+
+    Example:
+        >>> Scene(uavs={"a": (0.5, 0.5)}, users={"u1": (0.2, 0.3), "u2": (0.6, 0.7)}, aoi={"u1": 4, "u2": 0})
+        <Scene: 1 UAVs, 2 users>
+    """
+
+    __slots__ = ("_aoi", "_uav_ids", "_uavs", "_user_ids", "_users")
+
+    def __init__(
+        self,
+        uavs: Points,
+        users: Points,
+        aoi: Numbers | None = None,
+        *,
+        uav_ids: Sequence[str] | None = None,
+        user_ids: Sequence[str] | None = None,
+    ) -> None:
+        self._uav_ids, self._uavs = _points("scene.uavs", uavs, uav_ids, "uav")
+        self._user_ids, self._users = _points("scene.users", users, user_ids, "user")
+        self._aoi = [0.0] * len(self._user_ids) if aoi is None else _numbers("scene.aoi", aoi, self._user_ids)
+
+    def fill(self, scene: pb.Scene) -> None:
+        """Writes the scene to a message."""
+        add_uav, add_user = scene.uavs.add, scene.users.add
+        for name, (x, y) in zip(self._uav_ids, self._uavs):
+            add_uav(id=name, x=x, y=y)
+        for name, (x, y), aoi in zip(self._user_ids, self._users, self._aoi):
+            add_user(id=name, x=x, y=y, aoi=aoi)
+
+    def message(self) -> pb.Scene:
+        """The message of the protocol."""
+        scene = pb.Scene()
+        self.fill(scene)
+        return scene
+
+    def __repr__(self) -> str:
+        return f"<Scene: {len(self._uavs)} UAVs, {len(self._users)} users>"
+
+
+class Graph:
+    """What each UAV detects. The server derives what users detect.
+
+    Args:
+        detections: for each UAV, by id, the nodes that it detects: a mapping from the id of the target to its position
+            relative to the UAV, (x, y) in units of the side of the square.
+        aoi: AoI of every user of the fleet in slots, by id, also of users that no UAV detects.
+        positions: position (x, y) of each UAV by id, for policies that need their own position. Default: none.
+
+    Raises:
+        InvalidArgument: an id is unknown, or a position is not two numbers.
+
+    Example:
+        >>> Graph({"a": {"b": (0.1, 0.0), "u1": (0.0, -0.2)}, "b": {}}, aoi={"u1": 3, "u2": 0})
+        <Graph: 2 UAVs, 2 users>
+    """
+
+    __slots__ = ("_message",)
+
+    def __init__(
+        self,
+        detections: Mapping[str, Mapping[str, Sequence[float]]],
+        aoi: Mapping[str, float],
+        positions: Mapping[str, Sequence[float]] | None = None,
+    ) -> None:
+        message = pb.Graph()
+        for name, targets in detections.items():
+            node = message.nodes.add(id=name, kind=pb.NODE_KIND_UAV)
+            if positions is not None:
+                x, y = _pair(f"graph.positions[{name}]", positions.get(name))
+                node.position.x, node.position.y = x, y
+            for target, relative in targets.items():
+                x, y = _pair(f"graph.detections[{name}][{target}]", relative)
+                detection = node.detections.add(target_id=target, rel_x=x, rel_y=y)
+                if target in aoi:
+                    detection.aoi = float(aoi[target])
+                elif target not in detections:
+                    raise invalid("graph.detections", target, "the id of a UAV or of a user in `aoi`")
+        for name, age in aoi.items():
+            message.nodes.add(id=name, kind=pb.NODE_KIND_USER, aoi=float(age))
+        self._message = message
+
+    @classmethod
+    def from_arrays(
+        cls,
+        edge_index: ArrayLike,
+        edge_relative: ArrayLike,
+        aoi: ArrayLike,
+        *,
+        uavs: int | None = None,
+        positions: ArrayLike | None = None,
+        uav_ids: Sequence[str] | None = None,
+        user_ids: Sequence[str] | None = None,
+    ) -> Graph:
+        """A graph of M UAVs and N users from arrays.
+
+        Args:
+            edge_index: (E, 2) integers: node `edge_index[e, 0]`, a UAV, detects node `edge_index[e, 1]`. UAVs are nodes 0 to
+                M - 1, users are nodes M to M + N - 1.
+            edge_relative: (E, 2): position of the target minus position of the UAV, in units of the side of the square.
+            aoi: (N,) AoI of every user in slots.
+            uavs: M. Default: from `positions` or `uav_ids`, one of which is then required.
+            positions: (M, 2) positions of the UAVs, for policies that need their own position.
+            uav_ids: default uav-0, uav-1, ...
+            user_ids: default user-0, user-1, ...
+
+        Raises:
+            InvalidArgument: an array has another shape, or an index is out of range.
+        """
+        places = None if positions is None else _rows("graph.positions", positions)
+        given = uavs if uavs is not None else len(places) if places is not None else len(uav_ids or ())
+        names = _ids("graph.uav_ids", uav_ids, given, "uav")
+        if places is not None and len(places) != given:
+            raise invalid("graph.positions", len(places), f"{given} rows, one per UAV")
+        ages = np.asarray(aoi, np.float64)
+        if ages.ndim != 1:
+            raise invalid("graph.aoi", ages.shape, "shape (N,)")
+        users = _ids("graph.user_ids", user_ids, len(ages), "user")
+        ids = [*names, *users]
+        index = np.asarray(edge_index, np.int64).reshape(-1, 2)
+        relative = _rows("graph.edge_relative", np.asarray(edge_relative, np.float64).reshape(-1, 2))
+        if len(index) != len(relative):
+            raise invalid("graph.edge_relative", len(relative), f"{len(index)} rows, one per row of edge_index")
+        detections: dict[str, dict[str, list[float]]] = {name: {} for name in names}
+        for (source, target), pair in zip(index.tolist(), relative):
+            if not 0 <= source < given:
+                raise invalid("graph.edge_index", source, f"the index of a UAV, 0 to {given - 1}")
+            if not 0 <= target < len(ids):
+                raise invalid("graph.edge_index", target, f"the index of a node, 0 to {len(ids) - 1}")
+            detections[ids[source]][ids[target]] = pair
+        return cls(
+            detections,
+            dict(zip(users, ages.tolist())),
+            None if places is None else dict(zip(names, places)),
+        )
+
+    def message(self) -> pb.Graph:
+        """The message of the protocol."""
+        return self._message
+
+    def __repr__(self) -> str:
+        uavs = sum(node.kind == pb.NODE_KIND_UAV for node in self._message.nodes)
+        return f"<Graph: {uavs} UAVs, {len(self._message.nodes) - uavs} users>"
+
+
+Observation: TypeAlias = Scene | Graph | pb.Scene | pb.Graph | Mapping[str, Any]
+"""What `act` accepts: a `Scene`, a `Graph`, their messages (such as the scenes of a hosted environment), or a dict with the
+fields of the message: `{"uavs": [...], "users": [...]}` or `{"nodes": [...]}`, as in JSON."""
+
+
+def put(observation: Observation, request: pb.ActRequest) -> None:
+    """Sets the observation of a request."""
+    if isinstance(observation, Scene):
+        return observation.fill(request.scene)
+    message: pb.Scene | pb.Graph
+    if isinstance(observation, Graph):
+        message = observation.message()
+    elif isinstance(observation, (pb.Scene, pb.Graph)):
+        message = observation
+    elif isinstance(observation, Mapping):
+        message = _from_dict(observation)
+    else:
+        raise invalid(
+            "observation",
+            type(observation).__name__,
+            "a Scene, a Graph, or a dict with uavs and users, or nodes",
+        )
+    if isinstance(message, pb.Scene):
+        request.scene.CopyFrom(message)
+    else:
+        request.graph.CopyFrom(message)
+
+
+def _from_dict(fields: Mapping[str, Any]) -> pb.Scene | pb.Graph:
+    try:
+        if "nodes" not in fields:
+            return pb.Scene(**fields)
+        kinds = {"uav": pb.NODE_KIND_UAV, "user": pb.NODE_KIND_USER}
+        nodes = [{**node, "kind": kinds.get(node.get("kind", ""), node.get("kind"))} for node in fields["nodes"]]
+        return pb.Graph(**{**fields, "nodes": nodes})
+    except (TypeError, ValueError, AttributeError) as error:
+        name = "graph" if "nodes" in fields else "scene"
+        raise invalid(name, error, f"the fields of qedgix.v1.{name.title()}") from None
+
+
+_DEFAULT_IDS: dict[str, list[str]] = {"uav": [], "user": []}
+
+
+def default_ids(prefix: str, count: int) -> list[str]:
+    """`prefix`-0, `prefix`-1, ..."""
+    known = _DEFAULT_IDS[prefix]
+    if len(known) < count:
+        known = _DEFAULT_IDS[prefix] = [f"{prefix}-{i}" for i in range(count)]
+    return known[:count]
+
+
+def _ids(field: str, given: Sequence[str] | None, count: int, prefix: str) -> Iterable[str]:
+    if given is None:
+        return default_ids(prefix, count)
+    if len(given) != count:
+        raise invalid(field, len(given), f"{count} ids")
+    return given
+
+
+def _rows(field: str, points: ArrayLike) -> list[list[float]]:
+    """The rows of an array (n, 2)."""
+    try:
+        array = np.asarray(points, np.float64)
+    except (TypeError, ValueError):
+        raise invalid(field, points, "numbers") from None
+    if array.ndim != 2 or array.shape[1] != 2:
+        raise invalid(field, array.shape, "shape (n, 2)")
+    rows: list[list[float]] = array.tolist()
+    return rows
+
+
+def _points(field: str, points: Points, ids: Sequence[str] | None, prefix: str) -> tuple[Sequence[str], list[Any]]:
+    """Ids, and a pair of numbers for each."""
+    if isinstance(points, Mapping):
+        if ids is not None:
+            raise invalid(field, "ids", "a mapping, or an array with ids")
+        return list(points), [_pair(f"{field}[{name}]", pair) for name, pair in points.items()]
+    rows = _rows(field, points)
+    return list(_ids(f"{field}.ids", ids, len(rows), prefix)), rows
+
+
+def _pair(field: str, pair: Any) -> tuple[float, float]:
+    try:
+        x, y = pair
+        return float(x), float(y)
+    except (TypeError, ValueError):
+        raise invalid(field, pair, "two numbers (x, y)") from None
+
+
+def _numbers(field: str, numbers: Numbers, ids: Sequence[str]) -> list[float]:
+    """One number per id."""
+    if isinstance(numbers, Mapping):
+        if len(numbers) != len(ids) or any(name not in numbers for name in ids):
+            raise invalid(field, sorted(numbers), f"the ids {sorted(ids)}")
+        return [float(numbers[name]) for name in ids]
+    try:
+        array = np.asarray(numbers, np.float64)
+    except (TypeError, ValueError):
+        raise invalid(field, numbers, "numbers") from None
+    if array.shape != (len(ids),):
+        raise invalid(field, array.shape, f"shape ({len(ids)},)")
+    values: list[float] = array.tolist()
+    return values
