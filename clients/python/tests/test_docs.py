@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from conftest import BINARY, ROOT
 
-PAGES = ["docs/simulators.md", "clients/python/README.md"]
+PAGES = ["docs/simulators.md", "docs/learners.md", "clients/python/README.md"]
 
 
 def blocks(page: str) -> list[tuple[str, str]]:

@@ -46,6 +46,11 @@ def test_training_job(server, tmp_path):
         assert client.policies.aliases("example") == {"live": 1}
 
 
+def test_learner(server, tmp_path):
+    before, after = numbers(run("learner.py", server.grpc, "--iterations", "8", "--candidates", "64", cwd=tmp_path))[-2:]
+    assert after < before / 2
+
+
 @pytest.fixture(autouse=True)
 def _no_bytecode(monkeypatch):
     monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")

@@ -22,6 +22,7 @@ from ._sync.environments import Environment
 from ._sync.jobs import Job, Jobs
 from ._sync.policies import Policies
 from ._sync.sessions import ActStream, Fleet, LocalSession, Session
+from .environments import fleet_env, parallel_env, vector_env
 from .errors import (
     AlreadyExists,
     DeadlineExceeded,
@@ -112,4 +113,7 @@ __all__ = [
     "Unauthenticated",
     "Unavailable",
     "directions",
+    "fleet_env",
+    "parallel_env",
+    "vector_env",
 ]

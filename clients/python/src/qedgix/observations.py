@@ -216,7 +216,7 @@ def _from_dict(fields: Mapping[str, Any]) -> pb.Scene | pb.Graph:
 _DEFAULT_IDS: dict[str, list[str]] = {"uav": [], "user": []}
 
 
-def default_ids(prefix: str, count: int) -> list[str]:
+def _default_ids(prefix: str, count: int) -> list[str]:
     """`prefix`-0, `prefix`-1, ..."""
     known = _DEFAULT_IDS[prefix]
     if len(known) < count:
@@ -226,7 +226,7 @@ def default_ids(prefix: str, count: int) -> list[str]:
 
 def _ids(field: str, given: Sequence[str] | None, count: int, prefix: str) -> Iterable[str]:
     if given is None:
-        return default_ids(prefix, count)
+        return _default_ids(prefix, count)
     if len(given) != count:
         raise invalid(field, len(given), f"{count} ids")
     return given

@@ -254,23 +254,24 @@ class EnvironmentState:
         return [copy.graph for copy in self.message.copies]
 
     @cached_property
-    def _arrays(self) -> Arrays:
+    def arrays(self) -> Arrays:
+        """Positions and AoI of all copies."""
         return Arrays.of(self.scenes)
 
     @property
     def uavs(self) -> NDArray[np.float32]:
         """(B, M, 2) positions of the UAVs in units of the side of the square."""
-        return self._arrays.uavs
+        return self.arrays.uavs
 
     @property
     def users(self) -> NDArray[np.float32]:
         """(B, N, 2) positions of the users."""
-        return self._arrays.users
+        return self.arrays.users
 
     @property
     def aoi(self) -> NDArray[np.float32]:
         """(B, N) AoI of the users in slots."""
-        return self._arrays.aoi
+        return self.arrays.aoi
 
     @cached_property
     def rewards(self) -> NDArray[np.float32]:

@@ -109,9 +109,17 @@ class AsyncClient:
         request = pb.OpenSessionRequest(policy=policy, session_id=session_id or uuid.uuid4().hex, run_id=run_id, seed=seed)
         return AsyncSession(self._transport, request)
 
-    async def open_session(self, policy: str, *, timeout: float | None = None, **options: Any) -> AsyncSession:
+    async def open_session(
+        self,
+        policy: str,
+        *,
+        session_id: str | None = None,
+        run_id: str | None = None,
+        seed: int | None = None,
+        timeout: float | None = None,
+    ) -> AsyncSession:
         """Opens a session, which you close yourself. Arguments and errors: as `session` and `AsyncSession.open`."""
-        return await self.session(policy, **options).open(timeout)
+        return await self.session(policy, session_id=session_id, run_id=run_id, seed=seed).open(timeout)
 
     async def get_session(self, session_id: str) -> AsyncSession:
         """An open session, to continue it.
@@ -217,11 +225,19 @@ class AsyncClient:
         return AsyncEnvironment(self._transport, create_request(name, environment, count, seed, auto_reset))
 
     async def create_environment(
-        self, environment: Mapping[str, Any] | None = None, *, timeout: float | None = None, **options: Any
+        self,
+        environment: Mapping[str, Any] | None = None,
+        *,
+        count: int = 1,
+        seed: int = 0,
+        auto_reset: bool = False,
+        environment_id: str | None = None,
+        timeout: float | None = None,
     ) -> AsyncEnvironment:
         """Creates a hosted environment, which you delete yourself. Arguments and errors: as `environment` and
         `AsyncEnvironment.create`."""
-        return await self.environment(environment, **options).create(timeout)
+        made = self.environment(environment, count=count, seed=seed, auto_reset=auto_reset, environment_id=environment_id)
+        return await made.create(timeout)
 
     async def close(self) -> None:
         """Closes the connections. Sessions and environments stay on the server until they expire."""

@@ -110,9 +110,17 @@ class Client:
         request = pb.OpenSessionRequest(policy=policy, session_id=session_id or uuid.uuid4().hex, run_id=run_id, seed=seed)
         return Session(self._transport, request)
 
-    def open_session(self, policy: str, *, timeout: float | None = None, **options: Any) -> Session:
+    def open_session(
+        self,
+        policy: str,
+        *,
+        session_id: str | None = None,
+        run_id: str | None = None,
+        seed: int | None = None,
+        timeout: float | None = None,
+    ) -> Session:
         """Opens a session, which you close yourself. Arguments and errors: as `session` and `Session.open`."""
-        return self.session(policy, **options).open(timeout)
+        return self.session(policy, session_id=session_id, run_id=run_id, seed=seed).open(timeout)
 
     def get_session(self, session_id: str) -> Session:
         """An open session, to continue it.
@@ -218,11 +226,19 @@ class Client:
         return Environment(self._transport, create_request(name, environment, count, seed, auto_reset))
 
     def create_environment(
-        self, environment: Mapping[str, Any] | None = None, *, timeout: float | None = None, **options: Any
+        self,
+        environment: Mapping[str, Any] | None = None,
+        *,
+        count: int = 1,
+        seed: int = 0,
+        auto_reset: bool = False,
+        environment_id: str | None = None,
+        timeout: float | None = None,
     ) -> Environment:
         """Creates a hosted environment, which you delete yourself. Arguments and errors: as `environment` and
         `Environment.create`."""
-        return self.environment(environment, **options).create(timeout)
+        made = self.environment(environment, count=count, seed=seed, auto_reset=auto_reset, environment_id=environment_id)
+        return made.create(timeout)
 
     def close(self) -> None:
         """Closes the connections. Sessions and environments stay on the server until they expire."""
