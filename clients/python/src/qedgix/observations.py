@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from .errors import invalid
 from .v1 import policy_pb2 as pb
@@ -94,6 +94,8 @@ class Graph:
         positions: Mapping[str, Sequence[float]] | None = None,
     ) -> None:
         message = pb.Graph()
+        _texts("graph.uavs", detections)
+        _texts("graph.users", aoi)
         for name, targets in detections.items():
             node = message.nodes.add(id=name, kind=pb.NODE_KIND_UAV)
             if positions is not None:
@@ -103,11 +105,11 @@ class Graph:
                 x, y = _pair(f"graph.detections[{name}][{target}]", relative)
                 detection = node.detections.add(target_id=target, rel_x=x, rel_y=y)
                 if target in aoi:
-                    detection.aoi = float(aoi[target])
+                    detection.aoi = _number(f"graph.aoi[{target}]", aoi[target])
                 elif target not in detections:
                     raise invalid("graph.detections", target, "the id of a UAV or of a user in `aoi`")
         for name, age in aoi.items():
-            message.nodes.add(id=name, kind=pb.NODE_KIND_USER, aoi=float(age))
+            message.nodes.add(id=name, kind=pb.NODE_KIND_USER, aoi=_number(f"graph.aoi[{name}]", age))
         self._message = message
 
     @classmethod
@@ -139,20 +141,22 @@ class Graph:
         """
         places = None if positions is None else _rows("graph.positions", positions)
         given = uavs if uavs is not None else len(places) if places is not None else len(uav_ids or ())
-        names = _ids("graph.uav_ids", uav_ids, given, "uav")
+        names = _ids("graph.uavs", uav_ids, given, "uav")
         if places is not None and len(places) != given:
             raise invalid("graph.positions", len(places), f"{given} rows, one per UAV")
-        ages = np.asarray(aoi, np.float64)
-        if ages.ndim != 1:
-            raise invalid("graph.aoi", ages.shape, "shape (N,)")
-        users = _ids("graph.user_ids", user_ids, len(ages), "user")
+        ages = _column("graph.aoi", aoi, None)
+        users = _ids("graph.users", user_ids, len(ages), "user")
         ids = [*names, *users]
-        index = np.asarray(edge_index, np.int64).reshape(-1, 2)
-        relative = _rows("graph.edge_relative", np.asarray(edge_relative, np.float64).reshape(-1, 2))
+        # No edges are an array without a second dimension.
+        index, relative = (
+            _rows(field, edges) if np.size(edges) else []
+            for field, edges in (("graph.edge_index", edge_index), ("graph.edge_relative", edge_relative))
+        )
         if len(index) != len(relative):
             raise invalid("graph.edge_relative", len(relative), f"{len(index)} rows, one per row of edge_index")
         detections: dict[str, dict[str, list[float]]] = {name: {} for name in names}
-        for (source, target), pair in zip(index.tolist(), relative):
+        for (source, target), pair in zip(index, relative):
+            source, target = int(source), int(target)
             if not 0 <= source < given:
                 raise invalid("graph.edge_index", source, f"the index of a UAV, 0 to {given - 1}")
             if not 0 <= target < len(ids):
@@ -160,7 +164,7 @@ class Graph:
             detections[ids[source]][ids[target]] = pair
         return cls(
             detections,
-            dict(zip(users, ages.tolist())),
+            dict(zip(users, ages)),
             None if places is None else dict(zip(names, places)),
         )
 
@@ -213,45 +217,71 @@ def _from_dict(fields: Mapping[str, Any]) -> pb.Scene | pb.Graph:
         raise invalid(name, error, f"the fields of qedgix.v1.{name.title()}") from None
 
 
-_DEFAULT_IDS: dict[str, list[str]] = {"uav": [], "user": []}
+_DEFAULT_IDS: dict[tuple[str, int], tuple[str, ...]] = {}
 
 
-def _default_ids(prefix: str, count: int) -> list[str]:
+def _default_ids(prefix: str, count: int) -> tuple[str, ...]:
     """`prefix`-0, `prefix`-1, ..."""
-    known = _DEFAULT_IDS[prefix]
-    if len(known) < count:
-        known = _DEFAULT_IDS[prefix] = [f"{prefix}-{i}" for i in range(count)]
-    return known[:count]
+    known = _DEFAULT_IDS.get((prefix, count))
+    if known is None:
+        known = tuple(f"{prefix}-{i}" for i in range(count))
+        # A fleet has few sizes; a caller with many does not fill the memory.
+        if len(_DEFAULT_IDS) < 64:
+            _DEFAULT_IDS[prefix, count] = known
+    return known
 
 
-def _ids(field: str, given: Sequence[str] | None, count: int, prefix: str) -> Iterable[str]:
+def _ids(field: str, given: Sequence[str] | None, count: int, prefix: str) -> Sequence[str]:
     if given is None:
         return _default_ids(prefix, count)
     if len(given) != count:
-        raise invalid(field, len(given), f"{count} ids")
-    return given
+        raise invalid(f"{field}.ids", len(given), f"{count} ids")
+    return _texts(field, given)
+
+
+def _texts(field: str, ids: Iterable[str]) -> Sequence[str]:
+    for name in ids:
+        if not isinstance(name, str):
+            raise invalid(f"{field}.ids", repr(name), "a str")
+    return tuple(ids)
+
+
+def _array(values: ArrayLike, field: str) -> NDArray[Any]:
+    """An array of numbers. What simulators send is one already."""
+    if type(values) is np.ndarray and values.dtype.kind in "fiu":
+        return values
+    try:
+        return np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        raise invalid(field, values, "numbers") from None
 
 
 def _rows(field: str, points: ArrayLike) -> list[list[float]]:
     """The rows of an array (n, 2)."""
-    try:
-        array = np.asarray(points, np.float64)
-    except (TypeError, ValueError):
-        raise invalid(field, points, "numbers") from None
+    array = _array(points, field)
     if array.ndim != 2 or array.shape[1] != 2:
         raise invalid(field, array.shape, "shape (n, 2)")
     rows: list[list[float]] = array.tolist()
     return rows
 
 
+def _column(field: str, numbers: ArrayLike, count: int | None) -> list[float]:
+    """The values of an array (count,)."""
+    array = _array(numbers, field)
+    if array.ndim != 1 or count not in (None, len(array)):
+        raise invalid(field, array.shape, f"shape ({'n' if count is None else count},)")
+    values: list[float] = array.tolist()
+    return values
+
+
 def _points(field: str, points: Points, ids: Sequence[str] | None, prefix: str) -> tuple[Sequence[str], list[Any]]:
     """Ids, and a pair of numbers for each."""
-    if isinstance(points, Mapping):
+    if type(points) is not np.ndarray and isinstance(points, Mapping):
         if ids is not None:
             raise invalid(field, "ids", "a mapping, or an array with ids")
-        return list(points), [_pair(f"{field}[{name}]", pair) for name, pair in points.items()]
-    rows = _rows(field, points)
-    return list(_ids(f"{field}.ids", ids, len(rows), prefix)), rows
+        return _texts(field, points), [_pair(f"{field}[{name}]", pair) for name, pair in points.items()]
+    rows = _rows(field, cast("ArrayLike", points))
+    return _ids(field, ids, len(rows), prefix), rows
 
 
 def _pair(field: str, pair: Any) -> tuple[float, float]:
@@ -262,17 +292,17 @@ def _pair(field: str, pair: Any) -> tuple[float, float]:
         raise invalid(field, pair, "two numbers (x, y)") from None
 
 
+def _number(field: str, number: Any) -> float:
+    try:
+        return float(number)
+    except (TypeError, ValueError):
+        raise invalid(field, number, "a number") from None
+
+
 def _numbers(field: str, numbers: Numbers, ids: Sequence[str]) -> list[float]:
     """One number per id."""
-    if isinstance(numbers, Mapping):
+    if type(numbers) is not np.ndarray and isinstance(numbers, Mapping):
         if len(numbers) != len(ids) or any(name not in numbers for name in ids):
-            raise invalid(field, sorted(numbers), f"the ids {sorted(ids)}")
-        return [float(numbers[name]) for name in ids]
-    try:
-        array = np.asarray(numbers, np.float64)
-    except (TypeError, ValueError):
-        raise invalid(field, numbers, "numbers") from None
-    if array.shape != (len(ids),):
-        raise invalid(field, array.shape, f"shape ({len(ids)},)")
-    values: list[float] = array.tolist()
-    return values
+            raise invalid(field, sorted(map(str, numbers)), f"the ids {sorted(ids)}")
+        return [_number(f"{field}[{name}]", numbers[name]) for name in ids]
+    return _column(field, cast("ArrayLike", numbers), len(ids))

@@ -75,19 +75,24 @@ class Timings(NamedTuple):
 class Decision:
     """The headings of one fleet for one slot, in the order of the UAVs in the observation."""
 
+    __slots__ = ("_headings", "message")
+
     def __init__(self, message: policy_pb2.ActResponse) -> None:
         self.message = message
         """The message of the protocol."""
+        self._headings: NDArray[np.int64] | None = None
 
-    @cached_property
+    @property
     def uav_ids(self) -> list[str]:
         """Ids of the M UAVs."""
         return [action.uav_id for action in self.message.actions]
 
-    @cached_property
+    @property
     def headings(self) -> NDArray[np.int64]:
         """(M,) heading indices: h is the direction 45 h degrees counter-clockwise from +x; 8 is hover."""
-        return np.array([action.heading_index for action in self.message.actions], np.int64)
+        if self._headings is None:
+            self._headings = np.array([action.heading_index for action in self.message.actions], np.int64)
+        return self._headings
 
     @property
     def degrees(self) -> Floats:

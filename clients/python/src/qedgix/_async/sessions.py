@@ -119,7 +119,11 @@ class AsyncSession(AsyncFleet):
 
     def request(self, observation: Observation, *, q_values: bool = False) -> pb.ActRequest:
         """The request of this slot."""
-        request = pb.ActRequest(session_id=self.id, step=self.step, run_id=self._run_id, return_q_values=q_values)
+        request = pb.ActRequest(session_id=self.id, step=self.step)
+        if self._run_id is not None:
+            request.run_id = self._run_id
+        if q_values:
+            request.return_q_values = True
         put(observation, request)
         return request
 
