@@ -47,7 +47,9 @@ const GRPC: &[(&str, &str, Requirement)] = &[
 /// HTTP method, routes as they are registered and their requirement. `HEAD` counts as `GET`.
 const REST: &[(&str, &str, Requirement)] = &[
     ("GET", "/livez /readyz /openapi.json /docs /docs/{file} /v2/health/live /v2/health/ready", OPEN),
-    ("GET", "/ /metrics", READ),
+    // The dashboard has no data of its own; its requests have the key of its reader.
+    ("GET", "/ /ui/{file}", OPEN),
+    ("GET", "/metrics", READ),
     ("POST", "/v1/act /v1/sessions", ACT),
     ("GET", "/v1/sessions /v1/sessions/{id}", READ),
     ("DELETE", "/v1/sessions/{id}", ACT),

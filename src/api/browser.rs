@@ -46,10 +46,23 @@ impl AllowedHosts {
             let expected = "localhost, a loopback address, the address that the server listens on, or a name of --allow-host";
             return Err(Error::CrossSite(Invalid::new("host", format!("{:?}", named.host), expected)));
         }
+        if opens_a_page(request) {
+            return Ok(());
+        }
         check_origin(request.headers(), |origin| {
             self.names.contains(&origin.host) || named.as_ref().is_some_and(|named| origin.same_as(named))
         })
     }
+}
+
+/// Whether a browser opens the dashboard or the viewer of the OpenAPI document, for instance by a link in a message. Such pages may be
+/// opened from anywhere: they have no data of their own, and the page with the link can neither read nor embed them.
+fn opens_a_page<B>(request: &Request<B>) -> bool {
+    let is = |name: &str, value: &str| request.headers().get(name).is_some_and(|found| found == value);
+    *request.method() == Method::GET
+        && matches!(request.uri().path(), "/" | "/docs")
+        && is("sec-fetch-mode", "navigate")
+        && is("sec-fetch-dest", "document")
 }
 
 /// Checks a gRPC call to a server without keys. Browsers cannot speak gRPC, so only their headers are checked, not the host.
@@ -168,10 +181,18 @@ const NOTHING: &str = "default-src 'none'; frame-ancestors 'none'; base-uri 'non
 const VIEWER: &str = "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; \
                       connect-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
 
+/// What the dashboard loads: its own files and responses of this server. It saves files through addresses of the page itself.
+const DASHBOARD: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; \
+                         frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
+
 /// Adds the headers that keep browsers from guessing content types and other sites from embedding responses. `route`: the route
 /// of the request.
 pub(super) fn add_headers(route: &str, headers: &mut HeaderMap) {
-    let policy = if route == "/docs" || route.starts_with("/docs/") { VIEWER } else { NOTHING };
+    let policy = match route {
+        "/docs" | "/docs/{file}" => VIEWER,
+        "/" | "/ui/{file}" => DASHBOARD,
+        _ => NOTHING,
+    };
     headers.insert(header::CONTENT_SECURITY_POLICY, HeaderValue::from_static(policy));
     headers.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
     headers.insert(header::X_FRAME_OPTIONS, HeaderValue::from_static("DENY"));
@@ -222,6 +243,17 @@ mod tests {
         assert!(refused(&hosts("0.0.0.0"), &[("host", "other.example")]).is_some());
         assert!(refused(&hosts("127.0.0.1"), &[]).is_some(), "HTTP/1.1 requires a host");
         assert!(refused(&hosts("127.0.0.1"), &[("host", "localhost"), ("host", "other.example")]).is_some());
+    }
+
+    #[test]
+    fn links_on_other_pages_open_the_dashboard_and_nothing_else() {
+        let of = |path: &str, mode: &str, dest: &str| {
+            let request = Request::get(path).header("host", "localhost").header("sec-fetch-site", "cross-site");
+            let request = request.header("sec-fetch-mode", mode).header("sec-fetch-dest", dest);
+            hosts("127.0.0.1").check(&request.body(()).unwrap()).is_ok()
+        };
+        assert!(of("/", "navigate", "document") && of("/docs", "navigate", "document"));
+        assert!(!of("/", "navigate", "iframe") && !of("/", "no-cors", "script") && !of("/v1/jobs", "navigate", "document"));
     }
 
     #[test]

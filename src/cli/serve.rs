@@ -221,7 +221,9 @@ fn refuse_huge_pages() {
 fn print_start(config: &Config, endpoints: Endpoints) -> Result<(), OutputError> {
     outln!("qedgix {}", env!("CARGO_PKG_VERSION"))?;
     outln!("gRPC  {}", endpoints.grpc)?;
-    outln!("REST  {}://{}", if config.tls.is_some() { "https" } else { "http" }, endpoints.http)?;
+    let scheme = if config.tls.is_some() { "https" } else { "http" };
+    outln!("REST  {scheme}://{}", endpoints.http)?;
+    outln!("page  {scheme}://{}/", endpoints.http)?;
     outln!("data  {}", config.data_dir.display())
 }
 

@@ -3,6 +3,7 @@
 
 mod act;
 mod config_schemas;
+mod dashboard;
 mod environments;
 mod events;
 pub mod extract;
@@ -40,6 +41,7 @@ pub fn router(app: Arc<App>, metrics: fn() -> String, max_body: usize, hosts: Al
     // The OpenAPI document contains the routes that are merged here.
     let (router, document) = OpenApiRouter::with_openapi(openapi::document())
         .merge(ops::router())
+        .merge(dashboard::router())
         .merge(act::router())
         .merge(sessions::router())
         .merge(policies::router())

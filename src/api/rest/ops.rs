@@ -1,13 +1,11 @@
-//! Operations: probes, metrics, the index of endpoints, the OpenAPI document and its viewer.
+//! Operations: probes, metrics, the OpenAPI document and its viewer.
 
 use std::sync::Arc;
 
 use axum::extract::State;
 use axum::http::header;
 use axum::response::{Html, IntoResponse, Response};
-use axum::{Extension, Json};
-use serde::Serialize;
-use utoipa::ToSchema;
+use axum::Extension;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
@@ -19,32 +17,12 @@ use crate::service::{App, Error, operations};
 /// The routes.
 pub(super) fn router() -> OpenApiRouter<Arc<App>> {
     OpenApiRouter::new()
-        .routes(routes!(index))
         .routes(routes!(live))
         .routes(routes!(ready))
         .routes(routes!(metrics))
         .routes(routes!(openapi))
         .routes(routes!(docs))
         .routes(routes!(docs_file))
-}
-
-#[derive(Serialize, ToSchema)]
-#[schema(as = Server)]
-struct Index {
-    name: &'static str,
-    version: &'static str,
-    /// Methods and paths.
-    #[schema(value_type = Vec<String>)]
-    endpoints: Arc<[String]>,
-}
-
-/// Name, version and endpoints of the server
-#[utoipa::path(
-    get, path = "/", operation_id = "index", tag = "operations",
-    responses((status = 200, description = "Name, version and endpoints.", body = Index))
-)]
-async fn index(Extension(description): Extension<Description>) -> Json<Index> {
-    Json(Index { name: "qedgix", version: env!("CARGO_PKG_VERSION"), endpoints: description.operations })
 }
 
 /// Whether the process is alive

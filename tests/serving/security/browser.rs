@@ -130,7 +130,8 @@ async fn bodies_need_a_content_type_that_pages_cannot_send() {
 async fn responses_tell_browsers_not_to_guess_types_and_not_to_embed_them() {
     let server = Server::start().await;
     for (path, viewer) in [
-        ("/", false),
+        ("/", true),
+        ("/ui/app.css", true),
         ("/v1/policies", false),
         ("/v1/nothing", false),
         ("/v2/nothing", false),
