@@ -78,7 +78,7 @@ function Theme({ redraw }) {
     aria-label=${`Theme: ${THEME_NAMES[theme]}. Change to ${THEME_NAMES[next]}.`}><${Icon} path=${THEME_ICONS[theme]} /></button>`;
 }
 
-function KeyDialog({ open, close, wanted }) {
+function KeyDialog({ open, close, wanted, refused }) {
   const dialog = useRef(null);
   const [key, set] = useState('');
   useEffect(() => {
@@ -90,18 +90,18 @@ function KeyDialog({ open, close, wanted }) {
   }, [open]);
   const save = (value) => {
     apiKey.set(value.trim());
-    close();
+    close(true);
     dispatchEvent(new Event('qedgix-key'));
   };
-  return html`<dialog ref=${dialog} onClose=${close} aria-labelledby="key-title">
+  return html`<dialog ref=${dialog} onCancel=${() => close(false)} aria-labelledby="key-title">
     <form onSubmit=${(e) => { e.preventDefault(); save(key); }}>
       <h2 id="key-title">API key</h2>
-      ${wanted && html`<p class="wrong">${apiKey.get() ? 'The server refuses this key: it is wrong, expired or revoked.' : 'This server requires an API key.'}</p>`}
+      ${wanted && html`<p class="wrong">${refused ? 'The server refuses this key: it is wrong, expired or revoked.' : 'This server requires an API key.'}</p>`}
       <p>The key stays in this tab and is sent to this server only. <code>qedgix keys create --name me --scopes read,act,jobs</code> makes one.</p>
       <label class="field"><span class="field-label">Key</span><input type="password" autocomplete="off" value=${key} placeholder="qdx_…" onInput=${(e) => set(e.target.value)} /></label>
       <div class="dialog-actions">
         ${apiKey.get() && html`<button type="button" onClick=${() => save('')}>Forget the key</button>`}
-        <button type="button" onClick=${close}>Cancel</button><button class="primary">Use this key</button></div>
+        <button type="button" onClick=${() => close(false)}>Cancel</button><button class="primary">Use this key</button></div>
     </form></dialog>`;
 }
 
@@ -163,10 +163,14 @@ function App() {
   const route = useRoute();
   const [keyOpen, setKeyOpen] = useState(false);
   const [wanted, setWanted] = useState(false);
+  const [keys, setKeys] = useState(0);
+  // Who closes the dialog without a key is not asked again by every request that fails.
+  const declined = useRef(false);
   const [, redraw] = useState(0);
   const status = useLoad(loadStatus, [], 5);
   useEffect(() => {
     const want = () => {
+      if (declined.current) return;
       setWanted(true);
       setKeyOpen(true);
     };
@@ -176,6 +180,12 @@ function App() {
   useEffect(() => {
     scrollTo(0, 0);
   }, [route.parts.join('/')]);
+  const closeKey = (changed) => {
+    declined.current = !changed;
+    setKeyOpen(false);
+    setWanted(false);
+    if (changed) setKeys(keys + 1);
+  };
   const current = { submit: 'jobs' }[route.parts[0]] ?? route.parts[0] ?? 'jobs';
   const skip = (e) => {
     e.preventDefault();
@@ -190,8 +200,8 @@ function App() {
       <button type="button" class="quiet" onClick=${() => { setWanted(false); setKeyOpen(true); }} title="API key" aria-label=${apiKey.get() ? 'API key: set' : 'API key: not set'}><${Icon} path="M7 14a4 4 0 1 1 3.9-5H21v4h-2v3h-4v-3h-4.1A4 4 0 0 1 7 14z" /></button>
       <${Theme} redraw=${() => redraw((n) => n + 1)} />
     </header>
-    <main id="main"><${Page} route=${route} /></main>
-    <${KeyDialog} open=${keyOpen} wanted=${wanted} close=${() => setKeyOpen(false)} />
+    <main id="main"><${Page} key=${keys} route=${route} /></main>
+    <${KeyDialog} open=${keyOpen} wanted=${wanted} refused=${apiKey.get() !== ''} close=${closeKey} />
     <${Question} /><${Messages} />`;
 }
 

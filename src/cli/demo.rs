@@ -116,9 +116,10 @@ async fn run_in(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
     outln!("Finished in {:.0} s.", begin.elapsed().as_secs_f64())?;
     if args.keep {
         outln!(
-            "\nThe server keeps running: gRPC {}, REST http://{} (try /v1/jobs, /v1/policies). Stop it with ctrl-c.",
+            "\nThe server keeps running: gRPC {}, REST http://{http}. The dashboard is http://{http}/, and the trained policy flies beside \
+             qedgix at http://{http}/#/player?policy={policy}&against=qedgix. Stop it with ctrl-c.",
             server.grpc,
-            server.http
+            http = server.http
         )?;
         tokio::signal::ctrl_c().await?;
     }
