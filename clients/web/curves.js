@@ -3,6 +3,7 @@
 import { html, useEffect, useMemo, useRef, useState } from './htm-preact-3.1.1.js';
 import { get } from './api.js';
 import { Chart, mean, smooth } from './chart.js';
+import { Parallel, results, Table } from './compare.js';
 import { flatten, METRICS, metricName, setting } from './format.js';
 import { styles } from './palette.js';
 import { setOptions } from './route.js';
@@ -12,6 +13,8 @@ import { Card, Choice, Empty, ErrorBox, Field } from './ui.js';
 export const MOST = 24;
 /** Seconds between two requests for new rows of a running job. */
 const REFRESH = 2;
+
+const VIEWS = [['curves', 'Curves'], ['table', 'Table'], ['parallel', 'Parallel coordinates']];
 
 const configurations = new Map();
 
@@ -141,19 +144,24 @@ export function Curves({ jobs, options }) {
   });
   const drawn = curves.filter((curve) => curve.x.length);
   const banded = drawn.some((curve) => curve.low);
+  const view = VIEWS.some(([id]) => id === options.get('view')) ? options.get('view') : 'curves';
+  const compared = view === 'curves' ? [] : results(shown, fields, rows, metric);
   const names = METRICS[metric] ? Object.keys(METRICS) : [metric, ...Object.keys(METRICS)];
-  return html`<${Card} title="Curves" class="curves">
+  const views = html`<span class="toggles">${VIEWS.map(([id, name]) => html`<button type="button" class="small" aria-pressed=${String(view === id)} onClick=${() => setOptions({ view: id === 'curves' ? '' : id })}>${name}</button>`)}</span>`;
+  return html`<${Card} title="Comparison" class="curves" actions=${views}>
     <div class="controls">
       <${Field} label="Metric"><${Choice} value=${metric} options=${names.map((n) => [n, metricName(n)])} onChange=${(v) => setOptions({ metric: v === 'eval/mean_aoi' ? '' : v })} /><//>
-      <${Field} label="Group by"><${Choice} value=${by} onChange=${(v) => setOptions({ group: v })}
+      ${view === 'curves' && html`<${Field} label="Group by"><${Choice} value=${by} onChange=${(v) => setOptions({ group: v })}
         options=${[['', 'nothing: a curve per job'], ['all', 'all that differs but the seed'], ...withCurrent(fields.differing, by).map((n) => [n, n])]} /><//>
-      <${Field} label=${`Smoothing ${weight || 'off'}`}><input type="range" min="0" max="0.98" step="0.02" value=${weight} onInput=${(e) => setOptions({ smooth: Number(e.target.value) || '' })} /><//>
+      <${Field} label=${`Smoothing ${weight || 'off'}`}><input type="range" min="0" max="0.98" step="0.02" value=${weight} onInput=${(e) => setOptions({ smooth: Number(e.target.value) || '' })} /><//>`}
     </div>
     <${ErrorBox} error=${error} />
-    ${drawn.length ? html`<${Chart} curves=${drawn} label=${metricName(metric)} height=${340} />` : html`<${Empty} title=${shown.length ? 'No rows of this metric yet.' : 'No job is selected.'}>
+    ${view === 'table' && html`<${Table} all=${compared} fields=${fields} metric=${metric} options=${options} />`}
+    ${view === 'parallel' && html`<${Parallel} all=${compared} fields=${fields} metric=${metric} />`}
+    ${view === 'curves' && html`${drawn.length ? html`<${Chart} curves=${drawn} label=${metricName(metric)} height=${340} />` : html`<${Empty} title=${shown.length ? 'No rows of this metric yet.' : 'No job is selected.'}>
       <p>${shown.length ? 'A curve appears here as soon as the first rows arrive.' : 'Select jobs in the table below; their curves appear here.'}</p><//>`}
     <p class="hint">${jobs.length > MOST ? `The first ${MOST} of ${jobs.length} selected jobs are drawn. ` : ''}${banded ? 'Bands: mean ± one standard deviation over the jobs of the group. ' : ''}${
-      drawn.length ? 'Drag to zoom, double-click to see all; a name in the legend hides its curve.' : ''}</p>
+      drawn.length ? 'Drag to zoom, double-click to see all; a name in the legend hides its curve.' : ''}</p>`}
   <//>`;
 }
 

@@ -34,7 +34,7 @@ export async function command(job, verb) {
   return run(() => (verb === 'delete' ? remove(`/v1/jobs/${job.id}`) : post(`/v1/jobs/${job.id}/${verb}`)), `${name} ${DONE[verb]}.`);
 }
 
-const share = (job) => (job.progress.steps ? job.progress.step / job.progress.steps : 0);
+const share = (job) => (job.progress.steps ? Math.min(job.progress.step / job.progress.steps, 1) : 0);
 
 /** Seconds until a running job has done all steps, by the speed since it was first seen here, else since it started. */
 export function useTimeLeft() {

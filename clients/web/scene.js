@@ -7,14 +7,16 @@ const MARGIN = 0.06;
 /** Slots of the path behind a UAV that are drawn. */
 const TRAIL = 24;
 
-/** Colours from fresh to stale (cividis, readable for colour-blind people). */
+/** Colours from fresh to stale (cividis, readable for colour-blind people), for the light and the dark theme. */
 const STALENESS = [[0, 73, 135], [85, 91, 109], [133, 126, 120], [190, 164, 101], [255, 222, 79]];
+const STALENESS_DARK = [[58, 128, 205], [108, 128, 165], [150, 148, 140], [200, 176, 108], [255, 222, 79]];
 
 /** The colour of an AoI; `stale` is the AoI at which the scale ends. */
 export function aoiColour(aoi, stale) {
-  const place = Math.min(Math.max(aoi / stale, 0), 1) * (STALENESS.length - 1);
-  const i = Math.min(Math.floor(place), STALENESS.length - 2);
-  const mix = STALENESS[i].map((a, k) => Math.round(a + (place - i) * (STALENESS[i + 1][k] - a)));
+  const colours = isDark() ? STALENESS_DARK : STALENESS;
+  const place = Math.min(Math.max(aoi / stale, 0), 1) * (colours.length - 1);
+  const i = Math.min(Math.floor(place), colours.length - 2);
+  const mix = colours[i].map((a, k) => Math.round(a + (place - i) * (colours[i + 1][k] - a)));
   return `rgb(${mix.join(', ')})`;
 }
 

@@ -45,6 +45,7 @@ static FILES: &[File] = &files![
     "app.js",
     "api.js",
     "chart.js",
+    "compare.js",
     "console.js",
     "curves.js",
     "flight.js",
