@@ -215,6 +215,27 @@ async fn a_body_that_does_not_say_its_size_is_bounded_too() {
 }
 
 #[tokio::test]
+async fn browsers_get_the_dashboard_and_programs_the_index() {
+    let server = Server::start().await;
+    let client = reqwest::Client::new();
+    let get = |path: &str, header: (&str, &str)| client.get(server.url(path)).header(header.0, header.1).send();
+    let page = get("/", ("accept", "text/html,application/xhtml+xml,*/*;q=0.8")).await.unwrap();
+    assert_eq!((page.status(), page.headers()["vary"].to_str().unwrap()), (StatusCode::OK, "accept"));
+    assert!(page.headers()["content-type"].to_str().unwrap().starts_with("text/html"));
+    let tag = page.headers()["etag"].to_str().unwrap().to_owned();
+    let text = page.text().await.unwrap();
+    assert!(!text.contains("<style") && !text.contains("style=") && !text.contains("onload"), "the security policy forbids these");
+    let files: Vec<&str> = text.split('"').filter(|part| part.starts_with("ui/")).collect();
+    assert!(files.contains(&"ui/app.js"), "{files:?}");
+    for file in files {
+        assert_eq!(get(&format!("/{file}"), ("accept", "*/*")).await.unwrap().status(), StatusCode::OK, "{file}");
+    }
+    assert_eq!(get("/ui/index.html", ("if-none-match", &tag)).await.unwrap().status(), StatusCode::NOT_MODIFIED);
+    assert_eq!(get("/", ("accept", "application/json")).await.unwrap().json::<Value>().await.unwrap()["name"], "qedgix");
+    assert_eq!(Rest::new(&server).get("/ui/nothing.js").await.1["code"], "not_found");
+}
+
+#[tokio::test]
 async fn probes_metrics_and_policies() {
     let server = Server::start().await;
     let rest = Rest::new(&server);
