@@ -27,19 +27,24 @@ struct File {
     name: &'static str,
     bytes: &'static [u8],
     /// Changes with the bytes, so that a browser asks again but loads only what has changed.
-    etag: LazyLock<HeaderValue>,
+    etag: HeaderValue,
+}
+
+impl File {
+    fn new(name: &'static str, bytes: &'static [u8]) -> Self {
+        let digest = hex::encode(&Sha256::digest(bytes)[..12]);
+        let etag = HeaderValue::try_from(format!("\"{digest}\"")).expect("a digest in quotes is a header value");
+        Self { name, bytes, etag }
+    }
 }
 
 macro_rules! files {
     ($($name:literal),* $(,)?) => {
-        [$({
-            const BYTES: &[u8] = include_bytes!(concat!("../../../clients/web/", $name));
-            File { name: $name, bytes: BYTES, etag: LazyLock::new(|| etag(BYTES)) }
-        }),*]
+        LazyLock::new(|| vec![$(File::new($name, include_bytes!(concat!("../../../clients/web/", $name)))),*])
     };
 }
 
-static FILES: &[File] = &files![
+static FILES: LazyLock<Vec<File>> = files![
     "index.html",
     "app.css",
     "app.js",
@@ -67,11 +72,6 @@ static FILES: &[File] = &files![
     "uplot-1.6.32.js",
 ];
 
-fn etag(bytes: &[u8]) -> HeaderValue {
-    let digest = hex::encode(&Sha256::digest(bytes)[..12]);
-    HeaderValue::try_from(format!("\"{digest}\"")).expect("a digest in quotes is a header value")
-}
-
 impl File {
     fn content_type(&self) -> &'static str {
         match self.name.rsplit_once('.').map(|(_, end)| end) {
@@ -85,7 +85,7 @@ impl File {
     /// The file, or 304 if the browser has it already.
     fn respond(&self, request: &HeaderMap) -> Response {
         let known = request.get_all(header::IF_NONE_MATCH).iter().filter_map(|tags| tags.to_str().ok());
-        let is_known = known.flat_map(|tags| tags.split(',')).any(|tag| tag.trim().trim_start_matches("W/") == *self.etag);
+        let is_known = known.flat_map(|tags| tags.split(',')).any(|tag| tag.trim().trim_start_matches("W/") == self.etag);
         let cached = [(header::ETAG, self.etag.clone()), (header::CACHE_CONTROL, HeaderValue::from_static("no-cache"))];
         if is_known {
             return (StatusCode::NOT_MODIFIED, cached).into_response();
