@@ -99,8 +99,8 @@ export async function followJob(id, { onEvent, onTrouble, signal }) {
   while (!signal.aborted) {
     try {
       const response = await request('GET', `/v1/jobs/${id}/events?after=${after}`, { signal });
-      if (response.status === 204) return;
       onTrouble(null);
+      if (response.status === 204) return;
       for await (const { id: eventId, event, data } of serverSentEvents(response.body)) {
         after = Number(eventId) || after;
         onEvent(event, JSON.parse(data));

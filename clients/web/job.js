@@ -63,7 +63,7 @@ function add(curves, metric, step, value) {
 
 export function JobPage({ id, options }) {
   const events = useEvents(id);
-  const job = useLoad((signal) => get(`/v1/jobs/${encodeURIComponent(id)}`, signal), [id, events.states.length], events.ended ? 0 : 2);
+  const job = useLoad((signal) => get(`/v1/jobs/${encodeURIComponent(id)}`, signal), [id, events.states.length, events.ended], events.ended ? 0 : 2);
   const timeLeft = useTimeLeft();
   const view = VIEWS.some(([name]) => name === options.get('tab')) ? options.get('tab') : 'curves';
   if (!job.value) return html`<${Title} text="Job" />${job.error ? html`<${ErrorBox} error=${job.error} retry=${job.reload} /><p><a href="#/jobs">All jobs</a></p>` : html`<${Loading} what="the job" />`}`;

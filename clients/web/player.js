@@ -217,8 +217,8 @@ const average = (slot) => slot.users.reduce((sum, user) => sum + user[2], 0) / M
 function Controls({ clock, length, known, show, toggle }) {
   return html`<section class="card player-controls" aria-label="Playback">
     <button type="button" class="primary play" onClick=${clock.toggle} disabled=${!known}>${clock.playing ? 'Pause' : 'Play'}</button>
-    <button type="button" onClick=${() => clock.seek(clock.slot - 1)} aria-label="One slot back">−1</button>
-    <button type="button" onClick=${() => clock.seek(clock.slot + 1)} aria-label="One slot forward">+1</button>
+    <button type="button" onClick=${() => clock.seek(clock.slot - 1)} aria-label="−1 slot">−1</button>
+    <button type="button" onClick=${() => clock.seek(clock.slot + 1)} aria-label="+1 slot">+1</button>
     <input type="range" class="scrub" min="0" max=${length} value=${clock.slot} aria-label="Slot" aria-valuetext=${`slot ${clock.slot} of ${length}`} onInput=${(e) => clock.seek(Number(e.target.value))} />
     <output class="slot-number">slot ${clock.slot} of ${length}${known < length ? html` <span class="faint">(${known} flown)</span>` : ''}</output>
     <${Choice} value=${String(clock.speed)} options=${SPEEDS.map((s) => [String(s), `${s} slots/s`])} onChange=${(v) => clock.setSpeed(Number(v))} aria-label="Speed" />

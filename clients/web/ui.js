@@ -80,12 +80,15 @@ export function Loaded({ of, what, children }) {
   return html`${of.error && html`<${ErrorBox} error=${of.error} retry=${of.reload} />`}${children(of.value)}`;
 }
 
-/** The title of a page, which receives the focus when the page is opened. */
+let opened = false;
+
+/** The title of a page, which receives the focus when the reader goes to the page, so that screen readers begin there. */
 export function Title({ children, actions, text }) {
   const title = useRef(null);
   useEffect(() => {
     document.title = `${text} · Qedgix`;
-    if (document.activeElement === document.body) title.current?.focus({ preventScroll: true });
+    if (opened && document.activeElement === document.body) title.current?.focus({ preventScroll: true });
+    opened = true;
   }, [text]);
   return html`<header class="title"><h1 tabindex="-1" ref=${title}>${children ?? text}</h1>
     ${actions && html`<div class="actions">${actions}</div>`}</header>`;
