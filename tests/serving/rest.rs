@@ -224,7 +224,10 @@ async fn browsers_get_the_dashboard_and_programs_the_index() {
     assert!(page.headers()["content-type"].to_str().unwrap().starts_with("text/html"));
     let tag = page.headers()["etag"].to_str().unwrap().to_owned();
     let text = page.text().await.unwrap();
-    assert!(!text.contains("<style") && !text.contains("style=") && !text.contains("onload"), "the security policy forbids these");
+    assert!(
+        !text.contains("<style") && !text.contains("style=") && !text.contains("onload"),
+        "the security policy forbids these"
+    );
     let files: Vec<&str> = text.split('"').filter(|part| part.starts_with("ui/")).collect();
     assert!(files.contains(&"ui/app.js"), "{files:?}");
     for file in files {

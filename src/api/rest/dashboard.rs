@@ -170,7 +170,10 @@ mod tests {
     fn a_known_file_is_not_sent_again() {
         let file = find("app.css").unwrap();
         let first = file.respond(&HeaderMap::new());
-        assert_eq!((first.status(), first.headers()[header::CONTENT_TYPE].as_bytes()), (StatusCode::OK, &b"text/css; charset=utf-8"[..]));
+        assert_eq!(
+            (first.status(), first.headers()[header::CONTENT_TYPE].as_bytes()),
+            (StatusCode::OK, &b"text/css; charset=utf-8"[..])
+        );
         for (tag, status) in [
             (first.headers()[header::ETAG].clone(), StatusCode::NOT_MODIFIED),
             (HeaderValue::try_from(format!("\"x\", W/{}", file.etag.to_str().unwrap())).unwrap(), StatusCode::NOT_MODIFIED),
