@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -245,6 +247,17 @@ def test_wrong_dicts_are_refused(client, observation):
     with pytest.raises(qedgix.InvalidArgument) as refused:
         client.act(observation, policy="sweep")
     assert refused.value.field in ("scene", "graph", "observation")
+
+
+def test_threads_share_a_client(server):
+    client = qedgix.Client(server.grpc, server.http)
+    wanted = [expected(client, "qedgix", seed) for seed in range(4)]
+    client.close()
+    with qedgix.Client(server.grpc, server.http) as client, ThreadPoolExecutor(4) as pool:
+        # Nothing is connected yet.
+        flown = pool.map(lambda seed: fly(client.local_session("qedgix", seed=seed).act), range(4))
+        listed = pool.map(lambda _: len(client.policies.list()), range(4))
+        assert list(flown) == wanted and len(set(listed)) == 1
 
 
 def test_hover_has_no_direction():

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import inspect
+import os
 import subprocess
 import sys
 from pathlib import Path
+
+from conftest import BINARY
 
 import qedgix
 
@@ -21,6 +24,24 @@ def test_types():
     command = [sys.executable, "-m", "mypy", "--cache-dir", str(Path(sys.prefix) / "mypy")]
     checked = subprocess.run(command, cwd=HERE, capture_output=True, text=True)
     assert checked.returncode == 0, checked.stdout
+
+
+def test_a_wheel_can_carry_the_server(tmp_path):
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    build = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(tmp_path), str(HERE)]
+    subprocess.run(pip + build, env={**os.environ, "QEDGIX_SERVER": str(BINARY)}, check=True)
+    [wheel] = tmp_path.glob("*.whl")
+    assert wheel.name.startswith("qedgix-") and "-py3-none-" in wheel.name and not wheel.name.endswith("-any.whl")
+    prefix = tmp_path / "prefix"
+    subprocess.run(
+        [*pip, "install", "--no-deps", "--no-index", "--ignore-installed", "--prefix", str(prefix), str(wheel)], check=True
+    )
+    [command] = prefix.rglob("bin/qedgix")
+    told = subprocess.run([command, "--version"], check=True, capture_output=True, text=True).stdout
+    assert told.startswith("qedgix ")
+    assert list(prefix.rglob("qedgix/py.typed"))
+    missing = subprocess.run(pip + build, env={**os.environ, "QEDGIX_SERVER": "nowhere"}, capture_output=True, check=False)
+    assert missing.returncode != 0
 
 
 def public(owner):

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from time import monotonic
 from typing import TYPE_CHECKING, Any, cast
@@ -36,6 +37,8 @@ class Transport:
         self._channel: Channel | None = None
         self._calls: dict[Method, Any] = {}
         self._http: HttpClient | None = None
+        # Threads that use a client for the first time at once open one connection. Nothing waits while it is held.
+        self._opening = threading.Lock()
 
     def call(
         self,
@@ -79,9 +82,10 @@ class Transport:
         return call
 
     def _open_channel(self) -> Channel:
-        if self._channel is None:
-            self._channel = open_channel(self.settings)
-        return self._channel
+        with self._opening:
+            if self._channel is None:
+                self._channel = open_channel(self.settings)
+            return self._channel
 
     def open_stream(self, method: Method) -> RawStream:
         """Opens a bidirectional call."""
@@ -97,14 +101,15 @@ class Transport:
     @property
     def http(self) -> HttpClient:
         """The client of REST."""
-        if self._http is None:
-            self._http = HttpClient(
-                base_url=self.settings.http_url,
-                headers=dict(self._metadata),
-                verify=self.settings.tls(),
-                timeout=self.settings.timeout,
-            )
-        return self._http
+        with self._opening:
+            if self._http is None:
+                self._http = HttpClient(
+                    base_url=self.settings.http_url,
+                    headers=dict(self._metadata),
+                    verify=self.settings.tls(),
+                    timeout=self.settings.timeout,
+                )
+            return self._http
 
     def request(
         self,
