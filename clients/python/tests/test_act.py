@@ -70,6 +70,14 @@ class Fleet:
             "json": json,
             "json of a graph": {"nodes": nodes},
             "graph": qedgix.Graph(detections, aoi, uavs),
+            "graph of sightings": qedgix.Graph(
+                {
+                    uav: {node: (*at, aoi[node]) if node in aoi else at for node, at in seen.items()}
+                    for uav, seen in detections.items()
+                },
+                aoi,
+                uavs,
+            ),
             "graph of arrays": qedgix.Graph.from_arrays(index, relative, self.aoi, positions=self.uavs),
         }
 
@@ -224,7 +232,10 @@ def test_what_is_not_accepted_is_named(client):
         (lambda: qedgix.Scene(np.zeros((1, 2)), {"u": (0, 0)}, {"u": "old"}), "scene.aoi[u]"),
         (lambda: qedgix.Graph({"a": {}}, {"u": None}), "graph.aoi[u]"),
         (lambda: qedgix.Graph({1: {}}, {}), "graph.uavs.ids"),
-        (lambda: qedgix.Graph({"a": {"u": (0, 0)}}, {}), "graph.detections"),
+        (lambda: qedgix.Graph({"a": {"u": (0, 0)}}, {}), "graph.detections[a][u]"),
+        (lambda: qedgix.Graph({"a": {"u": (0, 0, 1, 2)}}), "graph.detections[a][u]"),
+        (lambda: qedgix.Graph({"a": {"b": (0, 0, 1)}, "b": {}}), "graph.detections[a][b]"),
+        (lambda: qedgix.Graph({"a": {2: (0, 0, 1)}}), "graph.detections[a].ids"),
         (lambda: qedgix.Graph({"a": {"u": (0,)}}, {"u": 1}), "graph.detections[a][u]"),
         (lambda: qedgix.Graph({"a": {}}, {}, {}), "graph.positions[a]"),
         (lambda: qedgix.Graph.from_arrays([[0, 9]], [[0, 0]], [1], uavs=1), "graph.edge_index"),
@@ -261,7 +272,8 @@ def test_threads_share_a_client(server):
 
 
 def test_hover_has_no_direction():
-    action = pb.Action(uav_id="a", heading_index=8)
-    decision = qedgix.Decision(pb.ActResponse(actions=[action]))
-    assert np.isnan(decision.degrees).all() and not decision.directions.any() and decision.q_values is None
+    actions = [pb.Action(uav_id="a", heading_index=8), pb.Action(uav_id="b", heading_index=2, heading_deg=90)]
+    decision = qedgix.Decision(pb.ActResponse(actions=actions))
+    assert np.isnan(decision.degrees[0]) and decision.degrees[1] == 90 and decision.q_values is None
+    assert np.allclose(decision.directions, [[0, 0], [0, 1]])
     assert np.allclose(qedgix.directions([0, 2, 8]), [[1, 0], [0, 1], [0, 0]])

@@ -73,8 +73,8 @@ class Graph:
 
     Args:
         detections: for each UAV, by id, the nodes that it detects: a mapping from the id of the target to its position
-            relative to the UAV, (x, y) in units of the side of the square.
-        aoi: AoI of every user of the fleet in slots, by id, also of users that no UAV detects.
+            relative to the UAV, (x, y) in units of the side of the square; (x, y, AoI) of a user, if UAVs know different AoI.
+        aoi: AoI of the users of the fleet in slots, by id, also of users that no UAV detects.
         positions: position (x, y) of each UAV by id, for policies that need their own position. Default: none.
 
     Raises:
@@ -90,25 +90,28 @@ class Graph:
     def __init__(
         self,
         detections: Mapping[str, Mapping[str, Sequence[float]]],
-        aoi: Mapping[str, float],
+        aoi: Mapping[str, float] | None = None,
         positions: Mapping[str, Sequence[float]] | None = None,
     ) -> None:
         message = pb.Graph()
+        users = {} if aoi is None else dict(aoi)
         _texts("graph.uavs", detections)
-        _texts("graph.users", aoi)
+        _texts("graph.users", users)
         for name, targets in detections.items():
             node = message.nodes.add(id=name, kind=pb.NODE_KIND_UAV)
             if positions is not None:
-                x, y = _pair(f"graph.positions[{name}]", positions.get(name))
-                node.position.x, node.position.y = x, y
-            for target, relative in targets.items():
-                x, y = _pair(f"graph.detections[{name}][{target}]", relative)
-                detection = node.detections.add(target_id=target, rel_x=x, rel_y=y)
-                if target in aoi:
-                    detection.aoi = _number(f"graph.aoi[{target}]", aoi[target])
-                elif target not in detections:
-                    raise invalid("graph.detections", target, "the id of a UAV or of a user in `aoi`")
-        for name, age in aoi.items():
+                node.position.x, node.position.y = _pair(f"graph.positions[{name}]", positions.get(name))
+            _texts(f"graph.detections[{name}]", targets)
+            for target, seen in targets.items():
+                field = f"graph.detections[{name}][{target}]"
+                if target in detections:
+                    x, y = _pair(field, seen)
+                    node.detections.add(target_id=target, rel_x=x, rel_y=y)
+                    continue
+                x, y, age = _sighting(field, seen, users.get(target))
+                node.detections.add(target_id=target, rel_x=x, rel_y=y, aoi=age)
+                users.setdefault(target, age)
+        for name, age in users.items():
             message.nodes.add(id=name, kind=pb.NODE_KIND_USER, aoi=_number(f"graph.aoi[{name}]", age))
         self._message = message
 
@@ -290,6 +293,16 @@ def _pair(field: str, pair: Any) -> tuple[float, float]:
         return float(x), float(y)
     except (TypeError, ValueError):
         raise invalid(field, pair, "two numbers (x, y)") from None
+
+
+def _sighting(field: str, seen: Any, age: float | None) -> tuple[float, float, float]:
+    """Relative position and AoI of a user, of which `age` is known already."""
+    try:
+        x, y, *known = seen
+        [found] = known or [age]
+        return float(x), float(y), float(found)
+    except (TypeError, ValueError):
+        raise invalid(field, seen, "two numbers (x, y) and the AoI in `aoi`, or three numbers (x, y, AoI)") from None
 
 
 def _number(field: str, number: Any) -> float:

@@ -97,12 +97,14 @@ class Decision:
     @property
     def degrees(self) -> Floats:
         """(M,) directions in degrees, counter-clockwise from +x; NaN for hover."""
-        return np.where(self.headings < 8, 45.0 * self.headings, np.nan)
+        actions = self.message.actions
+        return np.array([action.heading_deg if action.HasField("heading_deg") else np.nan for action in actions])
 
     @property
     def directions(self) -> Floats:
         """(M, 2) unit vectors; zeros for hover. A UAV moves by its speed times this vector in the slot."""
-        return directions(self.headings)
+        angles = np.deg2rad(self.degrees)
+        return np.nan_to_num(np.stack([np.cos(angles), np.sin(angles)], axis=-1), nan=0.0)
 
     @property
     def by_id(self) -> dict[str, int]:
