@@ -170,8 +170,10 @@ class Job:
 
         retry = self._transport.settings.retry
         last_success = monotonic()
+        failures = 0
         while True:
             failure: QedgixError | None = None
+            first = after
             silence = _SILENCE if deadline is None else min(_SILENCE, max(deadline - monotonic(), 0.001))
             limits = httpx.Timeout(self._transport.settings.timeout, read=silence)
             try:
@@ -184,7 +186,7 @@ class Job:
                         raise from_http(response)
                     kind = data = event_id = ""
                     for line in response.iter_lines():
-                        last_success = monotonic()
+                        last_success, failures = monotonic(), 0
                         name, _, value = line.partition(":")
                         value = value.removeprefix(" ")
                         if name == "id":
@@ -206,11 +208,16 @@ class Job:
                 raise DeadlineExceeded(f"job {self.id} has not ended in time", code="deadline_exceeded")
             remaining = last_success + patience - monotonic()
             # A stream that ended by itself is opened again: the answer says whether the job has ended.
-            wait = 0.0 if failure is None else retry.wait(failure, 1, remaining)
-            if wait is None:
-                assert failure is not None
-                raise failure
-            sleep(wait)
+            if failure is not None:
+                failures += 1
+                # What limits these attempts is patience, not their number.
+                wait = retry.wait(failure, min(failures, retry.attempts - 1), remaining) if retry.attempts > 1 else None
+                if wait is None:
+                    raise failure
+                sleep(wait)
+            elif after == first:
+                # Something on the way ends streams at once.
+                sleep(retry.initial)
 
     def wait(
         self,
@@ -220,7 +227,7 @@ class Job:
         check: bool = True,
         patience: float = 60.0,
     ) -> Self:
-        """Waits until the job has ended.
+        """Waits until the job has ended. A paused job has not ended.
 
         Args:
             timeout: seconds to wait. Default: no limit.
