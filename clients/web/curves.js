@@ -126,7 +126,8 @@ function jobLabel(job, jobs) {
   return seeds.size === same.length ? `${name}, seed ${job.seed}` : `${name}, ${job.id.slice(-6)}`;
 }
 
-export function Curves({ jobs, options }) {
+/** Several jobs compared. `first`: the view that is shown if the address names none. */
+export function Curves({ jobs, options, first = 'curves' }) {
   const metric = options.get('metric') ?? 'eval/mean_aoi';
   const by = options.get('group') ?? '';
   const weight = Math.min(Math.max(Number(options.get('smooth') ?? 0) || 0, 0), 0.99);
@@ -144,10 +145,10 @@ export function Curves({ jobs, options }) {
   });
   const drawn = curves.filter((curve) => curve.x.length);
   const banded = drawn.some((curve) => curve.low);
-  const view = VIEWS.some(([id]) => id === options.get('view')) ? options.get('view') : 'curves';
+  const view = VIEWS.some(([id]) => id === options.get('view')) ? options.get('view') : first;
   const compared = view === 'curves' ? [] : results(shown, fields, rows, metric);
   const names = METRICS[metric] ? Object.keys(METRICS) : [metric, ...Object.keys(METRICS)];
-  const views = html`<span class="toggles">${VIEWS.map(([id, name]) => html`<button type="button" class="small" aria-pressed=${String(view === id)} onClick=${() => setOptions({ view: id === 'curves' ? '' : id })}>${name}</button>`)}</span>`;
+  const views = html`<span class="toggles">${VIEWS.map(([id, name]) => html`<button type="button" class="small" aria-pressed=${String(view === id)} onClick=${() => setOptions({ view: id === first ? '' : id })}>${name}</button>`)}</span>`;
   return html`<${Card} title="Comparison" class="curves" actions=${views}>
     <div class="controls">
       <${Field} label="Metric"><${Choice} value=${metric} options=${names.map((n) => [n, metricName(n)])} onChange=${(v) => setOptions({ metric: v === 'eval/mean_aoi' ? '' : v })} /><//>

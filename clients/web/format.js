@@ -16,7 +16,7 @@ const group = (value) => String(value).replace(/\B(?=(\d{3})+(?!\d))/g, '\u202f'
 /** A count in short form: 1.2 M. */
 export function short(value) {
   for (const [size, unit] of [[1e12, 'T'], [1e9, 'G'], [1e6, 'M'], [1e3, 'k']]) {
-    if (Math.abs(value) >= size) return `${(value / size).toPrecision(3).replace(/\.?0+$/, '')}\u202f${unit}`;
+    if (Math.abs(value) >= size) return `${(value / size).toPrecision(3).replace(/(\.\d*?)0+$/, '$1').replace(/\.$/, '')}\u202f${unit}`;
   }
   return String(Math.round(value * 100) / 100);
 }
@@ -75,6 +75,7 @@ export const METRICS = {
   q_tot: 'Q_tot',
   epsilon: 'Exploration rate',
   env_steps_per_s: 'Environment steps per second',
+  'eval-v1/mean_aoi': 'Mean AoI on the layouts of eval-v1 (slots)',
 };
 
 export const metricName = (name) => METRICS[name] ?? name;

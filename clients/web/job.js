@@ -7,9 +7,16 @@ import { ago, bytes, clock, duration, flatten, METRICS, metricName, number, sett
 import { algorithmColour, colour } from './palette.js';
 import { go, link, setOptions } from './route.js';
 import { Action, Bar, Card, copy, Empty, ErrorBox, Field, Loaded, Loading, run, State, Tabs, Title, useLoad } from './ui.js';
+import { Evaluation, SweepJobs } from './report.js';
+import { Edit } from './edit.js';
 import { command, commands, useTimeLeft, why } from './jobs.js';
 
-const VIEWS = [['curves', 'Curves'], ['configuration', 'Configuration'], ['events', 'Events'], ['logs', 'Logs'], ['checkpoints', 'Checkpoints']];
+/** The views of a job of each kind; the first one is shown if the address names none. */
+const VIEWS = {
+  train: [['curves', 'Curves'], ['configuration', 'Configuration'], ['events', 'Events'], ['logs', 'Logs'], ['checkpoints', 'Checkpoints']],
+  evaluate: [['report', 'Report'], ['configuration', 'Configuration'], ['events', 'Events'], ['logs', 'Logs']],
+  sweep: [['jobs', 'Jobs'], ['configuration', 'Configuration'], ['events', 'Events']],
+};
 
 /** Milliseconds between two drawings of a stream of events. */
 const REDRAW = 250;
@@ -65,22 +72,27 @@ export function JobPage({ id, options }) {
   const events = useEvents(id);
   const job = useLoad((signal) => get(`/v1/jobs/${encodeURIComponent(id)}`, signal), [id, events.states.length, events.ended], events.ended ? 0 : 2);
   const timeLeft = useTimeLeft();
-  const view = VIEWS.some(([name]) => name === options.get('tab')) ? options.get('tab') : 'curves';
+  const [editing, setEditing] = useState(false);
   if (!job.value) return html`<${Title} text="Job" />${job.error ? html`<${ErrorBox} error=${job.error} retry=${job.reload} /><p><a href="#/jobs">All jobs</a></p>` : html`<${Loading} what="the job" />`}`;
   const now = job.value;
+  const views = VIEWS[now.kind] ?? VIEWS.train;
+  const view = views.some(([tab]) => tab === options.get('tab')) ? options.get('tab') : views[0][0];
   const name = now.name ?? `job ${id.slice(-6)}`;
   const act = async (verb) => {
     if (!(await command(now, verb))) return;
     if (verb === 'delete') go('#/jobs');
     else job.reload();
   };
-  const actions = html`${commands(now).map(([verb, label]) => html`<${Action} command=${() => act(verb)}>${label}<//>`)}<a class="button" href=${link(['submit'], { from: id })}>Clone</a>`;
+  const actions = html`${commands(now).map(([verb, label]) => html`<${Action} command=${() => act(verb)}>${label}<//>`)}${'notes' in now && html`<button type="button" onClick=${() => setEditing(true)}>Edit</button>`}<a class="button" href=${link(['submit'], { from: id })}>Clone</a>`;
   return html`
     <p class="crumbs"><a href="#/jobs">Jobs</a></p>
     <${Title} text=${name} actions=${actions}>${name} <${State} state=${now.state} wanted=${now.wanted} /><//>
     <${ErrorBox} error=${job.error} />
+    ${editing && html`<${Edit} job=${now} close=${() => { setEditing(false); job.reload(); }} />`}
     <${Summary} job=${now} left=${timeLeft(now)} />
-    <${Tabs} parts=${['jobs', id]} views=${VIEWS} current=${view} />
+    <${Tabs} parts=${['jobs', id]} views=${views} current=${view} />
+    ${view === 'report' && html`<${Evaluation} job=${now} />`}
+    ${view === 'jobs' && html`<${SweepJobs} id=${id} options=${options} ended=${now.ended_at != null} />`}
     ${view === 'curves' && html`<${AllCurves} job=${now} events=${events} options=${options} />`}
     ${view === 'configuration' && html`<${Configuration} job=${now} />`}
     ${view === 'events' && html`<${Events} events=${events} />`}
@@ -90,19 +102,22 @@ export function JobPage({ id, options }) {
 
 function Summary({ job, left }) {
   const { step, steps } = job.progress;
-  const reason = why(job, 0);
+  const reason = why(job);
   return html`<${Card}>
     <${Bar} value=${steps ? step / steps : 0} label="Progress" />
     <dl class="facts wide">
       <div><dt>Progress</dt><dd>${number(step)} of ${number(steps)} steps${left != null ? html`, <strong>${duration(left)} left</strong>` : ''}</dd></div>
-      <div><dt>Algorithm</dt><dd><span class="swatch" style=${{ background: algorithmColour(job.algorithm) }}></span> ${job.algorithm}, preset ${job.preset}, seed ${job.seed}</dd></div>
+      <div><dt>Algorithm</dt><dd><span class="swatch" style=${{ background: algorithmColour(job.algorithm) }}></span> ${[job.kind && job.kind !== 'train' ? job.kind : null, job.algorithm, job.preset && `preset ${job.preset}`, job.seed != null && `seed ${job.seed}`].filter(Boolean).join(', ')}</dd></div>
       <div><dt>Submitted</dt><dd title=${clock(job.created_at)}>${ago(job.created_at)}</dd></div>
       <div><dt>${job.ended_at ? 'Took' : 'Started'}</dt><dd>${job.ended_at && job.started_at ? duration((new Date(job.ended_at) - new Date(job.started_at)) / 1000) : ago(job.started_at)}</dd></div>
       <div><dt>Attempts</dt><dd>${job.attempts}${job.failures ? `, ${job.failures} failed` : ''}</dd></div>
       <div><dt>Threads</dt><dd>${job.threads}${job.priority ? `, priority ${job.priority}` : ''}</dd></div>
       ${job.policy && html`<div><dt>Policy</dt><dd><a href=${link(['policies', job.policy.split(':')[0]])}>${job.policy}</a> · <a href=${link(['player'], { policy: job.policy })}>fly it</a></dd></div>`}
+      ${job.metrics?.['eval/mean_aoi']?.best != null && html`<div><dt>Best mean AoI</dt><dd><strong>${number(job.metrics['eval/mean_aoi'].best)}</strong> at ${short(job.metrics['eval/mean_aoi'].best_step)} steps</dd></div>`}
+      ${job.parent && html`<div><dt>Made by</dt><dd><a href=${link(['jobs', job.parent])}>a sweep</a></dd></div>`}
       ${Object.keys(job.labels ?? {}).length > 0 && html`<div><dt>Labels</dt><dd>${Object.entries(job.labels).map(([k, v]) => html`<span class="label">${k}=${v}</span>`)}</dd></div>`}
     </dl>
+    ${job.notes && html`<p class="notes">${job.notes}</p>`}
     ${reason && html`<p class=${job.state === 'failed' ? 'wrong' : 'faint'}><strong>${job.state === 'queued' ? 'Waiting' : 'Reason'}:</strong> ${reason}</p>`}
   <//>`;
 }
@@ -118,8 +133,9 @@ function AllCurves({ job, events, options }) {
   };
   const own = algorithmColour(job.algorithm);
   const main = MAIN.filter((name) => events.curves.has(name)).map((name) => of(name, name === 'train/mean_aoi' ? colour(7) : own, name === 'train/mean_aoi' ? 'while training (explores)' : 'in evaluations'));
-  const order = Object.keys(METRICS);
-  const rest = [...events.curves.keys()].filter((name) => !MAIN.includes(name) && events.curves.get(name).x.length > 1).sort((a, b) => order.indexOf(a) - order.indexOf(b));
+  const known = Object.keys(METRICS);
+  const order = (name) => (known.includes(name) ? known.indexOf(name) : known.length);
+  const rest = [...events.curves.keys()].filter((name) => !MAIN.includes(name) && events.curves.get(name).x.length > 1).sort((a, b) => order(a) - order(b));
   return html`
     ${events.trouble && html`<${ErrorBox} error=${events.trouble} />`}
     <${Card} title="Mean AoI" actions=${html`<${Field} label=${`Smoothing ${weight || 'off'}`}><input type="range" min="0" max="0.98" step="0.02" value=${weight} onInput=${(e) => setOptions({ smooth: Number(e.target.value) || '' })} /><//>
@@ -130,7 +146,7 @@ function AllCurves({ job, events, options }) {
 }
 
 function Configuration({ job }) {
-  const parts = [['Environment', job.environment], ['Training', job.training]];
+  const parts = [['Environment', job.environment], ['Training', job.training], ['Evaluation', job.evaluation], ['Sweep', job.sweep]].filter(([, values]) => values);
   const request = { name: job.name, algorithm: job.algorithm, preset: job.preset, seed: job.seed, threads: job.threads, environment: job.environment, training: job.training };
   if (job.unreadable) return html`<${Card} title="Unreadable specification"><p>${job.unreadable.reason}</p><pre tabindex="0">${job.unreadable.document}</pre><//>`;
   return html`<p class="right"><button type="button" onClick=${() => copy(JSON.stringify(request, null, 2))}>Copy as JSON</button></p>

@@ -2,11 +2,14 @@
 
 import { html, useEffect, useMemo, useState } from './htm-preact-3.1.1.js';
 import { get, post } from './api.js';
+import { parseLabels } from './edit.js';
 import { setting } from './format.js';
 import { go, link } from './route.js';
 import { Card, Choice, ErrorBox, Field, Loaded, say, Title, useLoad } from './ui.js';
 
 const PRESETS = { practical: 'practical: trains in minutes', paper: 'paper: as in the paper', authors: "authors: as in the authors' code" };
+
+const KINDS = { train: 'train: one training run', evaluate: 'evaluate: policies on frozen layouts', sweep: 'sweep: training runs over values' };
 
 /** The schema itself, without an alternative for null. Of several alternatives none is chosen: a text stands for all. */
 const bare = (schema, document) => {
@@ -75,8 +78,11 @@ export function SubmitPage({ options }) {
 function Form({ document, source, options }) {
   const request = document.components.schemas.JobRequest.properties;
   const algorithms = bare(request.algorithm, document).enum;
+  const kinds = (request.kind?.enum ?? ['train']).filter((kind) => kind && (kind === 'train' || KINDS[kind]));
   const start = {
     name: source?.name ?? '', algorithm: source?.algorithm ?? options.get('algorithm') ?? 'qedgix', preset: source?.preset ?? 'practical', seeds: String(source?.seed ?? 1),
+    kind: kinds.includes(source?.kind ?? options.get('kind')) ? source?.kind ?? options.get('kind') : 'train', notes: source?.notes ?? '', timeout: '', stop: '',
+    policies: source?.evaluation?.policies?.join(', ') ?? options.get('policies') ?? '', layouts: 'eval-v1', episodes: '', grid: '', repeats: '',
     threads: source ? String(source.threads) : '', priority: source?.priority ? String(source.priority) : '', labels: Object.entries(source?.labels ?? {}).map(([k, v]) => `${k}=${v}`).join(', '),
   };
   const [basics, setBasics] = useState(start);
@@ -122,19 +128,30 @@ function Form({ document, source, options }) {
     }
     setBusy(false);
   };
-  const visible = all.filter(([path, schema]) => `${path} ${schema.description ?? ''}`.toLowerCase().includes(search.toLowerCase()));
+  const evaluates = basics.kind === 'evaluate';
+  const visible = all.filter(([path]) => !evaluates || path.startsWith('environment.')).filter(([path, schema]) => `${path} ${schema.description ?? ''}`.toLowerCase().includes(search.toLowerCase()));
   const wrong = (field) => (error?.field === field ? error.message : null);
+  const text = (name, label, hint, field) => html`<${Field} label=${label} hint=${hint} error=${wrong(field)}><input value=${basics[name]} onInput=${(e) => set(name)(e.target.value)} /><//>`;
   return html`<form onSubmit=${submit} class="submit">
     <${Card}>
       <div class="form">
         <${Field} label="Name" hint="Of the job and of the policy that it publishes. Empty: none." error=${wrong('name')}><input value=${basics.name} maxlength="63" onInput=${(e) => set('name')(e.target.value)} /><//>
-        <${Field} label="Algorithm" error=${wrong('algorithm')}><${Choice} value=${basics.algorithm} options=${algorithms} onChange=${set('algorithm')} /><//>
+        ${kinds.length > 1 && html`<${Field} label="Kind" error=${wrong('kind')}><${Choice} value=${basics.kind} options=${kinds.map((kind) => [kind, KINDS[kind]])} onChange=${set('kind')} /><//>`}
+        ${!evaluates && html`<${Field} label="Algorithm" error=${wrong('algorithm')}><${Choice} value=${basics.algorithm} options=${algorithms} onChange=${set('algorithm')} /><//>
         <${Field} label="Preset" hint="What the settings below start from." error=${wrong('preset')}><${Choice} value=${basics.preset} options=${bare(request.preset, document).enum.map((p) => [p, PRESETS[p] ?? p])} onChange=${set('preset')} /><//>
-        <${Field} label="Seeds" hint="One job per seed: 1 or 1, 2, 5-8." error=${wrong('seed')}><input value=${basics.seeds} inputmode="numeric" required onInput=${(e) => set('seeds')(e.target.value)} /><//>
+        ${basics.kind === 'sweep' ? text('repeats', 'Seeds of each combination', 'Empty: 1.', 'sweep.seeds') : html`<${Field} label="Seeds" hint="One job per seed: 1 or 1, 2, 5-8." error=${wrong('seed')}><input value=${basics.seeds} inputmode="numeric" required onInput=${(e) => set('seeds')(e.target.value)} /><//>`}`}
+        ${evaluates && html`${text('policies', 'Policies', 'Separated by commas: qedgix, my-policy@live, sweep.', 'evaluation.policies')}
+          <${Field} label="Layouts"><${Choice} value=${basics.layouts} options=${['eval-v1', 'valid-v1']} onChange=${set('layouts')} /><//>
+          ${text('episodes', 'Number of layouts', 'Empty: 256.', 'evaluation.episodes')}`}
         <${Field} label="Threads" hint=${`1 to ${request.threads.maximum}, the CPU budget. Empty: the server decides.`} error=${wrong('threads')}><input value=${basics.threads} inputmode="numeric" onInput=${(e) => set('threads')(e.target.value)} /><//>
         <${Field} label="Priority" hint="-100 to 100; higher starts first. Empty: 0." error=${wrong('priority')}><input value=${basics.priority} onInput=${(e) => set('priority')(e.target.value)} /><//>
         <${Field} label="Labels" hint="key=value, key=value" error=${wrong('labels')}><input value=${basics.labels} onInput=${(e) => set('labels')(e.target.value)} /><//>
+        ${request.timeout && !evaluates && text('timeout', 'Time limit', 'Seconds that the job may run. Empty: none.', 'timeout')}
+        ${request.stop && !evaluates && text('stop', 'Stop early', 'When the mean AoI of an evaluation is at most this. Empty: never.', 'stop.at_most')}
+        ${request.notes && text('notes', 'Notes', 'For people.', 'notes')}
       </div>
+      ${basics.kind === 'sweep' && html`<${Field} label="What varies" hint="One line per field, with its values; all combinations are trained." error=${wrong('sweep.grid')}>
+        <textarea rows="4" placeholder=${'training.learning_rate: 0.0003, 0.001\nalgorithm: qmix, qedgix'} value=${basics.grid} onInput=${(e) => set('grid')(e.target.value)}></textarea><//>`}
     <//>
     <${Card} title="Settings" actions=${html`<input type="search" aria-label="Search settings" placeholder="Search settings" value=${search} onInput=${(e) => setSearch(e.target.value)} />`}>
       <p class="hint">${source ? 'All settings of the cloned job. Changed ones are marked.' : 'An empty field keeps the value of the preset.'}</p>
@@ -165,26 +182,53 @@ function Setting({ path, schema, value, changed, cloned, error, change }) {
     <span class="hint">${schema.description ?? ''}${range ? ` (${range})` : ''}</span></div>`;
 }
 
+/** `field: value, value` per line, as the fields of a sweep. Values are JSON where they can be. */
+function grid(text, failed) {
+  const fields = {};
+  for (const line of text.split('\n').map((l) => l.trim()).filter(Boolean)) {
+    const [, field, values] = /^([A-Za-z_.]+)\s*[:=]\s*(.+)$/.exec(line) ?? [];
+    if (!field) throw failed('sweep.grid', `“${line}” is not FIELD: VALUE, VALUE.`);
+    fields[field] = values.split(',').map((value) => {
+      try {
+        return JSON.parse(value);
+      } catch {
+        return value.trim();
+      }
+    });
+  }
+  if (!Object.keys(fields).length) throw failed('sweep.grid', 'At least one field is needed.');
+  return fields;
+}
+
 /** The requests of the form: one job per seed. */
 function bodies(basics, values, all, source) {
   const failed = (field, problem) => Object.assign(new Error(problem), { field });
-  const body = { algorithm: basics.algorithm, preset: basics.preset };
+  const evaluates = basics.kind === 'evaluate';
+  const body = { ...(basics.kind === 'train' ? {} : { kind: basics.kind }), ...(evaluates ? {} : { algorithm: basics.algorithm, preset: basics.preset }) };
   if (basics.name.trim()) body.name = basics.name.trim();
-  for (const name of ['threads', 'priority']) {
+  if (basics.notes) body.notes = basics.notes;
+  for (const name of ['threads', 'priority', 'timeout']) {
     if (basics[name].trim() === '') continue;
     if (!/^-?\d+$/.test(basics[name].trim())) throw failed(name, 'A whole number is expected.');
     body[name] = Number(basics[name]);
   }
-  for (const pair of basics.labels.split(',').map((p) => p.trim()).filter(Boolean)) {
-    const [, key, value] = /^([^=]+)=(.*)$/.exec(pair) ?? [];
-    if (!key) throw failed('labels', `“${pair}” is not key=value.`);
-    body.labels = { ...body.labels, [key.trim()]: value.trim() };
+  try {
+    if (basics.labels.trim()) body.labels = parseLabels(basics.labels);
+  } catch (problem) {
+    throw failed('labels', problem.message);
   }
-  for (const section of ['environment', 'training']) {
+  if (evaluates) {
+    body.evaluation = { policies: basics.policies.split(/[,\s]+/).filter(Boolean), layouts: basics.layouts, ...(basics.episodes ? { episodes: Number(basics.episodes) } : {}) };
+  } else if (basics.stop.trim()) {
+    if (!Number.isFinite(Number(basics.stop))) throw failed('stop.at_most', 'A number is expected.');
+    body.stop = { metric: 'eval/mean_aoi', at_most: Number(basics.stop) };
+  }
+  if (basics.kind === 'sweep') body.sweep = { grid: grid(basics.grid, failed), ...(basics.repeats ? { seeds: Number(basics.repeats) } : {}) };
+  for (const section of evaluates ? ['environment'] : ['environment', 'training']) {
     if (source?.[section]) body[section] = { ...source[section] };
   }
   for (const [path, schema] of all) {
-    if (!(path in values)) continue;
+    if (!(path in values) || (evaluates && !path.startsWith('environment.'))) continue;
     const [section, name] = path.split('.');
     try {
       body[section] = { ...body[section], [name]: parse(values[path].trim(), schema) };
@@ -192,6 +236,7 @@ function bodies(basics, values, all, source) {
       throw failed(path, `${path}: ${problem.message}`);
     }
   }
+  if (evaluates) return [body];
   let list;
   try {
     list = seeds(basics.seeds);

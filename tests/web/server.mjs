@@ -27,13 +27,13 @@ export class Server {
 
   /** The output of a command on the data directory of the server. */
   run(...args) {
-    return execFileSync(binary, [...args, '--data-dir', this.data], { encoding: 'utf8' });
+    return execFileSync(binary, [...args, '--data-dir', this.data], { encoding: 'utf8', stdio: ['ignore', 'pipe', 'pipe'] });
   }
 
   async start(...flags) {
     const file = join(this.data, 'endpoints.json');
     rmSync(file, { force: true });
-    const args = ['serve', '--grpc-addr', '127.0.0.1:0', '--http-addr', '127.0.0.1:0', '--data-dir', this.data, '--cpu-budget', '1', ...flags];
+    const args = ['serve', '--grpc-addr', '127.0.0.1:0', '--http-addr', `127.0.0.1:${this.port ?? 0}`, '--data-dir', this.data, '--cpu-budget', '1', ...flags];
     this.process = spawn(binary, args, { stdio: ['ignore', 'pipe', 'pipe'] });
     this.log = '';
     for (const stream of [this.process.stdout, this.process.stderr]) stream.on('data', (text) => { this.log += text; });
@@ -43,7 +43,9 @@ export class Server {
       if (this.process.exitCode != null) throw new Error(`the server ended: ${this.log}`);
       return existsSync(file) && readFileSync(file, 'utf8').trim();
     });
+    // A server that is started again has the same address.
     this.url = `http://${JSON.parse(readFileSync(file, 'utf8')).http}`;
+    this.port = new URL(this.url).port;
     return this;
   }
 

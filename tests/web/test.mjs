@@ -184,7 +184,7 @@ const tests = {
     await page.getByRole('heading', { name: '200' }).waitFor();
     await page.getByLabel('Response').filter({ hasText: 'heading_index' }).waitFor();
     await page.getByRole('link', { name: 'GET /v1/jobs/{id}/events' }).click();
-    await page.getByLabel('id', { exact: false }).first().fill((await main.call('GET', '/v1/jobs')).jobs[0].id);
+    await page.getByLabel('id', { exact: false }).first().fill(await main.submit('web-console'));
     await page.getByRole('button', { name: 'Send' }).click();
     await page.getByLabel('Response').filter({ hasText: 'event: state' }).waitFor();
   },
@@ -231,7 +231,7 @@ const tests = {
     await server.stop();
     await page.getByRole('alert').filter({ hasText: 'The server does not answer' }).first().waitFor();
     await page.locator('.status-state', { hasText: 'not reachable' }).waitFor();
-    await server.start('--http-addr', new URL(server.url).host);
+    await server.start();
     await page.locator('.status-state', { hasText: /^ready$/ }).waitFor();
     await until('the errors are gone', async () => (await page.getByRole('alert').count()) === 0);
     const missing = await open(`${server.url}/#/jobs/nothing`, { expected: /404/ });
