@@ -240,13 +240,7 @@ impl TrainConfig {
         training: &Map<String, Value>,
         seed: u64,
     ) -> Result<Self, Invalid> {
-        let base = Self::preset(algorithm, preset);
-        let mut config = Self {
-            environment: overridden("environment", &base.environment, environment)?,
-            training: overridden("training", &base.training, training)?,
-            seed,
-            ..base
-        };
+        let mut config = Self { seed, ..Self::preset(algorithm, preset).with_fields(environment, training)? };
         if config.environment.reward_scale.is_none() {
             let env = &config.environment;
             let scale = if preset == Preset::Authors { env.users as f64 } else { env.effective_reward_scale() };
@@ -254,6 +248,18 @@ impl TrainConfig {
         }
         config.validate()?;
         Ok(config)
+    }
+
+    /// This configuration with other values of some fields. Their ranges and combination are not checked.
+    ///
+    /// # Errors
+    /// [`Invalid`] for the first field that is unknown or of the wrong type.
+    pub fn with_fields(&self, environment: &Map<String, Value>, training: &Map<String, Value>) -> Result<Self, Invalid> {
+        Ok(Self {
+            environment: overridden("environment", &self.environment, environment)?,
+            training: overridden("training", &self.training, training)?,
+            ..self.clone()
+        })
     }
 
     /// The architecture of the agents.
@@ -408,12 +414,17 @@ pub fn floats_to_integers(value: &mut Value) {
     }
 }
 
+/// The name of a field that a document may call by its symbol.
+pub fn field_name(key: &str) -> &str {
+    PAPER_SYMBOLS.iter().find(|(symbol, _)| *symbol == key).map_or(key, |(_, name)| name)
+}
+
 /// `base` with the fields of `patch` overridden, one at a time, so that an error names the invalid field.
 fn overridden<T: Serialize + DeserializeOwned>(section: &str, base: &T, patch: &Map<String, Value>) -> Result<T, Invalid> {
     let mut fields = serde_json::to_value(base).expect("a configuration is plain data");
     let known: Vec<String> = fields.as_object().into_iter().flatten().map(|(name, _)| name.clone()).collect();
     for (key, value) in patch {
-        let name = PAPER_SYMBOLS.iter().find(|(symbol, _)| symbol == key).map_or(key.as_str(), |(_, name)| name);
+        let name = field_name(key);
         if !known.iter().any(|k| k == name) {
             return Err(Invalid::unknown_field(format!("{section}.{key}"), format!("one of {}", known.join(", "))));
         }

@@ -170,6 +170,10 @@ fn a_dry_run_lists_the_runs_without_running_them() {
     assert_eq!(listed.lines().filter(|line| line.contains("to do")).count(), 12, "{listed}");
     assert!(listed.contains("QMIX, 3 users, seed 9"), "{listed}");
     assert!(!dir.path().join("results").exists());
+    for (number, seeds) in [("1", "1"), ("4", "1,2,3,4")] {
+        let first = run_successfully(dir.path(), &["tiny.toml", "--dry-run", "--num-seeds", number]);
+        assert_eq!(first, run_successfully(dir.path(), &["tiny.toml", "--dry-run", "--seeds", seeds]));
+    }
     let other = run_successfully(dir.path(), &["tiny.toml", "--dry-run", "--seeds", "7", "--set", "training.gamma=0.9"]);
     let folder = |text: &str| text.lines().nth(1).unwrap().rsplit(' ').next().unwrap().to_owned();
     assert_ne!(folder(&listed), folder(&other), "another configuration has another folder");
@@ -206,6 +210,10 @@ fn errors_name_the_file_the_table_and_the_field() {
         (vec!["tiny.toml", "--set", "training.bach=3"], "training.bach"),
         (vec!["tiny.toml", "--set", "bach=3"], "environment.FIELD"),
         (vec!["tiny.toml", "--steps", "0"], "training.steps"),
+        (vec!["tiny.toml", "--set", "environment.users=3"], "points[0] sets it"),
+        (vec!["tiny.toml", "--set", "environment.N=3", "--point", "3 users"], "on the command line, environment.N: got 3"),
+        (vec!["tiny.toml", "--num-seeds", "0"], "--num-seeds"),
+        (vec!["tiny.toml", "--num-seeds", "1", "--seeds", "1"], "--num-seeds"),
         (vec!["tiny.toml", "--series", "nobody"], "\"nobody\""),
         (vec!["tiny.toml", "--point", "nowhere"], "\"nowhere\""),
         (vec!["absent.toml"], "absent.toml"),

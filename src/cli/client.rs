@@ -1,26 +1,95 @@
 //! A client of the REST interface for commands that use a server.
 
+use std::io::Write;
 use std::time::Duration;
 
-use anyhow::{Context, bail};
-use axum::http::{HeaderMap, Method, header};
+use anyhow::Context;
+use axum::http::{HeaderMap, Method, Uri, header};
+use reqwest::Response;
 use reqwest::redirect::Policy;
 use serde_json::Value;
 
 use super::connect::ConnectArgs;
+use super::ports;
 
 /// Timeout of a request.
 const TIMEOUT: Duration = Duration::from_secs(60);
 /// Timeout of an upload or download of a checkpoint.
 const TRANSFER_TIMEOUT: Duration = Duration::from_secs(600);
-/// Time between two queries of a job's state.
-const JOB_POLL: Duration = Duration::from_millis(250);
+/// Timeout for opening a connection.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(20);
 
 /// A client of one server.
 #[derive(Clone, Debug)]
 pub struct Client {
     http: reqwest::Client,
+    url: Uri,
     base: String,
+    connect: ConnectArgs,
+}
+
+/// Why a request failed.
+#[derive(Debug, thiserror::Error)]
+pub enum ClientError {
+    /// The server refused it.
+    #[error("{path}: {detail}{}", in_brackets(.code))]
+    Refused {
+        /// Path of the request.
+        path: String,
+        /// HTTP status.
+        status: u16,
+        /// Code of the error; empty if the response has none.
+        code: String,
+        /// What is wrong.
+        detail: String,
+    },
+    /// No response arrived, or not all of it.
+    #[error("{problem}")]
+    Unreachable {
+        /// What happened, with the address.
+        problem: String,
+        /// The cause.
+        #[source]
+        source: reqwest::Error,
+    },
+    /// The address is that of another port.
+    #[error("{0} is the gRPC port of the server; expected its REST port (--http-addr of `qedgix serve`)")]
+    GrpcPort(String),
+}
+
+fn in_brackets(code: &str) -> String {
+    if code.is_empty() { String::new() } else { format!(" ({code})") }
+}
+
+impl ClientError {
+    /// Whether the same request may succeed later: the server restarts, drains, or has too much to do.
+    pub fn is_temporary(&self) -> bool {
+        match self {
+            Self::Refused { status, .. } => matches!(status, 429 | 502 | 503 | 504),
+            Self::Unreachable { .. } => true,
+            Self::GrpcPort(_) => false,
+        }
+    }
+}
+
+/// A request: its method, path, and body with its media type.
+struct Request<'a> {
+    method: Method,
+    path: &'a str,
+    body: Option<(&'a str, Vec<u8>)>,
+    idempotency_key: Option<&'a str>,
+    /// None: the response may take for ever.
+    timeout: Option<Duration>,
+}
+
+impl<'a> Request<'a> {
+    fn new(method: Method, path: &'a str) -> Self {
+        Self { method, path, body: None, idempotency_key: None, timeout: Some(TIMEOUT) }
+    }
+
+    fn json(method: Method, path: &'a str, body: &Value) -> Self {
+        Self { body: Some(("application/json", body.to_string().into_bytes())), ..Self::new(method, path) }
+    }
 }
 
 impl Client {
@@ -35,115 +104,146 @@ impl Client {
             .tls_backend_preconfigured(args.tls(&url)?)
             .default_headers(headers)
             .redirect(Policy::none())
+            .connect_timeout(CONNECT_TIMEOUT)
             .no_proxy()
             .build()
             .context("cannot create an HTTP client")?;
-        Ok(Self { http, base: url.to_string().trim_end_matches('/').to_owned() })
+        Ok(Self { http, base: url.to_string().trim_end_matches('/').to_owned(), url, connect: args.clone() })
+    }
+
+    /// The URL of the server.
+    pub fn base(&self) -> &str {
+        &self.base
     }
 
     /// `GET path`.
     ///
     /// # Errors
     /// The server cannot be reached, or returns an error, whose detail and code the message contains.
-    pub async fn get(&self, path: &str) -> anyhow::Result<Value> {
-        self.json(Method::GET, path, None).await
+    pub async fn get(&self, path: &str) -> Result<Value, ClientError> {
+        self.value(Request::new(Method::GET, path)).await
     }
 
     /// `POST path` with a JSON body.
     ///
     /// # Errors
     /// As [`Client::get`].
-    pub async fn post(&self, path: &str, body: &Value) -> anyhow::Result<Value> {
-        self.json(Method::POST, path, Some(body)).await
+    pub async fn post(&self, path: &str, body: &Value) -> Result<Value, ClientError> {
+        self.value(Request::json(Method::POST, path, body)).await
+    }
+
+    /// `POST path` with a JSON body and an idempotency key.
+    ///
+    /// # Errors
+    /// As [`Client::get`].
+    pub async fn post_once(&self, path: &str, body: &Value, key: &str) -> Result<Value, ClientError> {
+        self.value(Request { idempotency_key: Some(key), ..Request::json(Method::POST, path, body) }).await
     }
 
     /// `PUT path` with a JSON body.
     ///
     /// # Errors
     /// As [`Client::get`].
-    pub async fn put(&self, path: &str, body: &Value) -> anyhow::Result<Value> {
-        self.json(Method::PUT, path, Some(body)).await
+    pub async fn put(&self, path: &str, body: &Value) -> Result<Value, ClientError> {
+        self.value(Request::json(Method::PUT, path, body)).await
     }
 
     /// `DELETE path`.
     ///
     /// # Errors
     /// As [`Client::get`].
-    pub async fn delete(&self, path: &str) -> anyhow::Result<Value> {
-        self.json(Method::DELETE, path, None).await
+    pub async fn delete(&self, path: &str) -> Result<Value, ClientError> {
+        self.value(Request::new(Method::DELETE, path)).await
     }
 
     /// `POST path` with a binary body. The timeout is 10 minutes.
     ///
     /// # Errors
     /// As [`Client::get`].
-    pub async fn upload(&self, path: &str, bytes: Vec<u8>) -> anyhow::Result<Value> {
-        let body = self.send(Method::POST, path, Some(("application/octet-stream", bytes)), TRANSFER_TIMEOUT).await?;
-        Ok(serde_json::from_slice(&body).unwrap_or(Value::Null))
+    pub async fn upload(&self, path: &str, bytes: Vec<u8>) -> Result<Value, ClientError> {
+        let body = Some(("application/octet-stream", bytes));
+        self.value(Request { body, timeout: Some(TRANSFER_TIMEOUT), ..Request::new(Method::POST, path) }).await
     }
 
     /// `GET path`, which returns binary data. The timeout is 10 minutes.
     ///
     /// # Errors
     /// As [`Client::get`].
-    pub async fn download(&self, path: &str) -> anyhow::Result<Vec<u8>> {
-        self.send(Method::GET, path, None, TRANSFER_TIMEOUT).await
+    pub async fn download(&self, path: &str) -> Result<Vec<u8>, ClientError> {
+        let response = self.send(Request { timeout: Some(TRANSFER_TIMEOUT), ..Request::new(Method::GET, path) }).await?;
+        Ok(response.bytes().await.map_err(|error| self.unreachable(path, error))?.into())
     }
 
-    async fn json(&self, method: Method, path: &str, body: Option<&Value>) -> anyhow::Result<Value> {
-        let body = body.map(|body| ("application/json", body.to_string().into_bytes()));
-        let response = self.send(method, path, body, TIMEOUT).await?;
-        Ok(serde_json::from_slice(&response).unwrap_or(Value::Null))
-    }
-
-    /// Sends a request, with the media type and bytes of its body, and returns the body of a successful response.
-    async fn send(
-        &self,
-        method: Method,
-        path: &str,
-        body: Option<(&str, Vec<u8>)>,
-        timeout: Duration,
-    ) -> anyhow::Result<Vec<u8>> {
-        let url = format!("{}{path}", self.base);
-        let mut request = self.http.request(method, &url).timeout(timeout);
-        if let Some((media_type, bytes)) = body {
-            request = request.header(header::CONTENT_TYPE, media_type).body(bytes);
-        }
-        let failed = |error: reqwest::Error| {
-            let problem = if error.is_timeout() {
-                format!("{url}: no response within {} s", timeout.as_secs())
-            } else if error.is_body() || error.is_decode() {
-                format!("{url}: the response is incomplete")
-            } else {
-                format!("cannot reach {url}")
-            };
-            anyhow::Error::new(error.without_url()).context(problem)
-        };
-        let response = request.send().await.map_err(failed)?;
-        let status = response.status();
-        let body = response.bytes().await.map_err(failed)?;
-        if !status.is_success() {
-            let problem: Value = serde_json::from_slice(&body).unwrap_or(Value::Null);
-            let code = problem["code"].as_str().map(|code| format!(" ({code})")).unwrap_or_default();
-            bail!("{path}: {}{code}", problem["detail"].as_str().unwrap_or(status.as_str()));
-        }
-        Ok(body.into())
-    }
-
-    /// Waits until a job has ended, and calls `report` with the job at every poll.
+    /// `GET path`, and writes the response to `out` as it arrives. The timeout is 10 minutes.
     ///
     /// # Errors
-    /// The server cannot be reached, or the job failed or was cancelled.
-    pub async fn wait_for_job(&self, id: &str, mut report: impl FnMut(&Value)) -> anyhow::Result<Value> {
-        loop {
-            let job = self.get(&format!("/v1/jobs/{id}")).await?;
-            report(&job);
-            match job["state"].as_str() {
-                Some("succeeded") => return Ok(job),
-                Some("failed") => bail!("job {id} failed: {}", job["reason"].as_str().unwrap_or("no reason given")),
-                Some("cancelled") => bail!("job {id} was cancelled"),
-                _ => tokio::time::sleep(JOB_POLL).await,
-            }
+    /// As [`Client::get`]; or `out` cannot be written.
+    pub async fn download_into(&self, path: &str, out: &mut impl Write) -> anyhow::Result<()> {
+        let mut response = self.send(Request { timeout: Some(TRANSFER_TIMEOUT), ..Request::new(Method::GET, path) }).await?;
+        while let Some(bytes) = response.chunk().await.map_err(|error| self.unreachable(path, error))? {
+            out.write_all(&bytes)?;
         }
+        Ok(())
+    }
+
+    /// `GET path`, whose response is read as it arrives and may take for ever.
+    ///
+    /// # Errors
+    /// As [`Client::get`].
+    pub async fn stream(&self, path: &str) -> Result<Response, ClientError> {
+        self.send(Request { timeout: None, ..Request::new(Method::GET, path) }).await
+    }
+
+    async fn value(&self, request: Request<'_>) -> Result<Value, ClientError> {
+        let path = request.path.to_owned();
+        let body = self.send(request).await?.bytes().await.map_err(|error| self.unreachable(&path, error))?;
+        Ok(serde_json::from_slice(&body).unwrap_or(Value::Null))
+    }
+
+    /// Sends a request and returns a successful response.
+    async fn send(&self, request: Request<'_>) -> Result<Response, ClientError> {
+        let Request { method, path, body, idempotency_key, timeout } = request;
+        let mut sent = self.http.request(method, format!("{}{path}", self.base));
+        if let Some(timeout) = timeout {
+            sent = sent.timeout(timeout);
+        }
+        if let Some((media_type, bytes)) = body {
+            sent = sent.header(header::CONTENT_TYPE, media_type).body(bytes);
+        }
+        if let Some(key) = idempotency_key {
+            sent = sent.header("idempotency-key", key);
+        }
+        let response = match sent.send().await {
+            Ok(response) => response,
+            // Something listens there, and does not speak HTTP/1.
+            Err(error) if !error.is_connect() && !error.is_timeout() && ports::is_grpc(&self.url, &self.connect).await => {
+                return Err(ClientError::GrpcPort(self.base.clone()));
+            }
+            Err(error) => return Err(self.unreachable(path, error)),
+        };
+        let status = response.status();
+        if status.is_success() {
+            return Ok(response);
+        }
+        let body = response.bytes().await.map_err(|error| self.unreachable(path, error))?;
+        let problem: Value = serde_json::from_slice(&body).unwrap_or(Value::Null);
+        Err(ClientError::Refused {
+            path: path.to_owned(),
+            status: status.as_u16(),
+            code: problem["code"].as_str().unwrap_or_default().to_owned(),
+            detail: problem["detail"].as_str().unwrap_or(status.as_str()).to_owned(),
+        })
+    }
+
+    fn unreachable(&self, path: &str, error: reqwest::Error) -> ClientError {
+        let url = format!("{}{path}", self.base);
+        let problem = if error.is_timeout() {
+            format!("{url}: no response in time")
+        } else if error.is_body() || error.is_decode() {
+            format!("{url}: the response is incomplete")
+        } else {
+            format!("cannot reach {url}")
+        };
+        ClientError::Unreachable { problem, source: error.without_url() }
     }
 }

@@ -13,7 +13,7 @@ use super::client::Client;
 use super::connect::ConnectArgs;
 use super::in_process_server::InProcessServer;
 use super::output::outln;
-use super::run_args::all_cores;
+use super::run_args::{all_cores, count};
 use super::{act_client, progress, table, train};
 use crate::env::EnvConfig;
 use crate::learner::{Algorithm, Summary, difference, layout_list, summarize};
@@ -28,7 +28,7 @@ pub struct DemoArgs {
     #[arg(long)]
     keep: bool,
     /// Environment steps of the training job
-    #[arg(long, env = "QEDGIX_STEPS", default_value_t = 100_000, value_name = "STEPS")]
+    #[arg(long, env = "QEDGIX_STEPS", default_value_t = 100_000, value_name = "STEPS", value_parser = count)]
     steps: u64,
     /// Number of layouts of eval-v1 on which policies are compared
     #[arg(long, env = "QEDGIX_EPISODES", default_value_t = 32, value_name = "LAYOUTS")]
@@ -100,7 +100,7 @@ async fn run_in(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
         "threads": all_cores(),
     });
     outln!("\n2. A training job over REST: POST /v1/jobs {job}")?;
-    let ended = train::submit(&client, &job).await?;
+    let ended = train::run_job(&client, &job).await?;
     let id = ended["id"].as_str().context("the job has no id")?;
     print_curve(&client, id).await?;
     let policy = ended["policy"].as_str().context("the job published no policy")?;

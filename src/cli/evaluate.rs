@@ -9,7 +9,7 @@ use clap::Args;
 use super::comparison::{Comparison, PolicyEvaluation};
 use super::connect::ConnectArgs;
 use super::output::outln;
-use super::{act_client, progress, report, run_args::all_cores, table};
+use super::{act_client, ports, progress, report, run_args::all_cores, table};
 use crate::checkpoint::Checkpoint;
 use crate::env::EnvConfig;
 use crate::learner::{Disturbance, LayoutList, LostUav, TracedEvaluation, Trajectory, evaluate_traced, layout_list};
@@ -65,8 +65,8 @@ pub struct EvaluateArgs {
     /// Threads [default: all cores]
     #[arg(long, env = "QEDGIX_THREADS")]
     threads: Option<usize>,
-    /// Evaluate through gRPC Act of the server at HOST:PORT
-    #[arg(long, env = "QEDGIX_SERVER", value_name = "HOST:PORT")]
+    /// Evaluate through Act of the server at this gRPC address
+    #[arg(long, env = "QEDGIX_GRPC_SERVER", value_name = "HOST:PORT")]
     server: Option<String>,
     #[command(flatten)]
     connect: ConnectArgs,
@@ -98,7 +98,10 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
         args.policy.iter().map(|name| (name.as_str(), false)).chain(references.map(|name| (name, true))).collect();
 
     let mut server = match &args.server {
-        Some(address) => Some(act_client::connect(address, &args.connect).await?),
+        Some(address) => {
+            ports::expect_grpc(address, &args.connect).await?;
+            Some(act_client::connect(address, &args.connect).await?)
+        }
         None => None,
     };
     let bar = progress::bar(names.len() as u64, "policies");

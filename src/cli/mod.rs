@@ -11,13 +11,17 @@ mod evaluate;
 mod experiment;
 mod files;
 mod in_process_server;
+mod jobs;
 mod keys;
 mod output;
 mod policies;
+mod ports;
 mod progress;
 mod report;
+mod rest;
 mod run_args;
 mod serve;
+mod signals;
 mod table;
 mod train;
 mod worker;
@@ -44,6 +48,8 @@ enum Command {
     Demo(demo::DemoArgs),
     /// Train a policy in this process or as a job of a server
     Train(train::TrainArgs),
+    /// Submit, list, watch, stop, compare and export jobs of a server
+    Jobs(jobs::JobsArgs),
     /// Compare policies on fixed layouts
     Evaluate(evaluate::EvaluateArgs),
     /// List, upload, export, load and unload policies of a server, and move aliases
@@ -72,6 +78,7 @@ pub fn run() -> ExitCode {
         Command::Serve(args) => block_on(serve::run(args)),
         Command::Demo(args) => block_on(demo::run(args)),
         Command::Train(args) => block_on(train::run(args)),
+        Command::Jobs(args) => block_on(jobs::run(args)),
         Command::Evaluate(args) => block_on(evaluate::run(args)),
         Command::Policies(args) => block_on(policies::run(args)),
         Command::Experiment(args) => block_on(experiment::run(args)),

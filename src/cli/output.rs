@@ -27,6 +27,23 @@ const BROKEN_PIPE: u8 = 141;
 #[error("cannot write to standard output")]
 pub struct OutputError(#[from] io::Error);
 
+/// Ends the process with a status other than 1. The message is printed as it is; an empty one is not printed.
+#[derive(Debug, thiserror::Error)]
+#[error("{message}")]
+pub struct Exit {
+    /// The exit status.
+    pub code: u8,
+    /// The last line on standard error.
+    pub message: String,
+}
+
+impl Exit {
+    /// An exit with this status and message.
+    pub fn new(code: u8, message: impl Into<String>) -> Self {
+        Self { code, message: message.into() }
+    }
+}
+
 /// Implements `outln!`.
 ///
 /// # Errors
@@ -49,6 +66,12 @@ pub fn exit_code(result: anyhow::Result<()>) -> ExitCode {
     let output = error.downcast_ref::<OutputError>();
     if output.is_some_and(|error| error.0.kind() == io::ErrorKind::BrokenPipe) {
         return ExitCode::from(BROKEN_PIPE);
+    }
+    if let Some(Exit { code, message }) = error.downcast_ref::<Exit>() {
+        if !message.is_empty() {
+            print_error_line(format_args!("{message}"));
+        }
+        return ExitCode::from(*code);
     }
     print_error_line(format_args!("error: {error:#}"));
     ExitCode::FAILURE

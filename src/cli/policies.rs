@@ -4,13 +4,13 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
 use clap::{Args, Subcommand};
-use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, PercentEncode, utf8_percent_encode};
 use serde_json::{Value, json};
 
 use super::client::Client;
 use super::connect::ConnectArgs;
 use super::files::write_atomic;
 use super::output::outln;
+use super::rest::{self, items, query, text};
 use super::table;
 use crate::checkpoint::digest;
 
@@ -288,52 +288,11 @@ fn read(file: &Path) -> anyhow::Result<Vec<u8>> {
     std::fs::read(file).with_context(|| format!("cannot read {}", file.display()))
 }
 
-/// The path of a policy and resources below it. Each segment is percent-encoded.
+/// The path of a policy and resources below it.
 fn path(segments: &[&str]) -> String {
-    segments.iter().fold("/v1/policies".to_owned(), |path, segment| format!("{path}/{}", encode(segment)))
-}
-
-fn query(parameters: &[(&str, Option<String>)]) -> String {
-    let given = parameters.iter().filter_map(|(name, value)| Some(format!("{name}={}", encode(value.as_deref()?))));
-    let given: Vec<String> = given.collect();
-    if given.is_empty() { String::new() } else { format!("?{}", given.join("&")) }
-}
-
-/// Characters that are percent-encoded in segments and query values.
-const ENCODED: &AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'_').remove(b'.').remove(b':').remove(b'@');
-
-fn encode(text: &str) -> PercentEncode<'_> {
-    utf8_percent_encode(text, ENCODED)
-}
-
-fn items<'a>(response: &'a Value, name: &str) -> impl Iterator<Item = &'a Value> {
-    response[name].as_array().into_iter().flatten()
+    rest::path("policies", segments)
 }
 
 fn kind(policy: &Value) -> &'static str {
     if policy["kind"] == "POLICY_KIND_BASELINE" { "baseline" } else { "checkpoint" }
-}
-
-/// A JSON value as text.
-fn text(value: &Value) -> String {
-    match value {
-        Value::Null => "-".to_owned(),
-        Value::String(text) => text.clone(),
-        Value::Array(items) if items.is_empty() => "-".to_owned(),
-        Value::Array(items) => items.iter().map(text).collect::<Vec<_>>().join(", "),
-        other => other.to_string(),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn segments_and_query_values_are_percent_encoded() {
-        assert_eq!(path(&["my policy/..?x", "aliases", "live"]), "/v1/policies/my%20policy%2F..%3Fx/aliases/live");
-        assert_eq!(path(&["mine:3"]), "/v1/policies/mine:3");
-        assert_eq!(query(&[("alias", Some("a&b".into())), ("page_size", None)]), "?alias=a%26b");
-        assert_eq!(query(&[("alias", None)]), "");
-    }
 }

@@ -1,21 +1,24 @@
-//! The flags that describe a training run, shared by `train` and `bench`.
+//! The flags that describe a training run, shared by `train`, `jobs submit` and `bench`.
 
 use anyhow::{Context, bail};
 use clap::Args;
+use serde::Serialize;
 use serde::de::DeserializeOwned;
-use serde_json::{Map, Value, json};
+use serde_json::{Map, Value};
 
+use crate::invalid::Invalid;
 use crate::learner::{Algorithm, Preset, TrainConfig};
+use crate::train_config::floats_to_integers;
 
 /// The training run; values that are not given come from the preset.
 #[derive(Args, Clone, Debug)]
 pub struct RunArgs {
-    /// qedgix, qmix, vdn, iql, agggnn or rgcn
-    #[arg(long, env = "QEDGIX_ALGORITHM", default_value = "qedgix", value_parser = named::<Algorithm>)]
-    pub algorithm: Algorithm,
-    /// practical, paper or authors
-    #[arg(long, env = "QEDGIX_PRESET", default_value = "practical", value_parser = named::<Preset>)]
-    pub preset: Preset,
+    /// qedgix, qmix, vdn, iql, agggnn or rgcn [default: qedgix]
+    #[arg(long, env = "QEDGIX_ALGORITHM", value_parser = named::<Algorithm>)]
+    pub algorithm: Option<Algorithm>,
+    /// practical, paper or authors [default: practical]
+    #[arg(long, env = "QEDGIX_PRESET", value_parser = named::<Preset>)]
+    pub preset: Option<Preset>,
     /// Number of UAVs [preset: 3]
     #[arg(long, env = "QEDGIX_UAVS")]
     pub uavs: Option<usize>,
@@ -25,12 +28,12 @@ pub struct RunArgs {
     /// Slots per episode [preset: 80]
     #[arg(long, env = "QEDGIX_SLOTS")]
     pub slots: Option<usize>,
-    /// Environment steps to train for [preset: 2050000]
-    #[arg(long, env = "QEDGIX_STEPS")]
+    /// Environment steps to train for, as 400000, 400_000 or 4e5 [preset: 2050000]
+    #[arg(long, env = "QEDGIX_STEPS", value_parser = count)]
     pub steps: Option<u64>,
-    /// Seed of every random stream
-    #[arg(long, env = "QEDGIX_SEED", default_value_t = 1)]
-    pub seed: u64,
+    /// Seed of every random stream [default: 1]
+    #[arg(long, env = "QEDGIX_SEED")]
+    pub seed: Option<u64>,
     /// Overrides one field of the configuration; may be repeated
     #[arg(long = "set", value_name = "SECTION.FIELD=VALUE")]
     pub set: Vec<String>,
@@ -62,29 +65,86 @@ impl RunArgs {
     /// A field is unknown, of the wrong type or out of range.
     pub fn resolve(&self) -> anyhow::Result<TrainConfig> {
         let (environment, training) = self.sections()?;
-        Ok(TrainConfig::resolve(self.algorithm, self.preset, &environment, &training, self.seed)?)
+        let (algorithm, preset) = (self.algorithm.unwrap_or_default(), self.preset.unwrap_or_default());
+        Ok(TrainConfig::resolve(algorithm, preset, &environment, &training, self.seed.unwrap_or(1))?)
     }
 
-    /// The body of a request that submits this run as a job.
+    /// Checks that no flag contradicts the configuration of a snapshot.
     ///
     /// # Errors
-    /// As [`RunArgs::sections`].
-    pub fn job(&self, threads: usize, name: Option<&str>) -> anyhow::Result<Value> {
+    /// [`Invalid`] with the field, its value on the command line and its value in the snapshot.
+    pub fn agree_with(&self, config: &TrainConfig) -> anyhow::Result<()> {
         let (environment, training) = self.sections()?;
-        let mut job = json!({
-            "kind": "train",
-            "algorithm": self.algorithm,
-            "preset": self.preset,
-            "environment": environment,
-            "training": training,
-            "threads": threads,
-            "seed": self.seed,
-        });
-        if let Some(name) = name {
-            job["name"] = name.into();
+        let wanted = TrainConfig {
+            algorithm: self.algorithm.unwrap_or(config.algorithm),
+            preset: self.preset.unwrap_or(config.preset),
+            seed: self.seed.unwrap_or(config.seed),
+            ..config.with_fields(&environment, &training)?
+        };
+        let fields = |config: &TrainConfig| serde_json::to_value(config).expect("a configuration is plain data");
+        match first_difference("", &fields(&wanted), &fields(config)) {
+            None => Ok(()),
+            Some((field, wanted, had)) => {
+                Err(Invalid::new(field, wanted, format!("{had}, the value of the run that is resumed, or no value")).into())
+            }
         }
-        Ok(job)
     }
+
+    /// Writes what the flags say into the body of a request that submits a job. What they do not say is left to the server.
+    ///
+    /// # Errors
+    /// As [`RunArgs::sections`]; or a section of `job` is not an object.
+    pub fn write_into(&self, job: &mut Map<String, Value>) -> anyhow::Result<()> {
+        let (environment, training) = self.sections()?;
+        for (name, fields) in [("environment", environment), ("training", training)] {
+            if !fields.is_empty() {
+                let section = job.entry(name).or_insert_with(|| Map::new().into());
+                section.as_object_mut().with_context(|| format!("{name}: expected an object"))?.extend(fields);
+            }
+        }
+        insert(job, "algorithm", self.algorithm);
+        insert(job, "preset", self.preset);
+        insert(job, "seed", self.seed);
+        Ok(())
+    }
+}
+
+/// Inserts a value that is given.
+pub fn insert(fields: &mut Map<String, Value>, name: &str, value: Option<impl Serialize>) {
+    if let Some(value) = value {
+        fields.insert(name.to_owned(), serde_json::to_value(value).expect("a flag is plain data"));
+    }
+}
+
+/// The first field in which two documents of the same form differ: its path and both values.
+fn first_difference<'a>(path: &str, one: &'a Value, other: &'a Value) -> Option<(String, &'a Value, &'a Value)> {
+    match (one, other) {
+        (Value::Object(fields), Value::Object(others)) => fields.iter().find_map(|(name, value)| {
+            let dot = if path.is_empty() { "" } else { "." };
+            first_difference(&format!("{path}{dot}{name}"), value, others.get(name).unwrap_or(&Value::Null))
+        }),
+        _ => (one != other).then(|| (path.to_owned(), one, other)),
+    }
+}
+
+/// Parses a number of things: `400000`, `400_000` or `4e5`.
+///
+/// # Errors
+/// The text is not a whole number from 0 to 2^64 - 1.
+pub fn count(text: &str) -> Result<u64, String> {
+    let plain = without_separators(text);
+    let whole = |x: &f64| x.fract() == 0.0 && (0.0..=2f64.powi(53)).contains(x);
+    let number = plain.parse().ok().or_else(|| plain.parse().ok().filter(whole).map(|x| x as u64));
+    number.ok_or_else(|| "expected a whole number, as 400000, 400_000 or 4e5".to_owned())
+}
+
+/// A number without the underscores between its digits; other text as it is.
+fn without_separators(text: &str) -> String {
+    let number = text.starts_with(|c: char| c.is_ascii_digit() || c == '-')
+        && text.ends_with(|c: char| c.is_ascii_digit())
+        && text.chars().all(|c| c.is_ascii_digit() || matches!(c, '_' | '.' | '-' | '+' | 'e' | 'E'))
+        && !text.contains("__");
+    if number { text.replace('_', "") } else { text.to_owned() }
 }
 
 /// Inserts items `environment.FIELD=VALUE` and `training.FIELD=VALUE` into the sections.
@@ -95,7 +155,8 @@ pub fn set(items: &[String], environment: &mut Map<String, Value>, training: &mu
     for item in items {
         let (path, text) = item.split_once('=').with_context(|| format!("--set {item}: expected SECTION.FIELD=VALUE"))?;
         // Text that is not JSON is a string, so that `training.mixer=qmix` needs no quotes.
-        let value = serde_json::from_str(text).unwrap_or_else(|_| Value::String(text.to_owned()));
+        let mut value = serde_json::from_str(&without_separators(text)).unwrap_or_else(|_| Value::String(text.to_owned()));
+        floats_to_integers(&mut value);
         match path.split_once('.') {
             Some(("environment", field)) => environment.insert(field.to_owned(), value),
             Some(("training", field)) => training.insert(field.to_owned(), value),
@@ -143,6 +204,50 @@ mod tests {
         assert_eq!(config.training.mixer, crate::learner::MixerKind::Qmix);
         assert!(config.environment.hover);
         assert_eq!(config.training.batch, 32, "untouched fields keep the preset's value");
+    }
+
+    #[test]
+    fn counts_are_written_as_people_write_them() {
+        for (text, value) in [("0", 0), ("400000", 400_000), ("1_000_000", 1_000_000), ("1e6", 1_000_000), ("2.5e3", 2500)] {
+            assert_eq!(count(text), Ok(value), "{text}");
+            let config = parse(&["--set", &format!("training.eval_every={text}"), "--steps", text]).unwrap();
+            assert_eq!(config.sections().unwrap().1["steps"], value, "{text}");
+            assert_eq!(config.sections().unwrap().1["eval_every"], value, "{text}");
+        }
+        assert_eq!(count(&u64::MAX.to_string()), Ok(u64::MAX));
+        for text in ["", "-1", "1.5", "1e-3", "1e300", "nan", "inf", "_1", "1_", "1__0", "1 000", "0x10", "many"] {
+            assert!(count(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn flags_that_contradict_a_resumed_run_are_refused() {
+        let words = ["--algorithm", "qmix", "--seed", "3", "--set", "environment.M=2", "--steps", "1e3"];
+        let config = parse(&words).unwrap().resolve().unwrap();
+        for agreeing in [&words[..], &[], &["--uavs", "2"], &["--preset", "practical", "--set", "training.steps=1000"]] {
+            parse(agreeing).unwrap().agree_with(&config).unwrap();
+        }
+        for (words, field, had) in [
+            (["--algorithm", "vdn"], "algorithm", "\"qmix\""),
+            (["--preset", "paper"], "preset", "\"practical\""),
+            (["--seed", "4"], "seed", "3"),
+            (["--steps", "2e3"], "training.steps", "1000"),
+            (["--set", "environment.M=3"], "environment.uavs", "2"),
+        ] {
+            let error = parse(&words).unwrap().agree_with(&config).unwrap_err();
+            let error = error.downcast::<Invalid>().unwrap();
+            assert!(error.field == field && error.expected.starts_with(had), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_job_has_what_is_given_and_no_more() {
+        let mut job = Map::new();
+        parse(&[]).unwrap().write_into(&mut job).unwrap();
+        assert!(job.is_empty());
+        job.insert("training".into(), serde_json::json!({"batch": 3, "steps": 1}));
+        parse(&["--steps", "7", "--seed", "2", "--algorithm", "iql"]).unwrap().write_into(&mut job).unwrap();
+        assert_eq!(Value::from(job), serde_json::json!({"training": {"batch": 3, "steps": 7}, "seed": 2, "algorithm": "iql"}));
     }
 
     #[test]

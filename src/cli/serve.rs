@@ -9,6 +9,7 @@ use clap::{Args, ValueEnum};
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::output::{OutputError, outln};
+use super::signals::StopSignals;
 use crate::clock::Clock;
 use crate::config::{Config, TlsFiles};
 use crate::server::{self, DataDir, Endpoints, Listeners, Tls};
@@ -245,19 +246,13 @@ fn reload_on_hangup(tls: Option<Arc<Tls>>) -> std::io::Result<()> {
 /// Resolves on the first ctrl-c or SIGTERM. The second signal ends the process at once. No acknowledged change is lost, because
 /// it is committed to the database; workers end with the server.
 fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
-    let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
-    let mut next = async move || {
-        tokio::select! {
-            _ = interrupt.recv() => 130,
-            _ = terminate.recv() => 143,
-        }
-    };
+    let mut signals = StopSignals::new()?;
     Ok(async move {
-        next().await;
+        signals.next().await;
         tokio::spawn(async move {
-            let code = next().await;
+            let code = signals.next().await;
             tracing::warn!("second stop signal: ending at once");
-            std::process::exit(code);
+            std::process::exit(code.into());
         });
     })
 }

@@ -22,7 +22,11 @@ pub fn policy_table(rows: &[(String, Summary)]) -> Table {
 }
 
 /// A table with a header; without one if all its cells are empty.
-pub fn text_table<const N: usize>(header: [&str; N], rows: impl IntoIterator<Item = [String; N]>) -> String {
+pub fn text_table<H: AsRef<str>, R: IntoIterator<Item = String>>(
+    header: impl IntoIterator<Item = H>,
+    rows: impl IntoIterator<Item = R>,
+) -> String {
+    let header: Vec<String> = header.into_iter().map(|cell| cell.as_ref().to_owned()).collect();
     let mut table = Table::new();
     table.load_style(presets::ASCII_BORDERS_ONLY_CONDENSED);
     if header.iter().any(|cell| !cell.is_empty()) {

@@ -7,7 +7,9 @@ use crate::telemetry;
 
 /// Flags of `worker`. The job and its token come from the environment, because command lines are visible to all users.
 #[derive(Args, Debug)]
-#[command(after_help = "A server starts its workers itself and sets QEDGIX_SERVER, QEDGIX_JOB, QEDGIX_ATTEMPT and QEDGIX_TOKEN.")]
+#[command(
+    after_help = "A server starts its workers itself and sets QEDGIX_WORKER_SERVER, QEDGIX_JOB, QEDGIX_ATTEMPT and QEDGIX_TOKEN."
+)]
 pub struct WorkerArgs {
     /// Exit when standard input closes, which means that the server has ended
     #[arg(long)]

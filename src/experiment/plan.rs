@@ -90,7 +90,7 @@ impl Experiment {
         let plot = top.required("figure", "convergence, parameter or trajectories")?;
         let seeds = match &overrides.seeds {
             Some(seeds) => seeds.clone(),
-            None => top.optional("seeds")?.unwrap_or_else(|| vec![1]),
+            None => first_seeds(top.optional("seeds")?.unwrap_or_else(|| vec![1]), overrides.num_seeds),
         };
         distinct("seeds", &seeds)?;
         let list = layout_list(&top.optional::<String>("layouts")?.unwrap_or_else(|| "eval-v1".into()))?;
@@ -117,6 +117,12 @@ impl Experiment {
         }
         let x = top.optional("x")?.unwrap_or_default();
         let command_line = RunSettings::overrides(overrides);
+        for (i, point) in points.iter().enumerate() {
+            if let Some((field, value)) = point.settings.field_in_common(&command_line) {
+                let expected = format!("a field that no point sets; points[{i}] sets it, so all points would be the same");
+                return Err(Invalid::new(format!("on the command line, {field}"), value, expected));
+            }
+        }
 
         let mut experiment_points = Vec::new();
         for (i, point) in points.iter().enumerate() {
@@ -181,6 +187,17 @@ fn select(field: &str, rows: Vec<NamedSettings>, names: &[String]) -> Result<Vec
         return Err(Invalid::new(field, format!("{unknown:?}"), format!("one of {}", known.join("; "))));
     }
     Ok(rows.into_iter().filter(|row| names.is_empty() || names.contains(&row.name)).collect())
+}
+
+/// The first `count` seeds, and the numbers that follow the largest if there are fewer; all seeds without a count.
+fn first_seeds(mut seeds: Vec<u64>, count: Option<usize>) -> Vec<u64> {
+    if let Some(count) = count {
+        seeds.truncate(count);
+        let largest = seeds.iter().max().copied().unwrap_or(0);
+        let missing = (count - seeds.len()) as u64;
+        seeds.extend((1..=missing).map(|k| largest.saturating_add(k)));
+    }
+    seeds
 }
 
 fn distinct(field: &str, seeds: &[u64]) -> Result<(), Invalid> {

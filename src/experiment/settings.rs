@@ -4,13 +4,15 @@ use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
 
 use crate::invalid::{Invalid, expectation};
-use crate::train_config::{Algorithm, Preset, TrainConfig};
+use crate::train_config::{Algorithm, Preset, TrainConfig, field_name};
 
 /// Settings of the command line, which override the document.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Overrides {
     /// Seeds that replace those of the document.
     pub seeds: Option<Vec<u64>>,
+    /// Number of seeds: the first of the document, and beyond them the next numbers.
+    pub num_seeds: Option<usize>,
     /// Names of the series to run; empty: all.
     pub series: Vec<String>,
     /// Names of the points to run; empty: all.
@@ -95,6 +97,15 @@ impl RunSettings {
     pub fn overrides(overrides: &Overrides) -> Self {
         let Overrides { environment, training, .. } = overrides.clone();
         Self { prefix: "on the command line, ".into(), environment, training, ..Self::default() }
+    }
+
+    /// The first field that `other` sets, too, with the value of `other`: `training.gamma`.
+    pub fn field_in_common<'a>(&self, other: &'a Self) -> Option<(String, &'a Value)> {
+        let sections = [("environment", &self.environment, &other.environment), ("training", &self.training, &other.training)];
+        sections.into_iter().find_map(|(section, mine, theirs)| {
+            let also = |key: &String| mine.keys().any(|own| field_name(own) == field_name(key));
+            theirs.iter().find(|(key, _)| also(key)).map(|(key, value)| (format!("{section}.{key}"), value))
+        })
     }
 
     /// The configuration of one run; later sections override earlier ones. An error names the section of the invalid field.

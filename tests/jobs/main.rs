@@ -1,5 +1,6 @@
 //! Tests of jobs through both transports: submission, scheduling, the protocol of workers, events, and real processes.
 
+mod command_line;
 mod events;
 mod harness;
 #[path = "../process/mod.rs"]
@@ -10,4 +11,5 @@ mod publishing;
 mod scheduling;
 mod space;
 mod submission;
+mod train_command;
 mod unreadable;

@@ -280,7 +280,7 @@ async fn orphaned_worker_ends_although_nobody_reads_its_output() {
     let mut command = Command::new(PROGRAM);
     command.args(["worker", "--tethered"]).env("QEDGIX_ATTEMPT", "1").env("QEDGIX_TOKEN", "of a server that has ended");
     // Nothing listens there, and workers try for long to reach their server.
-    command.env("QEDGIX_SERVER", "http://127.0.0.1:1").env("QEDGIX_JOB", uuid::Uuid::nil().to_string());
+    command.env("QEDGIX_WORKER_SERVER", "http://127.0.0.1:1").env("QEDGIX_JOB", uuid::Uuid::nil().to_string());
     let mut worker = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     drop((worker.stdout.take(), worker.stderr.take()));
     drop(worker.stdin.take());
@@ -298,16 +298,16 @@ async fn orphaned_worker_ends_although_nobody_reads_its_output() {
 
 #[tokio::test]
 async fn worker_without_assignment_or_valid_token_fails() {
-    let output = Command::new(PROGRAM).arg("worker").env_remove("QEDGIX_SERVER").output().unwrap();
+    let output = Command::new(PROGRAM).arg("worker").env_remove("QEDGIX_WORKER_SERVER").output().unwrap();
     assert!(!output.status.success());
-    assert!(String::from_utf8_lossy(&output.stderr).contains("QEDGIX_SERVER"));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("QEDGIX_WORKER_SERVER"));
 
     let dir = tempfile::tempdir().unwrap();
     let server = Process::start(dir.path()).await;
     let endpoints: Value = serde_json::from_slice(&std::fs::read(dir.path().join("endpoints.json")).unwrap()).unwrap();
     let output = Command::new(PROGRAM)
         .arg("worker")
-        .env("QEDGIX_SERVER", format!("http://{}", endpoints["grpc"].as_str().unwrap()))
+        .env("QEDGIX_WORKER_SERVER", format!("http://{}", endpoints["grpc"].as_str().unwrap()))
         .env("QEDGIX_JOB", uuid::Uuid::nil().to_string())
         .env("QEDGIX_ATTEMPT", "1")
         .env("QEDGIX_TOKEN", "guessed")

@@ -82,7 +82,8 @@ pub async fn run(args: BenchArgs) -> anyhow::Result<()> {
 fn learner(mut args: LearnerArgs) -> anyhow::Result<()> {
     let threads = args.threads.unwrap_or_else(all_cores);
     let mut set: Vec<String> = CONFIGURATION.map(str::to_owned).to_vec();
-    if !matches!(TrainConfig::preset(args.run.algorithm, args.run.preset).training.mixer, MixerKind::Vdn | MixerKind::None) {
+    let (algorithm, preset) = (args.run.algorithm.unwrap_or_default(), args.run.preset.unwrap_or_default());
+    if !matches!(TrainConfig::preset(algorithm, preset).training.mixer, MixerKind::Vdn | MixerKind::None) {
         set.push("training.mixer=qmix".to_owned());
     }
     set.append(&mut args.run.set);

@@ -17,7 +17,7 @@ use serde_json::{Value, json};
 use self::folder::RunFolder;
 use self::runner::Runner;
 use super::files::write_atomic;
-use super::run_args::{self, all_cores};
+use super::run_args::{self, all_cores, count};
 use crate::cli::output::outln;
 use crate::env::EpisodeMetrics;
 use crate::experiment::{Experiment, ExperimentSummary, Overrides, PlotKind, RunResult, TrainingCurve, plots, readme};
@@ -42,18 +42,21 @@ pub struct ExperimentArgs {
     #[arg(long, env = "QEDGIX_THREADS")]
     threads: Option<usize>,
     /// Environment steps of every run; overrides the file
-    #[arg(long, env = "QEDGIX_STEPS")]
+    #[arg(long, env = "QEDGIX_STEPS", value_parser = count)]
     steps: Option<u64>,
     /// Seeds; override those of the file
     #[arg(long, env = "QEDGIX_SEEDS", value_delimiter = ',')]
     seeds: Option<Vec<u64>>,
+    /// Number of seeds: the first of the file, and beyond them the next numbers [default: all of the file]
+    #[arg(long, env = "QEDGIX_NUM_SEEDS", value_name = "NUMBER", conflicts_with = "seeds", value_parser = clap::value_parser!(u16).range(1..=1000))]
+    num_seeds: Option<u16>,
     /// Runs only the series with this name; may be repeated
     #[arg(long, env = "QEDGIX_SERIES", value_name = "NAME", value_delimiter = ';')]
     series: Vec<String>,
     /// Runs only the point with this name; may be repeated
     #[arg(long, env = "QEDGIX_POINT", value_name = "NAME", value_delimiter = ';')]
     point: Vec<String>,
-    /// Overrides one field of every run; may be repeated
+    /// Overrides one field of every run, unless the points set it; may be repeated
     #[arg(long = "set", value_name = "SECTION.FIELD=VALUE")]
     set: Vec<String>,
     /// Lists the runs and their progress without running them
@@ -101,8 +104,13 @@ fn read(args: &ExperimentArgs) -> anyhow::Result<Experiment> {
     let name = args.file.display().to_string();
     let text = fs::read_to_string(&args.file).with_context(|| name.clone())?;
     let document: Value = toml::from_str(&text).with_context(|| name.clone())?;
-    let mut overrides =
-        Overrides { seeds: args.seeds.clone(), series: args.series.clone(), points: args.point.clone(), ..Overrides::default() };
+    let mut overrides = Overrides {
+        seeds: args.seeds.clone(),
+        num_seeds: args.num_seeds.map(usize::from),
+        series: args.series.clone(),
+        points: args.point.clone(),
+        ..Overrides::default()
+    };
     run_args::set(&args.set, &mut overrides.environment, &mut overrides.training)?;
     if let Some(steps) = args.steps {
         overrides.training.insert("steps".into(), steps.into());
@@ -121,6 +129,7 @@ fn command(args: &ExperimentArgs) -> String {
     if let Some(seeds) = &args.seeds {
         words.push(format!("--seeds {}", seeds.iter().map(u64::to_string).collect::<Vec<_>>().join(",")));
     }
+    words.extend(args.num_seeds.map(|number| format!("--num-seeds {number}")));
     words.extend(args.series.iter().map(|name| format!("--series '{name}'")));
     words.extend(args.point.iter().map(|name| format!("--point '{name}'")));
     words.extend(args.set.iter().map(|item| format!("--set '{item}'")));

@@ -24,7 +24,7 @@ use crate::store::WorkerResult;
 use crate::wire::v1;
 
 /// Environment variable with the address of the server's gRPC.
-pub const ENV_SERVER: &str = "QEDGIX_SERVER";
+pub const ENV_SERVER: &str = "QEDGIX_WORKER_SERVER";
 /// Environment variable with the id of the job.
 pub const ENV_JOB: &str = "QEDGIX_JOB";
 /// Environment variable with the number of the attempt.

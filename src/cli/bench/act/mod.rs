@@ -25,6 +25,7 @@ use crate::cli::act_client::{self, PolicyClient};
 use crate::cli::connect::ConnectArgs;
 use crate::cli::in_process_server::InProcessServer;
 use crate::cli::output::{OutputError, outln};
+use crate::cli::ports;
 use crate::cli::serve::duration;
 use crate::wire::v1;
 
@@ -40,7 +41,7 @@ pub(super) use self::echo::serve as echo;
   qedgix bench act --uavs 1000 --users 10000 --range 0.05 --observation graph")]
 pub struct ActArgs {
     /// gRPC address of the server to measure [default: a temporary server in this process]
-    #[arg(long, env = "QEDGIX_SERVER", value_name = "HOST:PORT")]
+    #[arg(long, env = "QEDGIX_GRPC_SERVER", value_name = "HOST:PORT")]
     server: Option<String>,
     #[command(flatten)]
     connect: ConnectArgs,
@@ -142,6 +143,7 @@ pub(super) async fn run(args: ActArgs) -> anyhow::Result<()> {
         server.stop().await?;
         return measured;
     };
+    ports::expect_grpc(address, &args.connect).await?;
     measure(&args, address).await
 }
 

@@ -1,0 +1,328 @@
+//! `qedgix jobs compare`: how jobs differ, what they reached, and their curves.
+//!
+//! Jobs whose configurations differ only in the seed are one group. Means over seeds have a 95 % interval of Student's t; the band of
+//! a curve goes from the smallest to the largest value of its seeds.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+
+use anyhow::bail;
+use clap::Args;
+use serde::Serialize;
+use serde_json::{Value, json};
+
+use super::list::{Filter, list};
+use super::reference::{resolve_all, short};
+use crate::cli::client::Client;
+use crate::cli::files::{check_writable, write_atomic};
+use crate::cli::output::{errln, outln};
+use crate::cli::rest::{items, query, text};
+use crate::cli::table::text_table;
+use crate::plot::{Chart, Series, lines};
+
+/// Metrics whose best value is the largest.
+const LARGEST: [&str; 4] = ["eval/coverage", "eval/fairness", "q_tot", "env_steps_per_s"];
+/// Most jobs that are compared.
+const MAX_JOBS: usize = 1000;
+
+/// Flags of `jobs compare`.
+#[derive(Args, Debug)]
+pub struct CompareArgs {
+    /// Ids of jobs, beginnings of ids, or names
+    #[arg(value_name = "JOB")]
+    jobs: Vec<String>,
+    #[command(flatten)]
+    filter: Filter,
+    /// Metric to compare
+    #[arg(long, default_value = "eval/mean_aoi")]
+    metric: String,
+    /// File for the curves
+    #[arg(long, value_name = "FILE", default_value = "compare.svg")]
+    svg: PathBuf,
+}
+
+/// A job of the comparison.
+#[derive(Debug, Serialize)]
+struct Compared {
+    id: String,
+    name: Option<String>,
+    state: String,
+    seed: Option<u64>,
+    /// Fields of the configuration that are not the same in all jobs, without the seed.
+    differs: BTreeMap<String, Value>,
+    best: Option<[f64; 2]>,
+    last: Option<[f64; 2]>,
+    #[serde(skip)]
+    config: BTreeMap<String, Value>,
+    /// (step, value), by step.
+    #[serde(skip)]
+    curve: Vec<[f64; 2]>,
+}
+
+/// Jobs whose configurations differ only in the seed.
+#[derive(Debug, Serialize)]
+struct Group {
+    differs: BTreeMap<String, Value>,
+    seeds: Vec<Option<u64>>,
+    jobs: Vec<String>,
+    best: Option<Mean>,
+    last: Option<Mean>,
+    #[serde(skip)]
+    name: String,
+    #[serde(skip)]
+    curves: Vec<Vec<[f64; 2]>>,
+}
+
+/// A mean with its 95 % interval; none of one value.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+struct Mean {
+    mean: f64,
+    interval: Option<[f64; 2]>,
+}
+
+/// Runs the command.
+pub(super) async fn run(client: &Client, args: CompareArgs, print_json: bool) -> anyhow::Result<()> {
+    check_writable(&args.svg)?;
+    let mut ids = resolve_all(client, &args.jobs).await?;
+    if !args.filter.is_empty() {
+        let found = list(client, &args.filter, None, &[], MAX_JOBS).await?;
+        ids.extend(found.iter().map(|job| text(&job["id"])).filter(|id| !ids.contains(id)).collect::<Vec<_>>());
+    }
+    if ids.is_empty() || ids.len() > MAX_JOBS {
+        bail!("{} jobs; expected 1 to {MAX_JOBS}: ids, or a filter such as --label", ids.len());
+    }
+    let mut jobs = Vec::new();
+    for id in ids {
+        let job = client.get(&format!("/v1/jobs/{id}")).await?;
+        jobs.push(compared(&job, curve(client, &id, &args.metric).await?, is_largest_best(&args.metric)));
+    }
+    let fields = mark_differences(&mut jobs);
+    let groups = group(&jobs);
+    write_atomic(&args.svg, lines(&chart(&args.metric, &groups)).as_bytes())?;
+    if print_json {
+        outln!("{:#}", json!({"metric": args.metric, "jobs": jobs, "groups": groups, "svg": args.svg}))?;
+        return Ok(());
+    }
+    outln!("{}", job_table(&args.metric, &fields, &jobs))?;
+    if groups.len() < jobs.len() {
+        outln!("Over seeds: mean and 95 % interval\n{}", group_table(&args.metric, &fields, &groups))?;
+    }
+    errln!("curves: {}", args.svg.display());
+    Ok(())
+}
+
+fn is_largest_best(metric: &str) -> bool {
+    LARGEST.contains(&metric)
+}
+
+/// A metric of a job by step.
+async fn curve(client: &Client, id: &str, metric: &str) -> anyhow::Result<Vec<[f64; 2]>> {
+    let (mut points, mut token) = (Vec::new(), String::new());
+    loop {
+        let page = [("name", Some(metric.to_owned())), ("page_size", Some("100000".to_owned())), ("page_token", Some(token))];
+        let page = client.get(&format!("/v1/jobs/{id}/metrics{}", query(&page))).await?;
+        points.extend(items(&page, "metrics").filter_map(|row| Some([row["step"].as_u64()? as f64, row["value"].as_f64()?])));
+        token = page["next_page_token"].as_str().unwrap_or_default().to_owned();
+        if token.is_empty() {
+            return Ok(points);
+        }
+    }
+}
+
+fn compared(job: &Value, curve: Vec<[f64; 2]>, largest: bool) -> Compared {
+    let mut config = BTreeMap::new();
+    for field in ["kind", "algorithm", "preset"] {
+        config.insert(field.to_owned(), job[field].clone());
+    }
+    for section in ["environment", "training"] {
+        for (field, value) in job[section].as_object().into_iter().flatten() {
+            config.insert(format!("{section}.{field}"), value.clone());
+        }
+    }
+    let order = |a: &&[f64; 2], b: &&[f64; 2]| if largest { b[1].total_cmp(&a[1]) } else { a[1].total_cmp(&b[1]) };
+    Compared {
+        id: text(&job["id"]),
+        name: job["name"].as_str().map(str::to_owned),
+        state: text(&job["state"]),
+        seed: job["seed"].as_u64(),
+        differs: BTreeMap::new(),
+        best: curve.iter().min_by(order).copied(),
+        last: curve.last().copied(),
+        config,
+        curve,
+    }
+}
+
+/// Fills in `differs` of each job and returns the fields.
+fn mark_differences(jobs: &mut [Compared]) -> Vec<String> {
+    let fields: BTreeSet<String> = jobs.iter().flat_map(|job| job.config.keys().cloned()).collect();
+    let same = |field: &String| jobs.windows(2).all(|pair| pair[0].config.get(field) == pair[1].config.get(field));
+    let different: Vec<String> = fields.into_iter().filter(|field| !same(field)).collect();
+    for job in jobs {
+        let value = |field: &String| (field.clone(), job.config.get(field).cloned().unwrap_or(Value::Null));
+        job.differs = different.iter().map(value).collect();
+    }
+    different
+}
+
+fn group(jobs: &[Compared]) -> Vec<Group> {
+    let mut groups: Vec<(&Compared, Vec<&Compared>)> = Vec::new();
+    for job in jobs {
+        match groups.iter_mut().find(|(first, _)| first.config == job.config) {
+            Some((_, members)) => members.push(job),
+            None => groups.push((job, vec![job])),
+        }
+    }
+    let of = |(first, members): (&Compared, Vec<&Compared>)| {
+        let values = |pick: fn(&Compared) -> Option<[f64; 2]>| -> Vec<f64> {
+            members.iter().filter_map(|job| pick(job)).map(|point| point[1]).collect()
+        };
+        let differs: Vec<String> =
+            first.differs.iter().map(|(field, value)| format!("{} {}", last_word(field), text(value))).collect();
+        let name = if differs.is_empty() { text(&first.config["algorithm"]) } else { differs.join(", ") };
+        Group {
+            differs: first.differs.clone(),
+            seeds: members.iter().map(|job| job.seed).collect(),
+            jobs: members.iter().map(|job| job.id.clone()).collect(),
+            best: mean(&values(|job| job.best)),
+            last: mean(&values(|job| job.last)),
+            name,
+            curves: members.iter().map(|job| job.curve.clone()).filter(|curve| !curve.is_empty()).collect(),
+        }
+    };
+    groups.into_iter().map(of).collect()
+}
+
+/// The last part of the path of a field.
+fn last_word(field: &str) -> &str {
+    field.rsplit('.').next().unwrap_or(field)
+}
+
+/// The mean of values with its 95 % interval; none without values.
+fn mean(values: &[f64]) -> Option<Mean> {
+    let n = values.len();
+    let mean = (n > 0).then(|| values.iter().sum::<f64>() / n as f64)?;
+    let interval = (n > 1).then(|| {
+        let variance = values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / (n - 1) as f64;
+        let half = quantile(n - 1) * (variance / n as f64).sqrt();
+        [mean - half, mean + half]
+    });
+    Some(Mean { mean, interval })
+}
+
+/// The 0.975 quantile of Student's t distribution.
+fn quantile(degrees: usize) -> f64 {
+    const TABLE: [f64; 30] = [
+        12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160, 2.145, 2.131, 2.120, 2.110,
+        2.101, 2.093, 2.086, 2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042,
+    ];
+    // Beyond the table, the first terms of the expansion around the normal distribution.
+    TABLE.get(degrees.saturating_sub(1)).copied().unwrap_or_else(|| 1.96 + 2.37 / degrees as f64)
+}
+
+fn cell(value: Option<[f64; 2]>, index: usize) -> String {
+    value.map_or_else(|| "-".to_owned(), |value| if index == 0 { format!("{:.0}", value[0]) } else { format!("{:.2}", value[1]) })
+}
+
+fn job_table(metric: &str, fields: &[String], jobs: &[Compared]) -> String {
+    let mut header: Vec<String> = ["job", "name", "state"].map(str::to_owned).into();
+    header.extend(fields.iter().cloned());
+    header.extend(["seed".to_owned(), format!("{metric}: best"), "at step".to_owned(), "last".to_owned()]);
+    let ids: Vec<String> = jobs.iter().map(|job| job.id.clone()).collect();
+    let rows = jobs.iter().zip(short(&ids)).map(|(job, id)| {
+        let mut row = vec![id, job.name.clone().unwrap_or_else(|| "-".to_owned()), job.state.clone()];
+        row.extend(fields.iter().map(|field| text(&job.differs[field])));
+        row.push(job.seed.map_or_else(|| "-".to_owned(), |seed| seed.to_string()));
+        row.extend([cell(job.best, 1), cell(job.best, 0), cell(job.last, 1)]);
+        row
+    });
+    text_table(header, rows)
+}
+
+fn group_table(metric: &str, fields: &[String], groups: &[Group]) -> String {
+    let mut header = fields.to_vec();
+    header.extend(["seeds".to_owned(), format!("{metric}: best"), "95 %".to_owned(), "last".to_owned(), "95 %".to_owned()]);
+    let cells = |mean: Option<Mean>| {
+        let interval = mean.and_then(|mean| mean.interval).map(|[low, high]| format!("{low:.2} to {high:.2}"));
+        [mean.map_or_else(|| "-".to_owned(), |mean| format!("{:.2}", mean.mean)), interval.unwrap_or_else(|| "-".to_owned())]
+    };
+    let rows = groups.iter().map(|group| {
+        let mut row: Vec<String> = fields.iter().map(|field| text(&group.differs[field])).collect();
+        row.push(group.seeds.len().to_string());
+        row.extend(cells(group.best).into_iter().chain(cells(group.last)));
+        row
+    });
+    text_table(header, rows)
+}
+
+/// The mean curve of each group over the steps that all its seeds reached.
+fn chart(metric: &str, groups: &[Group]) -> Chart {
+    let series = groups.iter().map(|group| {
+        let by_step: Vec<BTreeMap<u64, f64>> =
+            group.curves.iter().map(|curve| curve.iter().map(|point| (point[0] as u64, point[1])).collect()).collect();
+        let (mut points, mut band) = (Vec::new(), Vec::new());
+        for &step in by_step.first().into_iter().flat_map(BTreeMap::keys) {
+            let Some(values) = by_step.iter().map(|curve| curve.get(&step).copied()).collect::<Option<Vec<f64>>>() else {
+                continue;
+            };
+            points.push([step as f64, values.iter().sum::<f64>() / values.len() as f64]);
+            band.push(values.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |band, &v| [band[0].min(v), band[1].max(v)]));
+        }
+        let several = by_step.len() > 1;
+        let name = if several { format!("{}, {} seeds", group.name, by_step.len()) } else { group.name.clone() };
+        Series { name, points, band: several.then_some(band) }
+    });
+    let unit = if metric.ends_with("_aoi") { " (slots)" } else { "" };
+    Chart {
+        title: metric.to_owned(),
+        x: "environment steps".to_owned(),
+        y: format!("{metric}{unit}: mean, smallest and largest"),
+        series: series.collect(),
+        markers: false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn job(seed: u64, rate: f64, curve: &[[f64; 2]]) -> Compared {
+        let job = json!({
+            "id": format!("01a202d1-93be-769e-80f7-75eef949600{seed}"), "state": "succeeded", "seed": seed, "algorithm": "qmix",
+            "training": {"learning_rate": rate, "steps": 100},
+        });
+        compared(&job, curve.to_vec(), false)
+    }
+
+    #[test]
+    fn jobs_that_differ_in_the_seed_are_one_group() {
+        let mut jobs = vec![
+            job(1, 0.1, &[[0.0, 9.0], [50.0, 1.0], [100.0, 4.0]]),
+            job(2, 0.1, &[[0.0, 9.0], [50.0, 3.0]]),
+            job(1, 0.2, &[[0.0, 8.0]]),
+            job(2, 0.2, &[]),
+        ];
+        let fields = mark_differences(&mut jobs);
+        assert_eq!(fields, ["training.learning_rate"]);
+        assert_eq!((jobs[0].best, jobs[0].last), (Some([50.0, 1.0]), Some([100.0, 4.0])));
+        let groups = group(&jobs);
+        assert_eq!(groups.iter().map(|group| group.seeds.len()).collect::<Vec<_>>(), [2, 2]);
+        let best = groups[0].best.unwrap();
+        let [low, high] = best.interval.unwrap();
+        assert!((best.mean - 2.0).abs() < 1e-12 && (low + 10.706).abs() < 1e-9 && (high - 14.706).abs() < 1e-9, "{best:?}");
+        assert_eq!(groups[1].best, Some(Mean { mean: 8.0, interval: None }));
+        let chart = chart("eval/mean_aoi", &groups);
+        assert_eq!(chart.series[0].points, [[0.0, 9.0], [50.0, 2.0]]);
+        assert_eq!(chart.series[0].band.as_ref().unwrap()[1], [1.0, 3.0]);
+        assert!(chart.series[1].band.is_none());
+        let table = group_table("eval/mean_aoi", &fields, &groups) + &job_table("eval/mean_aoi", &fields, &jobs);
+        assert!(table.contains("-10.71 to 14.71") && table.contains("training.learning_rate"), "{table}");
+    }
+
+    #[test]
+    fn the_quantile_falls_to_that_of_the_normal_distribution() {
+        let all: Vec<f64> = (1..500).map(quantile).collect();
+        assert!(all.windows(2).all(|pair| pair[1] <= pair[0]), "{all:?}");
+        assert!((quantile(100) - 1.984).abs() < 1e-3 && (quantile(1_000_000) - 1.96).abs() < 1e-3);
+    }
+}

@@ -1,0 +1,134 @@
+//! `qedgix jobs submit`, and the submission of `qedgix train --server`.
+
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use clap::Args;
+use serde_json::{Map, Value};
+
+use super::screen::{Lines, Screen};
+use super::view::JobView;
+use super::watch::{self, OnSignal};
+use crate::cli::client::{Client, ClientError};
+use crate::cli::output::{errln, outln};
+use crate::cli::run_args::{RunArgs, insert};
+
+/// Flags of `jobs submit`.
+#[derive(Args, Debug)]
+pub struct SubmitArgs {
+    #[command(flatten)]
+    run: RunArgs,
+    /// The job as a JSON or, if the name ends with .toml, TOML document, as POST /v1/jobs takes it; flags override its fields. -:
+    /// JSON from standard input
+    #[arg(long, value_name = "FILE")]
+    file: Option<PathBuf>,
+    #[command(flatten)]
+    job: JobArgs,
+    /// Follow the job until its end; the exit status is then that of `jobs watch`
+    #[arg(long)]
+    watch: bool,
+}
+
+/// What a job has besides its training run.
+#[derive(Args, Debug)]
+pub struct JobArgs {
+    /// Name of the job and of the policy that it publishes
+    #[arg(long, env = "QEDGIX_NAME")]
+    name: Option<String>,
+    /// Threads that the job may use [default: 1]
+    #[arg(long, env = "QEDGIX_THREADS")]
+    threads: Option<usize>,
+    /// Label for people; may be repeated
+    #[arg(long, value_name = "KEY=VALUE")]
+    label: Vec<String>,
+    /// Jobs with a higher priority start first, -100 to 100 [default: 0]
+    #[arg(long, env = "QEDGIX_PRIORITY", allow_negative_numbers = true)]
+    priority: Option<i64>,
+}
+
+impl JobArgs {
+    /// A job with a name and threads only.
+    pub fn new(name: Option<String>, threads: Option<usize>) -> Self {
+        Self { name, threads, label: Vec::new(), priority: None }
+    }
+}
+
+/// The body of a submission.
+///
+/// # Errors
+/// A flag is malformed.
+pub fn body(mut document: Map<String, Value>, run: &RunArgs, job: &JobArgs) -> anyhow::Result<Value> {
+    run.write_into(&mut document)?;
+    insert(&mut document, "name", job.name.as_deref());
+    insert(&mut document, "threads", job.threads);
+    insert(&mut document, "priority", job.priority);
+    if !job.label.is_empty() {
+        let labels = document.entry("labels").or_insert_with(|| Map::new().into());
+        let labels = labels.as_object_mut().context("labels: expected an object")?;
+        for label in &job.label {
+            let (key, value) = label.split_once('=').with_context(|| format!("--label {label}: expected KEY=VALUE"))?;
+            labels.insert(key.to_owned(), value.into());
+        }
+    }
+    Ok(document.into())
+}
+
+/// Submits a job and returns it. A repetition, after a response that was lost, does not make a second job.
+///
+/// # Errors
+/// The server cannot be reached, or refuses the job.
+pub async fn submit(client: &Client, body: &Value) -> Result<Value, ClientError> {
+    const TRIES: u32 = 4;
+    let key = uuid::Uuid::now_v7().to_string();
+    for tried in 1.. {
+        let error = match client.post_once("/v1/jobs", body, &key).await {
+            Ok(job) => return Ok(job),
+            Err(error) => error,
+        };
+        // A server that does not run is told at once.
+        let absent = matches!(&error, ClientError::Unreachable { source, .. } if source.is_connect());
+        if absent || !error.is_temporary() || tried == TRIES {
+            return Err(error);
+        }
+        tokio::time::sleep(Duration::from_millis(250 << tried)).await;
+    }
+    unreachable!("the last try returns")
+}
+
+/// Runs the command.
+pub(super) async fn run(client: &Client, args: SubmitArgs, json: bool) -> anyhow::Result<()> {
+    let document = args.file.as_deref().map(read).transpose()?.unwrap_or_default();
+    let job = submit(client, &body(document, &args.run, &args.job)?).await?;
+    let id = job["id"].as_str().context("the response of the server has no job id")?.to_owned();
+    match (json, args.watch) {
+        (true, _) => outln!("{job:#}")?,
+        (false, true) => errln!("job {id}"),
+        (false, false) => outln!("{id}")?,
+    }
+    if !args.watch {
+        return Ok(());
+    }
+    let lines = if json { Lines::Error } else { Lines::Out };
+    let ended = watch::follow(client, &mut Screen::new(JobView::new(&job), lines), OnSignal::Leave).await?;
+    ended.into_result(client, &id)
+}
+
+/// Reads a job as an object.
+fn read(path: &Path) -> anyhow::Result<Map<String, Value>> {
+    let name = path.display();
+    let mut text = String::new();
+    if path == Path::new("-") {
+        std::io::stdin().read_to_string(&mut text).context("cannot read standard input")?;
+    } else {
+        text = std::fs::read_to_string(path).with_context(|| format!("cannot read {name}"))?;
+    }
+    let document: Value = if path.extension().is_some_and(|extension| extension == "toml") {
+        toml::from_str(&text).with_context(|| name.to_string())?
+    } else {
+        serde_json::from_str(&text).with_context(|| name.to_string())?
+    };
+    let Value::Object(document) = document else { bail!("{name}: expected an object, the body of POST /v1/jobs") };
+    Ok(document)
+}
