@@ -44,7 +44,7 @@ fn update(c: &mut Criterion) {
         group.throughput(Throughput::Elements((batch * config.environment.nodes() * config.environment.slots) as u64));
         let episodes = episodes(&config.dims(), batch, 1);
         let mut learner = Learner::new(config, threads).expect("threads");
-        group.bench_function(name, |b| b.iter(|| learner.update(&episodes, 1e-3)));
+        group.bench_function(name, |b| b.iter(|| learner.update(std::slice::from_ref(&episodes), 1e-3)));
         group.finish();
     };
     for (name, algorithm) in ALGORITHMS {
@@ -95,7 +95,7 @@ fn step(c: &mut Criterion) {
                 (0..fleets).flat_map(|e| &x[(e * (k + 1) + k / 2) * width..][..width]).copied().collect()
             };
             let (uav_xy, aoi) = (middle(&ep.uav_xy, 2 * m), middle(&ep.aoi, n));
-            let mut batched_agent = BatchedAgent::new(learner.agent(), fleets);
+            let mut batched_agent = BatchedAgent::new(learner.agent(), config(algorithm).dims(), fleets);
             batched_agent.begin(learner.agent(), learner.agent_parameters(), &vec![0.0; fleets * m * TOKEN]);
             let input = StepInput { uav_xy: &uav_xy, user_xy: &ep.user_xy, aoi: &aoi };
             group.bench_function(BenchmarkId::new(name, fleets), |b| b.iter(|| batched_agent.step(learner.agent(), input)[0]));

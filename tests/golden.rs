@@ -215,6 +215,7 @@ fn check(file: &Path) -> Checked<String> {
     let b = config.batch;
 
     let episodes = Episodes {
+        env: config.dims.env,
         len: b,
         uavs: m,
         users: n,
@@ -242,7 +243,7 @@ fn check(file: &Path) -> Checked<String> {
     let (mut online, target, grads, after) = (flat("")?, flat("target_")?, flat("grad.")?, flat("after.")?);
 
     let mut trace = Trace::default();
-    let metrics = loss.compute_gradient(&online, &target, &episodes, Some(&mut trace));
+    let metrics = loss.compute_gradient(&online, &target, std::slice::from_ref(&episodes), Some(&mut trace));
     for (name, ours, shape) in [
         ("out.q", &trace.q[..], &[b, k + 1, m, actions][..]),
         ("out.q_tot", &trace.q_tot, &[b, k]),

@@ -255,9 +255,9 @@ fn whole_loss() {
         let online: Vec<f64> = layout.initialise(&mut rng::stream(1, "online", 0));
         let target: Vec<f64> = layout.initialise(&mut rng::stream(1, "target", 0));
         let episodes = episodes(&dims, 2, 3);
-        loss.compute_gradient(&online, &target, &episodes, None);
+        loss.compute_gradient(&online, &target, std::slice::from_ref(&episodes), None);
         let gradient = loss.gradient().to_vec();
         let ranges: Vec<_> = layout.parameters().iter().map(|p| (p.name.clone(), p.range.clone())).collect();
-        check(name, &ranges, &online, &gradient, |online| loss.compute_gradient(online, &target, &episodes, None).loss);
+        check(name, &ranges, &online, &gradient, |online| loss.compute_gradient(online, &target, std::slice::from_ref(&episodes), None).loss);
     }
 }

@@ -158,11 +158,11 @@ fn batched_agent_policy_and_update_compute_the_same_values() {
         let mut loss = Loss::<f32>::new(config, dims, MixerKind::Vdn, td_lambda, 1);
         let params = parameters(loss.layout(), 3);
         let mut trace = Trace::default();
-        loss.compute_gradient(&params, &params, &ep, Some(&mut trace));
+        loss.compute_gradient(&params, &params, std::slice::from_ref(&ep), Some(&mut trace));
 
         let agent = Agent::new(config, dims);
         let policy = LearnedPolicy::new(config, dims, params.clone()).expect("as many as the layout says");
-        let mut batched_agent = BatchedAgent::new(&agent, 1);
+        let mut batched_agent = BatchedAgent::new(&agent, dims, 1);
         for e in 0..2 {
             batched_agent.begin(&agent, &params, &ep.identity_token[e * m * TOKEN..][..m * TOKEN]);
             let mut memory = vec![0.0; policy.memory_len(m, n)];
@@ -459,7 +459,7 @@ fn updates_have_the_same_bits_for_any_number_of_threads() {
             let mut learner = Learner::new(&config, threads).expect("threads");
             let mut updates = Vec::new();
             for seed in 0..3 {
-                updates.push(learner.update(&episodes(&config.dims(), 37, seed), 1e-3));
+                updates.push(learner.update(&[episodes(&config.dims(), 37, seed)], 1e-3));
                 learner.sync_targets();
             }
             assert!(updates.iter().all(|u| u.loss.is_finite() && u.grad_norm > 0.0));
@@ -477,15 +477,15 @@ fn restored_learner_continues_with_the_same_bits() {
     config.environment.slots = 8;
     let batch = |seed| episodes(&config.dims(), 6, seed);
     let mut whole = Learner::new(&config, 1).expect("a thread");
-    whole.update(&batch(0), 1e-3);
+    whole.update(&[batch(0)], 1e-3);
     let state = whole.state();
     whole.sync_targets();
-    whole.update(&batch(1), 1e-3);
+    whole.update(&[batch(1)], 1e-3);
     let mut resumed = Learner::new(&TrainConfig { seed: 99, ..config.clone() }, 1).expect("a thread");
     resumed.restore(state.clone()).expect("the same architecture");
     assert_eq!(resumed.state(), state);
     resumed.sync_targets();
-    resumed.update(&batch(1), 1e-3);
+    resumed.update(&[batch(1)], 1e-3);
     assert_eq!(whole.state(), resumed.state());
     let short = qedgix::learner::LearnerState { adam_v: vec![0.0; 3], ..state };
     assert_eq!(resumed.restore(short).expect_err("too short").field, "adam_v");

@@ -8,7 +8,7 @@ use std::sync::atomic::Ordering;
 
 use qedgix::env::{BatchEnv, EnvConfig, EpisodeMetrics, Layout};
 use qedgix::learner::{
-    Algorithm, Event, Learner, Preset, Rollout, SnapshotError, Symmetry, TrainConfig, Trainer, evaluate, layout_list,
+    Algorithm, Event, Learner, Preset, Rollout, SnapshotError, Symmetry, TrainConfig, Trainer, Vary, evaluate, layout_list,
 };
 use qedgix::policy::{Gnn, Memory, ObservationKind};
 
@@ -49,6 +49,21 @@ fn opposite_config(algorithm: Algorithm) -> TrainConfig {
     t.memory = if algorithm.gnn() == Gnn::None { Memory::Own } else { Memory::Shared };
     t.teacher = Some("sweep-shared".into());
     config.environment.communication_range = Some(0.5);
+    config
+}
+
+/// As [`opposite_config`], in environments that are drawn anew for every iteration.
+fn varied_config(algorithm: Algorithm) -> TrainConfig {
+    let mut config = opposite_config(algorithm);
+    config.training.observation = ObservationKind::Set;
+    config.training.vary = Vary {
+        uavs: Some([1, 4]),
+        users: Some([2, 9]),
+        slots: Some([6, 12]),
+        detection_range: Some([0.2, 0.4]),
+        communication_range: Some([0.1, 1.5]),
+        ..Vary::default()
+    };
     config
 }
 
@@ -103,7 +118,7 @@ fn the_best_weights_are_kept_and_reproduce_their_evaluation() {
 
 #[test]
 fn the_number_of_threads_changes_no_bit() {
-    for config in ALGORITHMS.iter().flat_map(|&a| [small_config(a), opposite_config(a)]) {
+    for config in ALGORITHMS.iter().flat_map(|&a| [small_config(a), opposite_config(a), varied_config(a)]) {
         let mut one = Trainer::new(config.clone(), 1).unwrap();
         let mut two = Trainer::new(config, 2).unwrap();
         assert_eq!(collect_events(&mut one), collect_events(&mut two));
@@ -126,7 +141,7 @@ fn another_seed_gives_other_losses() {
 
 #[test]
 fn a_resumed_run_equals_a_run_without_interruption() {
-    for config in ALGORITHMS.iter().flat_map(|&a| [small_config(a), opposite_config(a)]) {
+    for config in ALGORITHMS.iter().flat_map(|&a| [small_config(a), opposite_config(a), varied_config(a)]) {
         let mut whole = Trainer::new(config.clone(), 2).unwrap();
         let expected = collect_events(&mut whole);
         // Interrupted several times, after every kind of event, with different numbers of threads.
@@ -152,7 +167,7 @@ fn transformed_episodes_equal_the_episodes_of_transformed_fleets() {
     train.environment = config.clone();
     train.training.envs = Symmetry::COUNT.into();
     let learner = Learner::new(&train, 1).unwrap();
-    let mut rollout = Rollout::new(&train, learner.agent()).unwrap();
+    let mut rollout = Rollout::new(&train, &train.environment, learner.agent()).unwrap();
     let episodes = rollout.collect(learner.agent(), learner.agent_parameters(), 1.0, 0).clone();
     let mut transformed = episodes.clone();
     let symmetries: Vec<_> = (0..Symmetry::COUNT).map(Symmetry::from_index).collect();
@@ -184,7 +199,7 @@ fn averaged_weights_are_averages_from_the_first_update() {
     let batch = sample::episodes(&config.dims(), 4, 1);
     let mut online: Vec<Vec<f32>> = Vec::new();
     for update in 1..=6_usize {
-        learner.update(&batch, 1e-3);
+        learner.update(std::slice::from_ref(&batch), 1e-3);
         online.push(learner.parameters().to_vec());
         // For the first four updates it is their mean; afterwards older updates have less weight.
         if update <= 4 {

@@ -2,10 +2,13 @@
 //! stored.
 
 use crate::env::EnvConfig;
+use crate::policy::EnvParams;
 
 /// A batch of B episodes of equal size, as a structure of arrays. Positions are f32, as in the environment.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Episodes {
+    /// The environment.
+    pub env: EnvParams,
     /// Number of episodes B.
     pub len: usize,
     /// Number of UAVs M.

@@ -6,7 +6,7 @@
 //! loss = mean over episodes, slots and joint values of (Q_tot - G)^2 / 2
 //! ```
 //!
-//! A batch is split into chunks of episodes; their number depends on sizes only. Each chunk has its own gradient, and the gradients
+//! A batch is one group of episodes or several, which may differ in size. Groups are split into chunks of episodes; their number depends on sizes only. Each chunk has its own gradient, and the gradients
 //! are summed in a fixed order. The number of threads therefore changes no bit.
 
 use std::sync::{Mutex, PoisonError};
@@ -148,28 +148,32 @@ impl<T: Real> Loss<T> {
     /// Computes the loss of a batch and its gradient with respect to `online`. Runs on the current rayon pool.
     ///
     /// # Panics
-    /// If the sizes of the episodes are not those of the networks, or there are no episodes.
+    /// If the networks do not fit the sizes of the episodes, or there are no episodes.
     pub fn compute_gradient(
         &mut self,
         online: &[T],
         target: &[T],
-        episodes: &Episodes,
+        groups: &[Episodes],
         trace: Option<&mut Trace<T>>,
     ) -> LossMetrics {
-        let dims = *self.agent.dims();
-        assert!(episodes.len > 0, "a batch of at least one episode");
-        assert_eq!(
-            (episodes.uavs, episodes.users, episodes.slots),
-            (dims.uavs, dims.users, dims.env.slots),
-            "episodes of M, N, K"
-        );
+        assert!(groups.iter().any(|group| group.len > 0), "a batch of at least one episode");
+        for group in groups {
+            self.agent.check_fleet(group.uavs, group.users).expect("the networks fit the fleet");
+        }
         let [prepared_online, prepared_target] = &mut self.prepared;
         for (params, prepared) in [(online, &mut *prepared_online), (target, &mut *prepared_target)] {
             self.agent.prepare(params, prepared);
             self.mixer.prepare(params, prepared);
         }
-        let per_chunk = episodes_per_chunk(dims.uavs);
-        let count = episodes.len.div_ceil(per_chunk);
+        let parts: Vec<(&Episodes, std::ops::Range<usize>)> = groups
+            .iter()
+            .flat_map(|group| {
+                let per_chunk = episodes_per_chunk(group.uavs);
+                (0..group.len).step_by(per_chunk).map(move |first| (group, first..(first + per_chunk).min(group.len)))
+            })
+            .collect();
+        let values = |group: &Episodes| group.len * group.slots * self.mixer.joint_values_per_slot(group.uavs);
+        let (count, total) = (parts.len(), groups.iter().map(values).sum::<usize>() as f64);
         let len = self.layout.len();
         let empty = || Chunk { grads: vec![T::ZERO; len], loss: 0.0, q_tot: 0.0, trace: Trace::default() };
         if self.chunks.len() < count {
@@ -181,16 +185,15 @@ impl<T: Real> Loss<T> {
             online: Weights { params: online, prepared: prepared_online },
             target: Weights { params: target, prepared: prepared_target },
             td_lambda: self.td_lambda,
-            episodes,
+            total,
             traced: trace.is_some(),
         };
         let workspaces = &self.workspaces;
-        self.chunks[..count].par_iter_mut().with_max_len(1).enumerate().for_each(|(i, chunk)| {
+        self.chunks[..count].par_iter_mut().zip(parts).with_max_len(1).for_each(|(chunk, part)| {
             let thread = rayon::current_thread_index().unwrap_or(0) % workspaces.len();
             // A poisoned workspace is usable: every buffer is written before it is read.
             let mut workspace = workspaces[thread].lock().unwrap_or_else(PoisonError::into_inner);
-            let first = i * per_chunk;
-            pass.run(first..(first + per_chunk).min(episodes.len), &mut workspace, chunk);
+            pass.run(part, &mut workspace, chunk);
         });
         let chunks = &self.chunks[..count];
         self.gradient.par_chunks_mut(BLOCK).zip(&mut self.norms).enumerate().for_each(|(i, (sum, norm))| {
@@ -204,11 +207,10 @@ impl<T: Real> Loss<T> {
             let join = |part: fn(&Trace<T>) -> &[T]| chunks.iter().flat_map(|c| part(&c.trace)).copied().collect();
             *trace = Trace { q: join(|t| &t.q), q_tot: join(|t| &t.q_tot), target: join(|t| &t.target) };
         }
-        let count = (episodes.len * dims.env.slots * self.mixer.joint_values_per_slot()) as f64;
         LossMetrics {
-            loss: 0.5 * chunks.iter().map(|c| c.loss).sum::<f64>() / count,
+            loss: 0.5 * chunks.iter().map(|c| c.loss).sum::<f64>() / total,
             grad_norm: self.norms.iter().sum::<f64>().sqrt(),
-            q_tot: chunks.iter().map(|c| c.q_tot).sum::<f64>() / count,
+            q_tot: chunks.iter().map(|c| c.q_tot).sum::<f64>() / total,
         }
     }
 }
@@ -220,13 +222,13 @@ struct Pass<'a, T> {
     online: Weights<'a, T>,
     target: Weights<'a, T>,
     td_lambda: TdLambda,
-    episodes: &'a Episodes,
+    /// Joint values of all slots of the batch.
+    total: f64,
     traced: bool,
 }
 
 impl<T: Real> Pass<'_, T> {
-    fn run(&self, range: std::ops::Range<usize>, ws: &mut Workspace<T>, out: &mut Chunk<T>) {
-        let ep = self.episodes;
+    fn run(&self, (ep, range): (&Episodes, std::ops::Range<usize>), ws: &mut Workspace<T>, out: &mut Chunk<T>) {
         let (m, k, b) = (ep.uavs, ep.slots, range.len());
         let (slots, per_slot) = (k + 1, b * m);
         ws.load(self.agent, ep, range.clone());
@@ -257,7 +259,7 @@ impl<T: Real> Pass<'_, T> {
         for (chosen, row) in ws.chosen.as_mut_slice().iter_mut().zip(0..) {
             *chosen = ws.online.q.row(row)[action(row)];
         }
-        let values = self.mixer.joint_values_per_slot();
+        let values = self.mixer.joint_values_per_slot(m);
         ws.target_total.resize(values, k * b);
         ws.total.resize(values, k * b);
         let next_inputs = (ws.states.range(b..slots * b), ws.best.rows());
@@ -266,11 +268,11 @@ impl<T: Real> Pass<'_, T> {
         self.mixer.forward(self.online, mixer_inputs, &mut ws.online_mixer, ws.total.rows_mut());
 
         ws.td_target.resize(values, k * b);
-        self.td_targets(range.start, b, ws.target_total.as_slice(), ws.td_target.as_mut_slice());
+        self.td_targets((ep, range.clone()), ws.target_total.as_slice(), ws.td_target.as_mut_slice());
         if self.traced {
             record_trace(ws, (b, slots, m), &mut out.trace);
         }
-        let scale = T::from_f64(1.0 / (ep.len * k * values) as f64);
+        let scale = T::from_f64(1.0 / self.total);
         (out.loss, out.q_tot) = (0.0, 0.0);
         ws.d_total.resize(values, k * b);
         let errors = ws.total.as_slice().iter().zip(ws.td_target.as_slice());
@@ -292,14 +294,14 @@ impl<T: Real> Pass<'_, T> {
     }
 
     /// Computes TD(lambda) targets from the last slot backwards; `next_values` starts at slot 1.
-    fn td_targets(&self, first: usize, b: usize, next_values: &[T], td_target: &mut [T]) {
-        let k = self.episodes.slots;
-        let stride = b * self.mixer.joint_values_per_slot();
+    fn td_targets(&self, (ep, range): (&Episodes, std::ops::Range<usize>), next_values: &[T], td_target: &mut [T]) {
+        let (k, values) = (ep.slots, self.mixer.joint_values_per_slot(ep.uavs));
+        let stride = range.len() * values;
         let gamma = T::from_f64(self.td_lambda.gamma);
         let (lambda, one_minus_lambda) = (T::from_f64(self.td_lambda.lambda), T::from_f64(1.0 - self.td_lambda.lambda));
         for t in (0..k).rev() {
             for i in 0..stride {
-                let reward = T::from_f64(self.episodes.reward[(first + i / self.mixer.joint_values_per_slot()) * k + t].into());
+                let reward = T::from_f64(ep.reward[(range.start + i / values) * k + t].into());
                 let value = next_values[t * stride + i];
                 let next = if t + 1 == k { value } else { td_target[(t + 1) * stride + i] };
                 td_target[t * stride + i] = reward + gamma * (lambda * next + one_minus_lambda * value);
@@ -312,9 +314,10 @@ impl<T: Real> Workspace<T> {
     /// Loads the episodes `range`, time-major.
     fn load(&mut self, agent: &Agent, ep: &Episodes, range: std::ops::Range<usize>) {
         let (m, n, k) = (ep.uavs, ep.users, ep.slots);
-        let config = agent.geometry_config();
+        let (env, episode_slots) = (&ep.env, agent.dims().env.slots);
+        let config = agent.geometry_config(env);
         let slots = k + 1;
-        let memory_len = agent.memory_len();
+        let memory_len = agent.memory_len(m, n);
         self.geometry.clear();
         self.goals.clear();
         self.memory.clear();
@@ -337,13 +340,13 @@ impl<T: Real> Workspace<T> {
                 }
                 if memory_len > 0 {
                     let memory = &mut self.memory[(e - range.start) * memory_len..][..memory_len];
-                    let (sight, env) = (self.geometry.last_sight(aoi), &agent.dims().env);
+                    let sight = self.geometry.last_sight(aoi);
                     agent.remember(env, &sight, t as u64, memory, &mut self.received);
                     self.goals.push_fleet(env, &sight, t as u64, memories(memory, n), &self.last[self.last.len() - m..]);
                 }
                 self.identity_token.extend_from_slice(&ep.identity_token[e * m * TOKEN..][..m * TOKEN]);
                 self.position.extend_from_slice(uav_xy);
-                flat_state(uav_xy, user_xy, aoi, k, states.next().expect("one state per slot"));
+                flat_state(uav_xy, user_xy, aoi, episode_slots, states.next().expect("one state per slot"));
             }
         }
         self.geometry.finish(&config);

@@ -6,6 +6,7 @@
 use super::loss::episodes_per_chunk;
 use super::replay::EpisodeShape;
 use crate::checkpoint;
+use crate::env::EnvConfig;
 use crate::nn::HIDDEN;
 use crate::policy::{Gnn, ObservationKind};
 use crate::train_config::TrainConfig;
@@ -29,7 +30,8 @@ pub struct MemoryEstimate {
 impl MemoryEstimate {
     /// The estimate for a run of `config` on `threads` threads.
     pub fn of(config: &TrainConfig, threads: usize) -> Self {
-        let (env, t) = (&config.environment, &config.training);
+        let t = &config.training;
+        let env = &t.vary.largest(&config.environment);
         let episodes_of_run = t.steps.div_ceil(env.slots as u64).saturating_add(t.envs as u64);
         let episodes = episodes_of_run.min(t.buffer as u64);
         let replay = episodes.saturating_mul(EpisodeShape::of_environment(env).bytes() as u64);
@@ -40,7 +42,7 @@ impl MemoryEstimate {
         let parameters = 4 * (checkpoint::parameter_layout(config).len() as u64).saturating_mul(copies as u64);
 
         let workspaces = threads.min(chunks).max(1) as u64;
-        let activations = activations_of_chunk(config).saturating_mul(workspaces);
+        let activations = activations_of_chunk(config, env).saturating_mul(workspaces);
         Self { replay, parameters, activations }
     }
 
@@ -62,8 +64,8 @@ impl MemoryEstimate {
 }
 
 /// Bytes that one thread keeps of a chunk of a batch.
-fn activations_of_chunk(config: &TrainConfig) -> u64 {
-    let (env, t) = (&config.environment, &config.training);
+fn activations_of_chunk(config: &TrainConfig, env: &EnvConfig) -> u64 {
+    let t = &config.training;
     let (m, n) = (env.uavs as u64, env.users as u64);
     let slots = (episodes_per_chunk(env.uavs) * (env.slots + 1)) as u64;
     let graph = config.algorithm.gnn() != Gnn::None;

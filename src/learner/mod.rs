@@ -30,4 +30,4 @@ pub use trainer::Trainer;
 pub use update::{Learner, LearnerState};
 
 pub use crate::policy::mixer::MixerKind;
-pub use crate::train_config::{Algorithm, Preset, TrainConfig, Training};
+pub use crate::train_config::{Algorithm, Preset, TrainConfig, Training, Vary};

@@ -21,10 +21,10 @@ use rand_chacha::ChaCha8Rng;
 use super::replay::EpisodeShape;
 use super::teacher::Teacher;
 use super::{Episodes, TrainConfig};
-use crate::env::BatchEnv;
+use crate::env::{BatchEnv, EnvConfig};
 use crate::invalid::Invalid;
 use crate::nn::argmax;
-use crate::policy::{Agent, BatchedAgent, StepInput, TOKEN};
+use crate::policy::{Agent, BatchedAgent, Dims, StepInput, TOKEN};
 use crate::rng;
 
 /// The environments and the agents of a training run, and the last collected episodes.
@@ -43,17 +43,19 @@ pub struct Rollout {
 }
 
 impl Rollout {
-    /// A rollout of `training.envs` episodes at a time.
+    /// A rollout of `training.envs` episodes at a time in `environment`.
     ///
     /// # Errors
     /// [`Invalid`] if the environment is invalid.
-    pub fn new(config: &TrainConfig, agent: &Agent) -> Result<Self, Invalid> {
-        let (environment, fleets) = (&config.environment, config.training.envs);
+    pub fn new(config: &TrainConfig, environment: &EnvConfig, agent: &Agent) -> Result<Self, Invalid> {
+        let fleets = config.training.envs;
         let (m, n, k) = (environment.uavs, environment.users, environment.slots);
         let env = BatchEnv::new(environment, fleets)?;
         let shape = EpisodeShape::of_environment(environment);
         let position_slots = if shape.users_move { k + 1 } else { 1 };
+        let dims = Dims { uavs: m, users: n, env: environment.into() };
         let episodes = Episodes {
+            env: dims.env,
             len: fleets,
             uav_xy: vec![0.0; fleets * (k + 1) * m * 2],
             user_xy: vec![0.0; fleets * position_slots * n * 2],
@@ -66,12 +68,12 @@ impl Rollout {
         Ok(Self {
             seed: config.seed,
             env,
-            batched_agent: BatchedAgent::new(agent, fleets),
+            batched_agent: BatchedAgent::new(agent, dims, fleets),
             episodes,
             seeds: Vec::with_capacity(fleets),
             exploration_rngs: Vec::with_capacity(fleets),
             actions: vec![0; fleets * m],
-            teacher: Teacher::new(config, fleets)?,
+            teacher: Teacher::new(config, environment, fleets)?,
             shaping_factors: config.training.shaping.then(|| {
                 let factor = environment.effective_reward_scale() / (1.0 - config.training.gamma) / n as f64;
                 environment.user_weights().iter().map(|w| w * factor).collect()
@@ -185,7 +187,7 @@ mod tests {
     fn collect_episodes(config: &TrainConfig, epsilon: f64, first: u64) -> Episodes {
         let agent = Agent::new(config.agent(), config.dims());
         let parameters: Vec<f32> = agent.layout().initialise(&mut rng::stream(5, "test", 0));
-        Rollout::new(config, &agent).unwrap().collect(&agent, &parameters, epsilon, first).clone()
+        Rollout::new(config, &config.environment, &agent).unwrap().collect(&agent, &parameters, epsilon, first).clone()
     }
 
     #[test]

@@ -7,7 +7,7 @@
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use super::replay::{EpisodeShape, Replay, ReplayArrays};
+use super::replay::{Replay, RingArrays};
 use super::state::{Counters, RunState};
 use super::{Evaluation, LearnerState, TrainConfig};
 use crate::checkpoint;
@@ -91,8 +91,9 @@ pub(super) fn encode(config: &TrainConfig, run: &RunState, learner: &LearnerStat
     for array in [&learner.online, &learner.target, &learner.adam_m, &learner.adam_v, &learner.average, best] {
         push_floats(&mut bytes, array);
     }
-    let arrays = replay.arrays();
-    for array in [&arrays.uav_xy, &arrays.user_xy, &arrays.reward, &arrays.identity_token] {
+    let mut arrays = RingArrays::default();
+    replay.rings().for_each(|ring| arrays.append(ring.arrays()));
+    for array in arrays.floats() {
         push_floats(&mut bytes, array);
     }
     let aoi: Vec<u8> = arrays.aoi.iter().flat_map(|a| a.to_le_bytes()).collect();
@@ -134,15 +135,14 @@ pub(super) fn decode(bytes: &[u8]) -> Result<Snapshot, SnapshotError> {
     let (uav_xy, user_xy, reward, identity_token) =
         (sections.floats()?, sections.floats()?, sections.floats()?, sections.floats()?);
     let aoi = sections.take()?.chunks_exact(2).map(|a| u16::from_le_bytes([a[0], a[1]])).collect();
-    let arrays = ReplayArrays { uav_xy, user_xy, aoi, actions: sections.take()?.to_vec(), reward, identity_token };
+    let arrays = RingArrays { uav_xy, user_xy, aoi, actions: sections.take()?.to_vec(), reward, identity_token };
     if arrays.actions.iter().any(|&a| usize::from(a) >= head.config.environment.actions()) {
         return Err(inconsistent("an action is out of range"));
     }
     if !sections.0.is_empty() {
         return Err(inconsistent("there are bytes after the last section"));
     }
-    let shape = EpisodeShape::of_environment(&head.config.environment);
-    let replay = Replay::from_parts(shape, head.config.training.buffer, head.replay_next, arrays)
+    let replay = Replay::from_parts(&head.config, head.counters.episodes, head.replay_next, arrays)
         .ok_or_else(|| inconsistent("the replay does not have the size of the configuration"))?;
     if !head.counters.is_consistent(&head.config, replay.len()) {
         return Err(inconsistent("the counters contradict each other"));

@@ -58,8 +58,10 @@ impl Counters {
     /// Whether a run of this configuration can reach these counters with `held` episodes in replay.
     pub(super) fn is_consistent(&self, config: &TrainConfig, held: usize) -> bool {
         let t = &config.training;
-        self.episodes.checked_mul(config.environment.slots as u64) == Some(self.env_steps)
-            && self.env_steps < t.steps + (t.envs * config.environment.slots) as u64
+        let [fewest, most] = t.vary.slots.unwrap_or([config.environment.slots; 2]).map(|slots| slots as u64);
+        let possible = self.episodes.checked_mul(fewest).zip(self.episodes.checked_mul(most));
+        possible.is_some_and(|(fewest, most)| (fewest..=most).contains(&self.env_steps))
+            && self.env_steps < t.steps + t.envs as u64 * most
             && self.targets_copied_at_episode <= self.episodes
             && self.updates <= self.episodes.saturating_mul(t.updates_per_iteration as u64)
             && self.next_evaluation <= (self.env_steps / t.eval_every + 1) * t.eval_every

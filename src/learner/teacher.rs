@@ -10,7 +10,7 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
 use super::TrainConfig;
-use crate::env::{BatchEnv, Point, points};
+use crate::env::{BatchEnv, EnvConfig, Point, points};
 use crate::invalid::Invalid;
 use crate::policy::{EnvParams, FleetGraph, FleetStep, Policy, baselines};
 
@@ -42,11 +42,11 @@ impl std::fmt::Debug for Teacher {
 }
 
 impl Teacher {
-    /// The teacher of a configuration, if it has one, for `fleets` fleets.
-    pub(super) fn new(config: &TrainConfig, fleets: usize) -> Result<Option<Self>, Invalid> {
+    /// The teacher of a configuration, if it has one, for `fleets` fleets in `environment`.
+    pub(super) fn new(config: &TrainConfig, environment: &EnvConfig, fleets: usize) -> Result<Option<Self>, Invalid> {
         let Some(name) = &config.training.teacher else { return Ok(None) };
-        let env = EnvParams::from(&config.environment);
-        let (m, n) = (config.environment.uavs, config.environment.users);
+        let env = EnvParams::from(environment);
+        let (m, n) = (environment.uavs, environment.users);
         let rule =
             baselines::by_name(name, env).ok_or_else(|| Invalid::new("training.teacher", name, "the name of a baseline"))?;
         rule.check_fleet(m, n)?;

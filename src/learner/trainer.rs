@@ -15,7 +15,7 @@ use rand::RngExt;
 
 use super::episodes::Symmetry;
 use super::evaluation::evaluate_until;
-use super::replay::{EpisodeShape, Replay};
+use super::replay::{Replay, group_environment};
 use super::rollout::Rollout;
 use super::snapshot::{self, SnapshotError};
 use super::state::{Counters, Phase, RunState};
@@ -33,7 +33,7 @@ pub struct Trainer {
     learner: Learner,
     rollout: Rollout,
     replay: Replay,
-    batch: Episodes,
+    batch: Vec<Episodes>,
     run: RunState,
     stop: Arc<AtomicBool>,
 }
@@ -46,13 +46,12 @@ impl Trainer {
     pub fn new(config: TrainConfig, threads: usize) -> Result<Self, Invalid> {
         config.validate()?;
         let learner = Learner::new(&config, threads)?;
-        let replay = Replay::new(EpisodeShape::of_environment(&config.environment), config.training.buffer);
         Ok(Self {
-            rollout: Rollout::new(&config, learner.agent())?,
+            rollout: Rollout::new(&config, &config.environment, learner.agent())?,
             threads,
             learner,
-            replay,
-            batch: Episodes::default(),
+            replay: Replay::new(&config),
+            batch: Vec::new(),
             run: RunState::new(),
             stop: Arc::default(),
             config,
@@ -190,6 +189,10 @@ impl Trainer {
         let counters = &mut self.run.counters;
         let epsilon = epsilon(t, counters.env_steps);
         let learning_rate = learning_rate(t, counters.env_steps);
+        if !t.vary.is_none() {
+            let environment = group_environment(&self.config, counters.episodes);
+            self.rollout = Rollout::new(&self.config, &environment, self.learner.agent()).expect("every drawn environment is valid");
+        }
         let episodes = self.rollout.collect(self.learner.agent(), self.learner.agent_parameters(), epsilon, counters.episodes);
         counters.env_steps += (episodes.len * episodes.slots) as u64;
         counters.episodes += episodes.len as u64;
@@ -201,9 +204,11 @@ impl Trainer {
                 let mut draw = rng::stream(self.config.seed, "replay", counters.updates);
                 self.replay.sample(t.batch, &mut draw, &mut self.batch);
                 if t.augment {
-                    let symmetries: Vec<_> =
-                        (0..t.batch).map(|_| Symmetry::from_index(draw.random_range(0..Symmetry::COUNT))).collect();
-                    self.batch.transform(&symmetries);
+                    for group in &mut self.batch {
+                        let symmetries: Vec<_> =
+                            (0..group.len).map(|_| Symmetry::from_index(draw.random_range(0..Symmetry::COUNT))).collect();
+                        group.transform(&symmetries);
+                    }
                 }
                 let update = self.learner.update(&self.batch, learning_rate);
                 loss += update.loss;

@@ -80,13 +80,13 @@ impl Learner {
         })
     }
 
-    /// One Adam step on the loss of `episodes`, then the updates of target networks and averaged parameters.
+    /// One Adam step on the loss of the episodes in `groups`, then the updates of target networks and averaged parameters.
     ///
     /// # Panics
-    /// If the sizes of the episodes are not those of the configuration, or there are no episodes.
-    pub fn update(&mut self, episodes: &Episodes, learning_rate: f64) -> LossMetrics {
+    /// If the networks do not fit the sizes of the episodes, or there are no episodes.
+    pub fn update(&mut self, groups: &[Episodes], learning_rate: f64) -> LossMetrics {
         let Self { loss, online, target, adam, pool, .. } = self;
-        let metrics = pool.install(|| loss.compute_gradient(online, target, episodes, None));
+        let metrics = pool.install(|| loss.compute_gradient(online, target, groups, None));
         adam.step(online, loss.gradient(), learning_rate, (metrics.grad_norm, self.clip));
         if self.tau > 0.0 {
             blend(&mut self.target, &self.online, self.tau);

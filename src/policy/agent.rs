@@ -104,7 +104,7 @@ impl Agent {
         let mut layout = ParameterLayout::default();
         let m = dims.uavs;
         let sets = (config.observation == ObservationKind::Set)
-            .then(|| SetEncoder::new(&mut layout, "agent.sets", dims.env.detection_range));
+            .then(|| SetEncoder::new(&mut layout, "agent.sets"));
         let observation = if sets.is_some() { SetEncoder::WIDTH } else { 2 * m + 3 * dims.users };
         let position = if config.self_position { 2 } else { 0 };
         let input = observation + dims.env.actions + identity_width(config.identity, m) + position;
@@ -144,22 +144,21 @@ impl Agent {
         &self.layout
     }
 
-    /// Configuration of geometries for this agent.
-    pub fn geometry_config(&self) -> GeometryConfig {
+    /// Configuration of geometries for this agent, in this environment. AoI is divided by the K that the agent was made for.
+    pub fn geometry_config(&self, env: &EnvParams) -> GeometryConfig {
         let layers = if self.config.gnn == Gnn::None { 0 } else { self.config.layers };
-        let env = &self.dims.env;
         GeometryConfig {
             ranges: env.ranges(),
-            episode_slots: env.slots,
+            episode_slots: self.dims.env.slots,
             layers,
             self_loops: self.config.self_loops,
             hops: self.config.hops,
         }
     }
 
-    /// Length of what the UAVs of the fleet that the agent was made for remember; 0 without memory.
-    pub fn memory_len(&self) -> usize {
-        if self.config.memory.is_none() { 0 } else { self.dims.uavs * uav_memory_len(self.dims.users) }
+    /// Length of what the UAVs of a fleet remember; 0 without memory.
+    pub fn memory_len(&self, uavs: usize, users: usize) -> usize {
+        if self.config.memory.is_none() { 0 } else { uavs * uav_memory_len(users) }
     }
 
     /// Advances what the UAVs of a fleet remember; does nothing without memory. `received` is a buffer.
@@ -216,11 +215,6 @@ impl Agent {
         }
     }
 
-    /// Factor of relative positions in flat observations.
-    fn flat_scale(&self) -> f64 {
-        if self.config.normalise { 1.0 / self.dims.env.detection_range } else { 1.0 }
-    }
-
     /// Writes the observations of rows `first` and following, `stride` apart.
     fn observe<T: Real>(
         &self,
@@ -233,11 +227,9 @@ impl Agent {
             Some(sets) => sets.forward(w, (geometry, first), search, (out, stride)),
             None => {
                 for (r, out) in out.chunks_exact_mut(stride).enumerate() {
-                    flat_observation(
-                        &geometry.view_of_row(first + r, search),
-                        self.flat_scale(),
-                        &mut out[..self.observation_width],
-                    );
+                    let view = geometry.view_of_row(first + r, search);
+                    let scale = if self.config.normalise { view.fleet.scale } else { 1.0 };
+                    flat_observation(&view, scale, &mut out[..self.observation_width]);
                 }
             }
         }

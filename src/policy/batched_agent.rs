@@ -1,6 +1,6 @@
 //! An agent that acts for B fleets of equal size at once, slot by slot, without allocation per step. Used by rollouts.
 
-use super::agent::{Agent, AgentCache};
+use super::agent::{Agent, AgentCache, Dims};
 use super::config::TOKEN;
 use super::features::{Inputs, NO_ACTION};
 use super::geometry::Geometry;
@@ -19,10 +19,12 @@ pub struct StepInput<'a> {
     pub aoi: &'a [f32],
 }
 
-/// Hidden states, last actions and buffers of B fleets of the size that the agent was made for.
+/// Hidden states, last actions and buffers of B fleets.
 #[derive(Debug)]
 pub struct BatchedAgent {
     fleets: usize,
+    /// The environment, and the size of each fleet.
+    dims: Dims,
     params: Vec<f32>,
     prepared: Vec<f32>,
     hidden: Vec<f32>,
@@ -38,18 +40,19 @@ pub struct BatchedAgent {
 }
 
 impl BatchedAgent {
-    /// Allocates for `fleets` fleets. Call [`BatchedAgent::begin`] before the first step.
-    pub fn new(agent: &Agent, fleets: usize) -> Self {
-        let (len, rows) = (agent.layout().len(), fleets * agent.dims().uavs);
+    /// Allocates for `fleets` fleets of these sizes, in this environment. Call [`BatchedAgent::begin`] before the first step.
+    pub fn new(agent: &Agent, dims: Dims, fleets: usize) -> Self {
+        let (len, rows) = (agent.layout().len(), fleets * dims.uavs);
         Self {
             fleets,
+            dims,
             params: vec![0.0; len],
             prepared: vec![0.0; len],
             hidden: vec![0.0; rows * HIDDEN],
             last: vec![NO_ACTION; rows],
             identity_token: vec![0.0; rows * TOKEN],
             geometry: Geometry::default(),
-            memory: vec![0.0; agent.memory_len() * fleets],
+            memory: vec![0.0; agent.memory_len(dims.uavs, dims.users) * fleets],
             received: Vec::new(),
             goals: Goals::default(),
             slot: 0,
@@ -76,10 +79,10 @@ impl BatchedAgent {
     /// # Panics
     /// If a length does not fit.
     pub fn step(&mut self, agent: &Agent, input: StepInput<'_>) -> &[f32] {
-        let (m, n) = (agent.dims().uavs, agent.dims().users);
+        let (m, n, env) = (self.dims.uavs, self.dims.users, &self.dims.env);
         let lengths = (input.uav_xy.len(), input.user_xy.len(), input.aoi.len());
         assert_eq!(lengths, (self.fleets * m * 2, self.fleets * n * 2, self.fleets * n), "B fleets of M and N");
-        let config = agent.geometry_config();
+        let config = agent.geometry_config(env);
         self.geometry.clear();
         self.goals.clear();
         for f in 0..self.fleets {
@@ -87,11 +90,11 @@ impl BatchedAgent {
             let aoi = &input.aoi[f * n..][..n];
             self.geometry.push_scene(&config, uav_xy, user_xy, aoi);
             if !self.memory.is_empty() {
-                let len = agent.memory_len();
+                let len = agent.memory_len(m, n);
                 let (memory, last) = (&mut self.memory[f * len..][..len], &self.last[f * m..][..m]);
                 let sight = self.geometry.last_sight(aoi);
-                agent.remember(&agent.dims().env, &sight, self.slot, memory, &mut self.received);
-                self.goals.push_fleet(&agent.dims().env, &sight, self.slot, memories(memory, n), last);
+                agent.remember(env, &sight, self.slot, memory, &mut self.received);
+                self.goals.push_fleet(env, &sight, self.slot, memories(memory, n), last);
             }
         }
         self.geometry.finish(&config);

@@ -113,17 +113,15 @@ pub(super) fn identity_width(identity: Identity, uavs: usize) -> usize {
 pub struct SetEncoder {
     uav: Embedding<2>,
     user: Embedding<3>,
-    /// 1 / d.
-    scale: f64,
 }
 
 impl SetEncoder {
     /// Width of the observation.
     pub const WIDTH: usize = 2 * HIDDEN;
 
-    pub(super) fn new(layout: &mut ParameterLayout, name: &str, range: f64) -> Self {
+    pub(super) fn new(layout: &mut ParameterLayout, name: &str) -> Self {
         let uav = Embedding::new(layout, &format!("{name}.uav"));
-        Self { uav, user: Embedding::new(layout, &format!("{name}.user")), scale: 1.0 / range }
+        Self { uav, user: Embedding::new(layout, &format!("{name}.user")) }
     }
 
     pub(super) fn prepare<T: Real>(&self, params: &[T], prepared: &mut [T]) {
@@ -139,13 +137,13 @@ impl SetEncoder {
         search: &mut HopSearch,
         (out, stride): (&mut [T], usize),
     ) {
-        let (uav, user, scale) = (self.uav.params(w), self.user.params(w), self.scale);
+        let (uav, user) = (self.uav.params(w), self.user.params(w));
         simd(
             #[inline(always)]
             || {
                 for (r, out) in out.chunks_exact_mut(stride).enumerate() {
                     let [uavs, users] = out[..Self::WIDTH].as_chunks_mut::<HIDDEN>().0 else { unreachable!("two halves") };
-                    encode(&geometry.view_of_row(first + r, search), scale, (&uav, &user), (uavs, users));
+                    encode(&geometry.view_of_row(first + r, search), (&uav, &user), (uavs, users));
                 }
             },
         );
@@ -160,7 +158,7 @@ impl SetEncoder {
         d: Rows<'_, T>,
         grads: &mut [T],
     ) {
-        let (uav, user, scale) = (self.uav.params(w), self.user.params(w), self.scale);
+        let (uav, user) = (self.uav.params(w), self.user.params(w));
         let (mut uav_sums, mut user_sums) = (EmbeddingParams::zero(), EmbeddingParams::zero());
         simd(
             #[inline(always)]
@@ -168,7 +166,7 @@ impl SetEncoder {
                 for (r, d) in d.data.chunks(d.stride).take(d.len).enumerate() {
                     let [uavs, users] = d[..Self::WIDTH].as_chunks::<HIDDEN>().0 else { unreachable!("two halves") };
                     let sums = (&mut uav_sums, &mut user_sums);
-                    encode_back(&geometry.view_of_row(first + r, search), scale, (&uav, &user), (uavs, users), sums);
+                    encode_back(&geometry.view_of_row(first + r, search), (&uav, &user), (uavs, users), sums);
                 }
             },
         );
@@ -180,12 +178,11 @@ impl SetEncoder {
 #[inline(always)]
 fn encode<T: Real>(
     view: &NodeView<'_>,
-    scale: f64,
     (uav, user): (&EmbeddingParams<T, 2>, &EmbeddingParams<T, 3>),
     (uav_sum, user_sum): (&mut [T; HIDDEN], &mut [T; HIDDEN]),
 ) {
     let (mut uavs, mut users) = ([T::ZERO; HIDDEN], [T::ZERO; HIDDEN]);
-    for_each_detected(view, scale, |point| uav.add(point, &mut uavs), |point| user.add(point, &mut users));
+    for_each_detected(view, |point| uav.add(point, &mut uavs), |point| user.add(point, &mut users));
     *uav_sum = uavs;
     *user_sum = users;
 }
@@ -193,18 +190,17 @@ fn encode<T: Real>(
 #[inline(always)]
 fn encode_back<T: Real>(
     view: &NodeView<'_>,
-    scale: f64,
     (uav, user): (&EmbeddingParams<T, 2>, &EmbeddingParams<T, 3>),
     (d_uav, d_user): (&[T; HIDDEN], &[T; HIDDEN]),
     (uav_sums, user_sums): (&mut EmbeddingParams<T, 2>, &mut EmbeddingParams<T, 3>),
 ) {
-    for_each_detected(view, scale, |point| uav.backward(point, d_uav, uav_sums), |point| user.backward(point, d_user, user_sums));
+    for_each_detected(view, |point| uav.backward(point, d_uav, uav_sums), |point| user.backward(point, d_user, user_sums));
 }
 
 /// Calls `uav` or `user` for every node that the view's node detects. A user also observes itself.
 #[inline(always)]
-fn for_each_detected<T: Real>(view: &NodeView<'_>, scale: f64, mut uav: impl FnMut([T; 2]), mut user: impl FnMut([T; 3])) {
-    let m = view.fleet.uavs;
+fn for_each_detected<T: Real>(view: &NodeView<'_>, mut uav: impl FnMut([T; 2]), mut user: impl FnMut([T; 3])) {
+    let (m, scale) = (view.fleet.uavs, view.fleet.scale);
     let aoi = |node: usize| T::from_f64(view.aoi_scaled[node - m].into());
     if view.node >= m {
         user([T::ZERO, T::ZERO, aoi(view.node)]);

@@ -21,6 +21,8 @@ pub struct FleetSpan {
     pub uavs: usize,
     /// N.
     pub users: usize,
+    /// 1 / d, the factor of relative positions in observations.
+    pub scale: f64,
     /// Row of the first UAV.
     pub first_uav: usize,
     /// Index of the first node among all nodes.
@@ -67,7 +69,7 @@ pub struct Geometry {
     points: Vec<Point>,
 }
 
-/// How a geometry is built.
+/// How a geometry is built. The ranges may differ between the fleets of a geometry.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GeometryConfig {
     /// Ranges within which nodes detect each other.
@@ -100,16 +102,17 @@ impl Geometry {
         self.row_of.clear();
     }
 
-    fn add_fleet(&mut self, uavs: usize, users: usize) {
+    fn add_fleet(&mut self, config: &GeometryConfig, uavs: usize, users: usize) {
         let first_uav = self.fleets.last().map_or(0, |f| f.first_uav + f.uavs);
-        self.fleets.push(FleetSpan { uavs, users, first_uav, first_node: self.row_of.len(), first_user: self.aoi_scaled.len() });
+        let (first_node, first_user) = (self.row_of.len(), self.aoi_scaled.len());
+        self.fleets.push(FleetSpan { uavs, users, scale: 1.0 / config.ranges.detection, first_uav, first_node, first_user });
         self.row_of.resize(self.row_of.len() + uavs + users, NO_ROW);
     }
 
     /// Adds a fleet from positions (x, y, x, y ...); `aoi` in slots.
     pub fn push_scene(&mut self, config: &GeometryConfig, uav_xy: &[f32], user_xy: &[f32], aoi: &[f32]) {
         let (uavs, users) = (uav_xy.len() / 2, user_xy.len() / 2);
-        self.add_fleet(uavs, users);
+        self.add_fleet(config, uavs, users);
         self.points.clear();
         self.points.extend(points(uav_xy).chain(points(user_xy)));
         let observers = config.observers(uavs, users);
@@ -128,7 +131,7 @@ impl Geometry {
 
     /// Adds a fleet from what its nodes detect.
     pub fn push_graph(&mut self, config: &GeometryConfig, graph: &FleetGraph) {
-        self.add_fleet(graph.uavs(), graph.users());
+        self.add_fleet(config, graph.uavs(), graph.users());
         let observers = config.observers(graph.uavs(), graph.users());
         for i in 0..observers {
             self.detections.extend_from_slice(graph.detections(i));

@@ -100,7 +100,7 @@ impl Policy for LearnedPolicy {
     }
 
     fn observers(&self, uavs: usize, users: usize) -> usize {
-        self.agent.geometry_config().observers(uavs, users)
+        self.agent.geometry_config(&self.env()).observers(uavs, users)
     }
 
     fn memory_period(&self, _uavs: usize, users: usize) -> usize {
@@ -139,14 +139,13 @@ impl Policy for LearnedPolicy {
 impl LearnedPolicy {
     fn run(&self, fleets: &mut [FleetStep<'_>], b: &mut Buffers) {
         let stride = self.stride();
-        let config = self.agent.geometry_config();
         b.geometry.clear();
         b.last.clear();
         b.identity_token.clear();
         b.position.clear();
         b.goals.clear();
         for fleet in fleets.iter_mut() {
-            b.geometry.push_graph(&config, fleet.graph);
+            b.geometry.push_graph(&self.agent.geometry_config(&fleet.env), fleet.graph);
             let (memory, remembered) = fleet.memory.split_at_mut(fleet.graph.uavs() * stride);
             for uav in memory.chunks_exact(stride) {
                 // The memory may come from a client. A number that is not a heading counts as no heading.
@@ -164,7 +163,7 @@ impl LearnedPolicy {
                 b.position.extend(own.iter().flatten().map(|&x| x as f32));
             }
         }
-        b.geometry.finish(&config);
+        b.geometry.finish(&self.agent.geometry_config(&self.env()));
         let rows = b.geometry.uav_rows();
         let memories = fleets.iter().flat_map(|fleet| fleet.memory[..fleet.graph.uavs() * stride].chunks_exact(stride));
         for (h, uav) in b.cache.begin(rows, 1).chunks_exact_mut(HIDDEN).zip(memories) {

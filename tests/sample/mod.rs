@@ -25,7 +25,7 @@ pub fn episodes(dims: &Dims, len: usize, seed: u64) -> Episodes {
     let Dims { uavs, users, env } = *dims;
     let (actions, slots) = (env.actions, env.slots);
     let mut stream = rng::stream(seed, "episodes", 0);
-    let mut ep = Episodes { len, uavs, users, slots, ..Episodes::default() };
+    let mut ep = Episodes { env: dims.env, len, uavs, users, slots, ..Episodes::default() };
     for _ in 0..len {
         let mut at = vec![0.5_f32; 2 * uavs];
         let mut aoi = vec![0.0; users];

@@ -154,10 +154,28 @@ fn training() -> Map<String, Value> {
             "Baseline that flies some of the UAVs while episodes are collected; absent: none.",
         ),
         ("teacher_share", number(0.0, 1.0), "Smallest probability that the teacher flies a UAV for an episode."),
+        ("vary", vary(), "Ranges [lowest, highest] from which environments are drawn, one per iteration; absent: not drawn."),
         ("eval_every", integer(1, STEPS), "Environment steps between evaluations."),
         ("eval_episodes", integer(1, 4096), "Layouts per evaluation."),
     ];
     object(&fields, &Value::Null)
+}
+
+/// The ranges of varied environments.
+fn vary() -> Value {
+    let range = |end: Value| json!({"type": ["array", "null"], "items": end, "minItems": 2, "maxItems": 2});
+    json!({
+        "type": "object",
+        "properties": {
+            "uavs": range(integer(1, 4096)),
+            "users": range(integer(1, 65_536)),
+            "slots": range(integer(1, 10_000)),
+            "transmission_range": range(number(0.0, 2.0)),
+            "detection_range": range(number(1e-6, 2.0)),
+            "communication_range": range(number(0.0, 10.0)),
+        },
+        "additionalProperties": false,
+    })
 }
 
 impl PartialSchema for Training {

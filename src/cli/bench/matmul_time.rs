@@ -36,7 +36,7 @@ pub(super) fn measure(agent: &Agent, batch: &Episodes, threads: usize, repeat: u
 
 /// The graphs of all slots of all episodes.
 fn geometry(agent: &Agent, ep: &Episodes) -> Geometry {
-    let config = agent.geometry_config();
+    let config = agent.geometry_config(&ep.env);
     let mut geometry = Geometry::default();
     geometry.clear();
     for at in 0..ep.len * (ep.slots + 1) {

@@ -94,9 +94,9 @@ fn learner(mut args: LearnerArgs) -> anyhow::Result<()> {
     let mut learner = Learner::new(&config, threads)?;
     let batch = random_episodes(&config, &learner)?;
     let update_s = median_seconds(repeat, || {
-        learner.update(&batch, config.training.learning_rate);
+        learner.update(std::slice::from_ref(&batch), config.training.learning_rate);
     });
-    let mut rollout = Rollout::new(&config, learner.agent())?;
+    let mut rollout = Rollout::new(&config, &config.environment, learner.agent())?;
     let rollout_s = median_seconds(repeat, || {
         rollout.collect(learner.agent(), learner.agent_parameters(), 0.1, 0);
     });
@@ -138,7 +138,7 @@ fn learner(mut args: LearnerArgs) -> anyhow::Result<()> {
 fn random_episodes(config: &TrainConfig, learner: &Learner) -> anyhow::Result<Episodes> {
     let mut config = config.clone();
     config.training.envs = config.training.batch;
-    let mut rollout = Rollout::new(&config, learner.agent())?;
+    let mut rollout = Rollout::new(&config, &config.environment, learner.agent())?;
     Ok(rollout.collect(learner.agent(), learner.agent_parameters(), 1.0, 0).clone())
 }
 

@@ -12,11 +12,9 @@ use super::hyper_net::{HyperNet, HyperNetCache};
 use super::mixing::{E, mix, mix_back};
 use crate::nn::matmul::InitialValue;
 use crate::nn::{Batch, Embedding, EmbeddingParams, HIDDEN, Linear, ParameterLayout, Real, Rows, Weights, simd};
-use crate::policy::agent::Dims;
 
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Invariant {
-    uavs: usize,
     uav: Embedding<2>,
     user: Embedding<3>,
     w1: HyperNet,
@@ -40,9 +38,8 @@ pub(super) struct InvariantCache<T: Real> {
 }
 
 impl Invariant {
-    pub(super) fn new(layout: &mut ParameterLayout, dims: &Dims) -> Self {
+    pub(super) fn new(layout: &mut ParameterLayout) -> Self {
         Self {
-            uavs: dims.uavs,
             uav: Embedding::new(layout, "mixer.uav"),
             user: Embedding::new(layout, "mixer.user"),
             w1: HyperNet::new(layout, "mixer.w1", [2 + HIDDEN, HIDDEN, E]),
@@ -67,7 +64,7 @@ impl Invariant {
         c: &mut InvariantCache<T>,
         total: &mut [T],
     ) {
-        let (m, slots) = (self.uavs, states.len);
+        let (m, slots) = (q.stride, states.len);
         c.g.resize(HIDDEN, slots);
         c.positions.resize(2, slots * m);
         c.g_part_or_grad.resize(HIDDEN, slots);
@@ -108,7 +105,7 @@ impl Invariant {
         d_total: &[T],
         (grads, dq): (&mut [T], &mut Batch<T>),
     ) {
-        let (m, params) = (self.uavs, w.params);
+        let (m, params) = (q.stride, w.params);
         let parts = (c.w1.output_or_grad.as_mut_slice(), c.w2.output_or_grad.as_mut_slice(), c.mixed.as_mut_slice());
         simd(
             #[inline(always)]

@@ -29,10 +29,9 @@ pub enum MixerKind {
     None,
 }
 
-/// A mixing network and the offsets of its parameters.
+/// A mixing network and the offsets of its parameters. All but `qmix` mix fleets of any size.
 #[derive(Clone, Copy, Debug)]
 pub struct Mixer {
-    uavs: usize,
     net: Net,
 }
 
@@ -56,16 +55,16 @@ impl Mixer {
     pub fn new(kind: MixerKind, dims: &Dims, layout: &mut ParameterLayout) -> Self {
         let net = match kind {
             MixerKind::Qmix => Net::Qmix(Qmix::new(layout, dims)),
-            MixerKind::Invariant => Net::Invariant(Invariant::new(layout, dims)),
+            MixerKind::Invariant => Net::Invariant(Invariant::new(layout)),
             MixerKind::Vdn => Net::Vdn,
             MixerKind::None => Net::None,
         };
-        Self { uavs: dims.uavs, net }
+        Self { net }
     }
 
-    /// Number of joint values per slot: 1, or M with [`MixerKind::None`].
-    pub fn joint_values_per_slot(&self) -> usize {
-        if matches!(self.net, Net::None) { self.uavs } else { 1 }
+    /// Number of joint values per slot of a fleet of `uavs` UAVs: 1, or M with [`MixerKind::None`].
+    pub fn joint_values_per_slot(&self, uavs: usize) -> usize {
+        if matches!(self.net, Net::None) { uavs } else { 1 }
     }
 
     /// See [`crate::nn::Weights`].
@@ -89,7 +88,7 @@ impl Mixer {
             Net::Qmix(net) => net.forward(w, states, q, &mut c.qmix, total.data),
             Net::Invariant(net) => net.forward(w, states, q, &mut c.invariant, total.data),
             Net::Vdn => {
-                for (total, q) in total.data.iter_mut().zip(q.data.chunks_exact(self.uavs)) {
+                for (total, q) in total.data.iter_mut().zip(q.data.chunks_exact(q.stride)) {
                     *total = q.iter().fold(T::ZERO, |sum, &q| sum + q);
                 }
             }
@@ -106,12 +105,12 @@ impl Mixer {
         d_total: &[T],
         (grads, dq): (&mut [T], &mut Batch<T>),
     ) {
-        dq.resize(self.uavs, q.len);
+        dq.resize(q.stride, q.len);
         match &self.net {
             Net::Qmix(net) => net.backward(w, (states, q), &mut c.qmix, d_total, (grads, dq)),
             Net::Invariant(net) => net.backward(w, (states, q), &mut c.invariant, d_total, (grads, dq)),
             Net::Vdn => {
-                for (dq, &d) in dq.as_mut_slice().chunks_exact_mut(self.uavs).zip(d_total) {
+                for (dq, &d) in dq.as_mut_slice().chunks_exact_mut(q.stride).zip(d_total) {
                     dq.fill(d);
                 }
             }

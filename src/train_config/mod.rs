@@ -2,9 +2,12 @@
 //!
 //! `learner` trains from it, and `checkpoint` stores it with the parameters.
 
+mod vary;
+
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use serde_json::{Map, Value};
 
+pub use self::vary::Vary;
 use crate::env::EnvConfig;
 use crate::invalid::{Invalid, expectation, in_range};
 use crate::policy::baselines;
@@ -125,6 +128,9 @@ pub struct Training {
     /// With a teacher: smallest probability that it flies a UAV for an episode. The probability is epsilon while that is larger.
     #[serde(default = "default_teacher_share")]
     pub teacher_share: f64,
+    /// Ranges from which environments are drawn, one per iteration. The policy then flies fleets of many sizes.
+    #[serde(default)]
+    pub vary: Vary,
     /// Environment steps between evaluations.
     pub eval_every: u64,
     /// Layouts per evaluation.
@@ -195,6 +201,7 @@ impl TrainConfig {
             augment: false,
             teacher: None,
             teacher_share: default_teacher_share(),
+            vary: Vary::default(),
             eval_every: 10_000,
             eval_episodes: 64,
         };
@@ -307,11 +314,38 @@ impl TrainConfig {
                 "1, because the number of layers of a graph network sets its hops",
             ));
         }
+        if !t.vary.is_none() {
+            self.validate_vary()?;
+        }
+        let env = t.vary.largest(env);
         let episode = (env.slots + 1) * (env.uavs * 8 + env.users * 10) + env.slots * (env.uavs + 4);
         let replay = episode.saturating_mul(t.buffer);
         if replay > MAX_REPLAY_BYTES {
             let value = format!("{} episodes of {} MiB in total", t.buffer, replay >> 20);
             return Err(Invalid::new("training.buffer", value, format!("at most {} MiB in total", MAX_REPLAY_BYTES >> 20)));
+        }
+        Ok(())
+    }
+}
+
+impl TrainConfig {
+    /// Checks that the networks fit fleets of any size.
+    fn validate_vary(&self) -> Result<(), Invalid> {
+        let t = &self.training;
+        t.vary.validate(&self.environment).map_err(|e| e.with_prefix("training.vary"))?;
+        if t.observation == ObservationKind::Flat {
+            return Err(Invalid::new("training.observation", "flat", "set, because training.vary draws fleets of different sizes"));
+        }
+        if t.identity == Identity::Onehot {
+            return Err(Invalid::new("training.identity", "onehot", "another one, because training.vary draws fleets of different sizes"));
+        }
+        if t.mixer == MixerKind::Qmix {
+            return Err(Invalid::new("training.mixer", "qmix", "another one, because training.vary draws fleets of different sizes"));
+        }
+        if !t.batch.is_multiple_of(t.envs) || !t.buffer.is_multiple_of(t.envs) {
+            let (field, value) = if t.batch.is_multiple_of(t.envs) { ("training.buffer", t.buffer) } else { ("training.batch", t.batch) };
+            let expected = format!("a multiple of training.envs ({}), because episodes of one drawn environment stay together", t.envs);
+            return Err(Invalid::new(field, value, expected));
         }
         Ok(())
     }
@@ -445,7 +479,7 @@ mod tests {
 
     #[test]
     fn the_documented_presets_are_the_presets() {
-        let text = include_str!("../docs/algorithms.md");
+        let text = include_str!("../../docs/algorithms.md");
         let fields = |preset| {
             let mut config = TrainConfig::resolve(Algorithm::Qedgix, preset, &Map::new(), &Map::new(), 1).unwrap();
             // The table states it in terms of K and N.

@@ -1,21 +1,20 @@
-//! Replay: a ring buffer of whole episodes (docs/model.md, "Replay"). AoI is stored as u16, actions as u8, positions as f32. Memory
-//! grows with the episodes held, not with the capacity.
+//! A ring buffer of whole episodes of one shape. AoI is stored as u16, actions as u8, positions as f32.
 
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
-use super::Episodes;
+use super::super::Episodes;
 use crate::env::EnvConfig;
 
 /// The last `capacity` episodes, all of the same shape.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Replay {
+pub struct Ring {
     shape: EpisodeShape,
     capacity: usize,
     len: usize,
     /// Index at which the next episode is stored.
     next: usize,
-    arrays: ReplayArrays,
+    arrays: RingArrays,
     /// 0, 1, 2, ..; sampling permutes it temporarily.
     order: Vec<u32>,
 }
@@ -35,7 +34,7 @@ pub struct EpisodeShape {
 
 /// The stored episodes as a structure of arrays; see [`Episodes`] for the layout of each.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct ReplayArrays {
+pub struct RingArrays {
     pub uav_xy: Vec<f32>,
     pub user_xy: Vec<f32>,
     pub aoi: Vec<u16>,
@@ -55,7 +54,7 @@ impl EpisodeShape {
         Self { uavs: env.uavs, users: env.users, slots: env.slots, users_move: env.user_speed > 0.0 }
     }
 
-    /// Values per episode of each array of [`ReplayArrays`], in its order.
+    /// Values per episode of each array of [`RingArrays`], in its order.
     fn widths(&self) -> [usize; 6] {
         let (m, n, k) = (self.uavs, self.users, self.slots);
         let position_slots = if self.users_move { k + 1 } else { 1 };
@@ -68,6 +67,14 @@ impl EpisodeShape {
         4 * (uavs + users + reward + identity_token) + 2 * aoi + actions
     }
 
+    /// A batch of `len` episodes in which every number is `value`.
+    #[cfg(test)]
+    pub fn filled(&self, len: usize, value: f32) -> Episodes {
+        let [uavs, users, aoi, actions, reward, identity_token] = self.widths().map(|width| vec![value; len * width]);
+        let actions = actions.into_iter().map(|x| x as u8).collect();
+        Episodes { len, uav_xy: uavs, user_xy: users, aoi, actions, reward, identity_token, ..self.episodes() }
+    }
+
     /// An empty batch of this shape.
     pub fn episodes(&self) -> Episodes {
         let &Self { uavs, users, slots, users_move } = self;
@@ -75,14 +82,52 @@ impl EpisodeShape {
     }
 }
 
-impl Replay {
-    /// An empty replay for `capacity` episodes.
-    pub fn new(shape: EpisodeShape, capacity: usize) -> Self {
-        Self { shape, capacity, len: 0, next: 0, arrays: ReplayArrays::default(), order: Vec::new() }
+impl RingArrays {
+    /// The arrays in a fixed order, except actions and AoI.
+    pub fn floats(&self) -> [&Vec<f32>; 4] {
+        [&self.uav_xy, &self.user_xy, &self.reward, &self.identity_token]
     }
 
-    /// A replay with this content; `None` if the sizes contradict each other.
-    pub(super) fn from_parts(shape: EpisodeShape, capacity: usize, next: usize, arrays: ReplayArrays) -> Option<Self> {
+    /// Whether all arrays are empty.
+    pub fn is_empty(&self) -> bool {
+        self.floats().into_iter().all(Vec::is_empty) && self.aoi.is_empty() && self.actions.is_empty()
+    }
+
+    /// Adds `other` at the end.
+    pub fn append(&mut self, other: &Self) {
+        self.uav_xy.extend_from_slice(&other.uav_xy);
+        self.user_xy.extend_from_slice(&other.user_xy);
+        self.aoi.extend_from_slice(&other.aoi);
+        self.actions.extend_from_slice(&other.actions);
+        self.reward.extend_from_slice(&other.reward);
+        self.identity_token.extend_from_slice(&other.identity_token);
+    }
+
+    /// Removes `episodes` episodes of this shape from the front; `None` if there are fewer.
+    pub fn take_front(&mut self, shape: &EpisodeShape, episodes: usize) -> Option<Self> {
+        fn take<T>(array: &mut Vec<T>, len: usize) -> Option<Vec<T>> {
+            (len <= array.len()).then(|| array.drain(..len).collect())
+        }
+        let [uavs, users, aoi, actions, reward, identity_token] = shape.widths().map(|width| width * episodes);
+        Some(Self {
+            uav_xy: take(&mut self.uav_xy, uavs)?,
+            user_xy: take(&mut self.user_xy, users)?,
+            aoi: take(&mut self.aoi, aoi)?,
+            actions: take(&mut self.actions, actions)?,
+            reward: take(&mut self.reward, reward)?,
+            identity_token: take(&mut self.identity_token, identity_token)?,
+        })
+    }
+}
+
+impl Ring {
+    /// An empty ring for `capacity` episodes.
+    pub fn new(shape: EpisodeShape, capacity: usize) -> Self {
+        Self { shape, capacity, len: 0, next: 0, arrays: RingArrays::default(), order: Vec::new() }
+    }
+
+    /// A ring with this content; `None` if the sizes contradict each other.
+    pub fn from_parts(shape: EpisodeShape, capacity: usize, next: usize, arrays: RingArrays) -> Option<Self> {
         let [uavs, users, aoi, actions, reward, identity_token] = shape.widths();
         let len = arrays.reward.len() / reward.max(1);
         let fits = [
@@ -99,23 +144,23 @@ impl Replay {
         fits.into_iter().all(|fit| fit).then_some(Self { shape, capacity, len, next, arrays, order })
     }
 
+    /// The shape of its episodes.
+    pub fn shape(&self) -> EpisodeShape {
+        self.shape
+    }
+
     /// Number of episodes held.
     pub fn len(&self) -> usize {
         self.len
     }
 
-    /// Whether it holds no episode.
-    pub fn is_empty(&self) -> bool {
-        self.len == 0
-    }
-
     /// Index at which the next episode is stored.
-    pub(super) fn next(&self) -> usize {
+    pub fn next(&self) -> usize {
         self.next
     }
 
     /// The stored episodes.
-    pub(super) fn arrays(&self) -> &ReplayArrays {
+    pub fn arrays(&self) -> &RingArrays {
         &self.arrays
     }
 
@@ -131,12 +176,12 @@ impl Replay {
             + d.actions.capacity()
     }
 
-    /// Adds every episode of `batch`. When the replay is full, each replaces the oldest.
+    /// Adds every episode of `batch`. When the ring is full, each replaces the oldest.
     ///
     /// # Panics
     /// If the episodes have another shape.
     pub fn push(&mut self, batch: &Episodes) {
-        assert_eq!(EpisodeShape::of(batch), self.shape, "all episodes of a replay have one shape");
+        assert_eq!(EpisodeShape::of(batch), self.shape, "all episodes of a ring have one shape");
         let [uavs, users, aoi, actions, reward, identity_token] = self.shape.widths();
         for b in 0..batch.len {
             let at = self.next;
@@ -225,7 +270,7 @@ mod tests {
         }
     }
 
-    fn sampled(replay: &mut Replay, count: usize, update: u64) -> Vec<usize> {
+    fn sampled(replay: &mut Ring, count: usize, update: u64) -> Vec<usize> {
         let mut batch = Episodes::default();
         replay.sample(count, &mut rng::stream(1, "replay", update), &mut batch);
         batch.reward.chunks(replay.shape.slots).map(|r| r[0] as usize).collect()
@@ -233,7 +278,7 @@ mod tests {
 
     #[test]
     fn the_oldest_episodes_are_replaced() {
-        let mut replay = Replay::new(SHAPE, 10);
+        let mut replay = Ring::new(SHAPE, 10);
         replay.push(&numbered(SHAPE, 0..8));
         assert_eq!(replay.len(), 8);
         replay.push(&numbered(SHAPE, 8..16));
@@ -246,7 +291,7 @@ mod tests {
     #[test]
     fn sampled_episodes_equal_the_stored_ones() {
         for shape in [SHAPE, EpisodeShape { users_move: true, ..SHAPE }] {
-            let mut replay = Replay::new(shape, 10);
+            let mut replay = Ring::new(shape, 10);
             replay.push(&numbered(shape, 0..7));
             let mut batch = Episodes::default();
             replay.sample(3, &mut rng::stream(1, "replay", 4), &mut batch);
@@ -267,7 +312,7 @@ mod tests {
 
     #[test]
     fn draws_are_uniform_without_replacement_and_independent() {
-        let mut replay = Replay::new(SHAPE, 20);
+        let mut replay = Ring::new(SHAPE, 20);
         replay.push(&numbered(SHAPE, 0..20));
         let alone = sampled(&mut replay.clone(), 8, 77);
         let mut counts = [0; 20];
@@ -287,7 +332,7 @@ mod tests {
 
     #[test]
     fn a_replay_of_the_paper_s_size_takes_less_than_50_mib() {
-        let mut replay = Replay::new(SHAPE, 5000);
+        let mut replay = Ring::new(SHAPE, 5000);
         let batch = numbered(SHAPE, 0..8);
         for _ in 0..700 {
             replay.push(&batch);
@@ -299,7 +344,7 @@ mod tests {
     #[test]
     fn aoi_beyond_u16_saturates() {
         let shape = EpisodeShape { uavs: 1, users: 1, slots: 1, users_move: false };
-        let mut replay = Replay::new(shape, 1);
+        let mut replay = Ring::new(shape, 1);
         let mut e = numbered(shape, 0..1);
         e.aoi = vec![65_534.0, 70_000.0];
         replay.push(&e);
