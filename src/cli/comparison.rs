@@ -85,12 +85,19 @@ impl Comparison {
     /// The conditions of the evaluation in one line.
     pub fn conditions(&self) -> String {
         let Self { env, disturbance, .. } = self;
+        if self.layouts.mixed {
+            return format!("{} of {}, with drawn sizes, ranges and horizons", self.episodes, self.layouts.name);
+        }
         let mut parts = vec![
             format!("{} of {}", self.episodes, self.layouts.name),
             format!("{} UAVs", env.uavs),
             format!("{} users", env.users),
             format!("{} slots", env.slots),
         ];
+        if env.detection_range != EnvConfig::default().detection_range {
+            parts.push(format!("detection range {}", env.detection_range));
+        }
+        parts.extend(env.communication_range.map(|range| format!("communication range {range}")));
         parts.extend(disturbance.lose.map(|lost| format!("UAV {} lost from slot {} on", lost.uav, lost.slot)));
         if disturbance.position_noise > 0.0 {
             parts.push(format!("observed positions with an error of {}", disturbance.position_noise));

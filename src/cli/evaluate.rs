@@ -12,7 +12,9 @@ use super::output::outln;
 use super::{act_client, ports, progress, report, run_args::all_cores, table};
 use crate::checkpoint::Checkpoint;
 use crate::env::EnvConfig;
-use crate::learner::{Disturbance, LayoutList, LostUav, TracedEvaluation, Trajectory, evaluate_traced, layout_list};
+use crate::learner::{
+    Disturbance, LayoutList, LostUav, TracedEvaluation, Trajectory, evaluate_list, evaluate_traced, layout_list,
+};
 use crate::policy::{Policy, baselines};
 use crate::serving::bundled;
 
@@ -26,6 +28,8 @@ use crate::serving::bundled;
 Conditions that differ from training:
   qedgix evaluate --policy policy.safetensors --policy sweep --uavs 4 --users 8 --json
   qedgix evaluate --policy qedgix --policy sweep --detection-range 0.2 --user-speed 0.01
+  qedgix evaluate --policy qedgix --policy sweep-shared --communication-range 1.5   # everywhere
+  qedgix evaluate --policy qedgix --policy sweep-shared --layouts eval-mixed-v2     # drawn sizes, ranges and horizons
   qedgix evaluate --policy qedgix --policy sweep --lose-uav 1@20      # UAV 1 of 0, 1, 2 is lost from slot 20 on
   qedgix evaluate --policy qedgix --policy sweep --position-noise 0.02")]
 pub struct EvaluateArgs {
@@ -50,6 +54,9 @@ pub struct EvaluateArgs {
     /// Detection range, in units of the square's side
     #[arg(long, env = "QEDGIX_DETECTION_RANGE", default_value_t = 0.28)]
     detection_range: f64,
+    /// Range within which UAVs exchange messages, in units of the square's side [default: the detection range]
+    #[arg(long, env = "QEDGIX_COMMUNICATION_RANGE")]
+    communication_range: Option<f64>,
     /// Transmission range, in units of the square's side
     #[arg(long, env = "QEDGIX_TRANSMISSION_RANGE", default_value_t = 0.12)]
     transmission_range: f64,
@@ -117,8 +124,14 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
                 let policy = open(name, &env)?;
                 let env = EnvConfig { hover: policy.actions() > EnvConfig::COMPASS, ..env.clone() };
                 let threads = args.threads.unwrap_or_else(all_cores);
-                evaluate_traced(policy.as_ref(), &env, &seeds, args.report_layout, &disturbance, threads)
-                    .with_context(|| format!("policy {name}"))?
+                if list.mixed {
+                    let episodes = evaluate_list(policy.as_ref(), (&list, args.episodes), &env, threads)
+                        .with_context(|| format!("policy {name}"))?;
+                    TracedEvaluation { episodes, aoi: Vec::new(), trajectory: Trajectory::default() }
+                } else {
+                    evaluate_traced(policy.as_ref(), &env, &seeds, args.report_layout, &disturbance, threads)
+                        .with_context(|| format!("policy {name}"))?
+                }
             }
         };
         evaluations.push(PolicyEvaluation::new(name, reference, evaluation)?);
@@ -151,6 +164,7 @@ fn check(args: &EvaluateArgs) -> anyhow::Result<(LayoutList, Vec<u64>, EnvConfig
         users: args.users,
         slots: args.slots,
         detection_range: args.detection_range,
+        communication_range: args.communication_range,
         transmission_range: args.transmission_range,
         user_speed: args.user_speed,
         ..EnvConfig::default()
@@ -170,6 +184,11 @@ fn check(args: &EvaluateArgs) -> anyhow::Result<(LayoutList, Vec<u64>, EnvConfig
     ensure!(
         args.server.is_none() || !local_only,
         "--report, --lose-uav and --position-noise work for files, bundled policies and baselines only; leave out --server"
+    );
+    ensure!(
+        !list.mixed || (args.server.is_none() && !local_only),
+        "--layouts {}: it draws the environments itself; leave out --server, --report, --lose-uav and --position-noise",
+        list.name
     );
     Ok((list, seeds, env))
 }
@@ -205,6 +224,9 @@ impl EvaluateArgs {
             if value != default {
                 add(flag, value.to_string());
             }
+        }
+        if let Some(range) = self.communication_range {
+            add("communication-range", range.to_string());
         }
         if let Some(LostUav { uav, slot }) = self.lose_uav {
             add("lose-uav", format!("{uav}@{slot}"));

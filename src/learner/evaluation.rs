@@ -7,6 +7,7 @@ use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::disturbance::Disturbance;
+use super::layouts::LayoutList;
 use crate::env::{BatchEnv, EnvConfig, EpisodeMetrics, Point, points};
 use crate::invalid::{Invalid, in_range};
 use crate::policy::{EnvParams, FleetGraph, FleetStep, Policy};
@@ -19,6 +20,22 @@ use crate::policy::{EnvParams, FleetGraph, FleetStep, Policy};
 pub fn evaluate(policy: &dyn Policy, env: &EnvConfig, seeds: &[u64], threads: usize) -> Result<Vec<EpisodeMetrics>, Invalid> {
     let parts = run_parallel(policy, env, seeds, threads, &Disturbance::default(), |_| ())?;
     Ok(parts.into_iter().flat_map(|(metrics, ())| metrics).collect())
+}
+
+/// As [`evaluate`], on the first `episodes` layouts of a list; `env` is the environment of lists that are not mixed. A policy whose
+/// fleet size is fixed does not fit a mixed list.
+///
+/// # Errors
+/// As [`evaluate`].
+pub fn evaluate_list(
+    policy: &dyn Policy,
+    (list, episodes): (&LayoutList, usize),
+    env: &EnvConfig,
+    threads: usize,
+) -> Result<Vec<EpisodeMetrics>, Invalid> {
+    let groups = list.environments(env, episodes);
+    let parts: Result<Vec<_>, _> = groups.iter().map(|(env, seeds)| evaluate(policy, env, seeds, threads)).collect();
+    Ok(parts?.concat())
 }
 
 /// As [`evaluate`], unless `stop` is set before the last slot: then `None`, within a slot.

@@ -1,6 +1,9 @@
 //! The frozen lists of layouts that policies are evaluated on (docs/model.md, "Evaluation").
 
+use crate::env::EnvConfig;
 use crate::invalid::Invalid;
+use crate::rng;
+use crate::train_config::Vary;
 
 /// A named, frozen list of layouts: the seeds of its episodes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -11,6 +14,8 @@ pub struct LayoutList {
     pub first: u64,
     /// Number of episodes.
     pub episodes: u64,
+    /// Whether sizes, ranges and horizons are drawn, see [`LayoutList::environments`].
+    pub mixed: bool,
 }
 
 impl LayoutList {
@@ -20,11 +25,40 @@ impl LayoutList {
     }
 }
 
-/// All lists: `eval-v1` for reports, `valid-v1` for choosing the best weights of a run. They share no seed with each other or
-/// with training, whose seeds have the top bit set.
-pub const LAYOUT_LISTS: [LayoutList; 2] = [
-    LayoutList { name: "eval-v1", first: 10_000, episodes: 256 },
-    LayoutList { name: "valid-v1", first: 20_000, episodes: 4096 },
+/// Episodes in a row of a mixed list that share a drawn environment.
+const MIXED_GROUP: u64 = 8;
+
+/// What mixed lists draw. The rest is that of the environment asked for.
+const MIXED: Vary = Vary {
+    uavs: Some([2, 6]),
+    users: Some([4, 20]),
+    slots: Some([40, 320]),
+    transmission_range: None,
+    detection_range: Some([0.2, 0.36]),
+    communication_range: Some([0.2, 1.5]),
+};
+
+impl LayoutList {
+    /// The first `episodes` seeds of the list in groups, each with its environment: `base`, or in a mixed list one that is drawn
+    /// for the group.
+    pub fn environments(&self, base: &EnvConfig, episodes: usize) -> Vec<(EnvConfig, Vec<u64>)> {
+        let seeds = self.seeds(episodes);
+        if !self.mixed {
+            return vec![(base.clone(), seeds)];
+        }
+        let draw = |group: &[u64]| MIXED.draw(base, &mut rng::stream(group[0], "mixed", 0));
+        seeds.chunks(MIXED_GROUP as usize).map(|group| (draw(group), group.to_vec())).collect()
+    }
+}
+
+/// All lists: `eval-v1`, `eval-v2` and `eval-mixed-v2` for reports, `valid-v1` and `valid-mixed-v1` for choosing weights and
+/// settings. They share no seed with each other or with training, whose seeds have the top bit set.
+pub const LAYOUT_LISTS: [LayoutList; 5] = [
+    LayoutList { name: "eval-v1", first: 10_000, episodes: 256, mixed: false },
+    LayoutList { name: "valid-v1", first: 20_000, episodes: 4096, mixed: false },
+    LayoutList { name: "eval-v2", first: 30_000, episodes: 512, mixed: false },
+    LayoutList { name: "eval-mixed-v2", first: 40_000, episodes: 512, mixed: true },
+    LayoutList { name: "valid-mixed-v1", first: 50_000, episodes: 4096, mixed: true },
 ];
 
 /// The list with this name.
@@ -32,6 +66,6 @@ pub const LAYOUT_LISTS: [LayoutList; 2] = [
 /// # Errors
 /// [`Invalid`] if the name is unknown.
 pub fn layout_list(name: &str) -> Result<LayoutList, Invalid> {
-    let known = || LAYOUT_LISTS.map(|l| l.name).join(" or ");
+    let known = || format!("one of {}", LAYOUT_LISTS.map(|l| l.name).join(", "));
     LAYOUT_LISTS.into_iter().find(|l| l.name == name).ok_or_else(|| Invalid::new("layouts", format!("{name:?}"), known()))
 }

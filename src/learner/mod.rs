@@ -18,7 +18,7 @@ mod update;
 
 pub use disturbance::{Disturbance, LostUav};
 pub use episodes::{Episodes, Symmetry};
-pub use evaluation::{TracedEvaluation, Trajectory, evaluate, evaluate_traced};
+pub use evaluation::{TracedEvaluation, Trajectory, evaluate, evaluate_list, evaluate_traced};
 pub use event::{Evaluation, Event, Iteration};
 pub use layouts::{LAYOUT_LISTS, LayoutList, layout_list};
 pub use loss::LossMetrics;

@@ -22,7 +22,7 @@ pub struct Vary {
     pub transmission_range: Option<[f64; 2]>,
     /// d, the detection range.
     pub detection_range: Option<[f64; 2]>,
-    /// Range within which UAVs exchange messages.
+    /// Range within which UAVs exchange messages. A drawn value below d counts as d: radios reach at least as far as cameras.
     pub communication_range: Option<[f64; 2]>,
 }
 
@@ -43,7 +43,8 @@ impl Vary {
         let mut real = |range: Option<[f64; 2]>| range.map(|[low, high]| rng.random_range(low..=high));
         env.transmission_range = real(self.transmission_range).unwrap_or(env.transmission_range);
         env.detection_range = real(self.detection_range).unwrap_or(env.detection_range);
-        env.communication_range = real(self.communication_range).or(env.communication_range);
+        let communication = real(self.communication_range).map(|range| range.max(env.detection_range));
+        env.communication_range = communication.or(env.communication_range);
         env
     }
 
