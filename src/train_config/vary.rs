@@ -32,7 +32,8 @@ impl Vary {
         *self == Self::default()
     }
 
-    /// An environment with the fields of `base` that have no range, and drawn values of the others.
+    /// An environment with the fields of `base` that have no range, and drawn values of the others. Rewards grow with M: mean AoI falls
+    /// with M, and updates would otherwise care little about large fleets.
     pub fn draw(&self, base: &EnvConfig, rng: &mut impl Rng) -> EnvConfig {
         let mut env = base.clone();
         for (field, range) in [(&mut env.uavs, self.uavs), (&mut env.users, self.users), (&mut env.slots, self.slots)] {
@@ -45,6 +46,9 @@ impl Vary {
         env.detection_range = real(self.detection_range).unwrap_or(env.detection_range);
         let communication = real(self.communication_range).map(|range| range.max(env.detection_range));
         env.communication_range = communication.or(env.communication_range);
+        if self.uavs.is_some() {
+            env.reward_scale = Some(base.effective_reward_scale() * env.uavs as f64 / base.uavs as f64);
+        }
         env
     }
 
