@@ -258,6 +258,8 @@ fn whole_loss() {
         loss.compute_gradient(&online, &target, std::slice::from_ref(&episodes), None);
         let gradient = loss.gradient().to_vec();
         let ranges: Vec<_> = layout.parameters().iter().map(|p| (p.name.clone(), p.range.clone())).collect();
-        check(name, &ranges, &online, &gradient, |online| loss.compute_gradient(online, &target, std::slice::from_ref(&episodes), None).loss);
+        check(name, &ranges, &online, &gradient, |online| {
+            loss.compute_gradient(online, &target, std::slice::from_ref(&episodes), None).loss
+        });
     }
 }

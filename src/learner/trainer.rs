@@ -191,7 +191,8 @@ impl Trainer {
         let learning_rate = learning_rate(t, counters.env_steps);
         if !t.vary.is_none() {
             let environment = group_environment(&self.config, counters.episodes);
-            self.rollout = Rollout::new(&self.config, &environment, self.learner.agent()).expect("every drawn environment is valid");
+            self.rollout =
+                Rollout::new(&self.config, &environment, self.learner.agent()).expect("every drawn environment is valid");
         }
         let episodes = self.rollout.collect(self.learner.agent(), self.learner.agent_parameters(), epsilon, counters.episodes);
         counters.env_steps += (episodes.len * episodes.slots) as u64;

@@ -103,8 +103,7 @@ impl Agent {
     pub fn new(config: AgentConfig, dims: Dims) -> Self {
         let mut layout = ParameterLayout::default();
         let m = dims.uavs;
-        let sets = (config.observation == ObservationKind::Set)
-            .then(|| SetEncoder::new(&mut layout, "agent.sets"));
+        let sets = (config.observation == ObservationKind::Set).then(|| SetEncoder::new(&mut layout, "agent.sets"));
         let observation = if sets.is_some() { SetEncoder::WIDTH } else { 2 * m + 3 * dims.users };
         let position = if config.self_position { 2 } else { 0 };
         let input = observation + dims.env.actions + identity_width(config.identity, m) + position;

@@ -334,17 +334,31 @@ impl TrainConfig {
         let t = &self.training;
         t.vary.validate(&self.environment).map_err(|e| e.with_prefix("training.vary"))?;
         if t.observation == ObservationKind::Flat {
-            return Err(Invalid::new("training.observation", "flat", "set, because training.vary draws fleets of different sizes"));
+            return Err(Invalid::new(
+                "training.observation",
+                "flat",
+                "set, because training.vary draws fleets of different sizes",
+            ));
         }
         if t.identity == Identity::Onehot {
-            return Err(Invalid::new("training.identity", "onehot", "another one, because training.vary draws fleets of different sizes"));
+            return Err(Invalid::new(
+                "training.identity",
+                "onehot",
+                "another one, because training.vary draws fleets of different sizes",
+            ));
         }
         if t.mixer == MixerKind::Qmix {
-            return Err(Invalid::new("training.mixer", "qmix", "another one, because training.vary draws fleets of different sizes"));
+            return Err(Invalid::new(
+                "training.mixer",
+                "qmix",
+                "another one, because training.vary draws fleets of different sizes",
+            ));
         }
         if !t.batch.is_multiple_of(t.envs) || !t.buffer.is_multiple_of(t.envs) {
-            let (field, value) = if t.batch.is_multiple_of(t.envs) { ("training.buffer", t.buffer) } else { ("training.batch", t.batch) };
-            let expected = format!("a multiple of training.envs ({}), because episodes of one drawn environment stay together", t.envs);
+            let (field, value) =
+                if t.batch.is_multiple_of(t.envs) { ("training.buffer", t.buffer) } else { ("training.batch", t.batch) };
+            let expected =
+                format!("a multiple of training.envs ({}), because episodes of one drawn environment stay together", t.envs);
             return Err(Invalid::new(field, value, expected));
         }
         Ok(())
