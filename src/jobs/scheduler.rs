@@ -340,7 +340,7 @@ mod tests {
         let config = TrainConfig::preset(Algorithm::Qmix, Preset::Practical);
         let spec = JobSpec { kind: JobKind::Train, name: None, labels: BTreeMap::new(), threads: 1, priority: 0, config };
         let id = JobId(Uuid::from_u128(1));
-        store.submit_job(NewJob { id, owner: None, any_name: false, spec, now: clock.now(), idempotency: None }).await.unwrap();
+        store.submit_job(NewJob { id, owner: None, any_name: false, spec, notes: String::new(), parent: None, now: clock.now(), idempotency: None }).await.unwrap();
         let config = SchedulerConfig { max_attempts: 1, ..SchedulerConfig::new(1) };
         let scheduler = Scheduler::open(store, config, Arc::new(Endless), clock, Draining::default()).await.unwrap();
         (dir, scheduler, id)

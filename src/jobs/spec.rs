@@ -2,12 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use serde::{Deserialize, Serialize};
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 
 use crate::invalid::{Invalid, in_range};
-use crate::store::{JobKind, JobSpec};
+use crate::store::{Job, JobEdit, JobKind, JobSpec};
 use crate::train_config::{Algorithm, Preset, TrainConfig, floats_to_integers};
 
 /// A job as it is submitted; what is absent has a default.
@@ -23,6 +24,9 @@ pub struct JobRequest {
     /// Labels for people.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub labels: Option<BTreeMap<String, String>>,
+    /// Notes for people.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub notes: Option<String>,
     /// CPU cores; default: 1.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub threads: Option<usize>,
@@ -52,12 +56,8 @@ impl JobRequest {
     ///
     /// # Errors
     /// The first field that is unknown or of the wrong type.
-    pub fn from_json(mut document: Value) -> Result<Self, Invalid> {
-        floats_to_integers(&mut document);
-        if !document.is_object() {
-            return Err(Invalid::schema("job", document, "an object"));
-        }
-        serde_path_to_error::deserialize(document).map_err(|e| Invalid::from_parser(&e.path().to_string(), e.inner()))
+    pub fn from_json(document: Value) -> Result<Self, Invalid> {
+        from_json(document)
     }
 
     /// SHA-256 of the request in canonical form, by which the same request is recognised.
@@ -82,12 +82,13 @@ impl JobRequest {
             let expected = format!("a number from 1 to {cpu_budget}, the server's CPU budget");
             return Err(Invalid::new("threads", threads, expected));
         }
-        in_range("priority", priority, -100..=100)?;
+        check_priority(priority)?;
         if let Some(name) = &self.name {
             check_name("name", name)?;
         }
         let labels = self.labels.unwrap_or_default();
         check_labels(&labels)?;
+        check_notes(&self.notes.unwrap_or_default())?;
         let [environment, training] = [self.environment, self.training].map(|section| {
             let mut fields = section.unwrap_or_default();
             fields.values_mut().for_each(floats_to_integers);
@@ -99,7 +100,98 @@ impl JobRequest {
     }
 }
 
-fn check_name(field: &str, name: &str) -> Result<(), Invalid> {
+/// What a caller changes of a job, as a JSON merge patch (RFC 7396): what is absent stays, and null means the default.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct EditRequest {
+    /// The name; null: no name.
+    #[serde(deserialize_with = "present")]
+    pub name: Option<Option<String>>,
+    /// The labels to add or replace; those that are null are removed. Null: all are removed.
+    #[serde(deserialize_with = "present")]
+    pub labels: Option<Option<BTreeMap<String, Option<String>>>>,
+    /// The priority; null: 0.
+    #[serde(deserialize_with = "present")]
+    pub priority: Option<Option<i64>>,
+    /// The notes; null: none.
+    #[serde(deserialize_with = "present")]
+    pub notes: Option<Option<String>>,
+}
+
+/// For `deserialize_with`: tells null from absent.
+fn present<'de, D: Deserializer<'de>, T: Deserialize<'de>>(deserializer: D) -> Result<Option<Option<T>>, D::Error> {
+    Option::deserialize(deserializer).map(Some)
+}
+
+impl EditRequest {
+    /// Reads a document, as [`JobRequest::from_json`] does.
+    ///
+    /// # Errors
+    /// The first field that is unknown or of the wrong type.
+    pub fn from_json(document: Value) -> Result<Self, Invalid> {
+        from_json(document)
+    }
+
+    /// The edit of `job`.
+    ///
+    /// # Errors
+    /// The first field whose value is not accepted.
+    pub fn resolve(self, job: &Job) -> Result<JobEdit, Invalid> {
+        if let Some(Some(name)) = &self.name {
+            check_name("name", name)?;
+        }
+        let labels = self.labels.map(|changes| {
+            let Some(changes) = changes else { return BTreeMap::new() };
+            let mut labels = job.spec.labels.clone();
+            for (key, value) in changes {
+                match value {
+                    Some(value) => drop(labels.insert(key, value)),
+                    None => drop(labels.remove(&key)),
+                }
+            }
+            labels
+        });
+        if let Some(labels) = &labels {
+            check_labels(labels)?;
+        }
+        let priority = self.priority.map(Option::unwrap_or_default);
+        check_priority(priority.unwrap_or_default())?;
+        let notes = self.notes.map(Option::unwrap_or_default);
+        check_notes(notes.as_deref().unwrap_or_default())?;
+        Ok(JobEdit { name: self.name, labels, priority, notes })
+    }
+}
+
+/// Reads a document with whole numbers as integers.
+fn from_json<T: DeserializeOwned>(mut document: Value) -> Result<T, Invalid> {
+    floats_to_integers(&mut document);
+    if !document.is_object() {
+        return Err(Invalid::schema("job", document, "an object"));
+    }
+    serde_path_to_error::deserialize(document).map_err(|e| Invalid::from_parser(&e.path().to_string(), e.inner()))
+}
+
+fn check_priority(priority: i64) -> Result<(), Invalid> {
+    in_range("priority", priority, -100..=100)
+}
+
+/// Most characters of the notes of a job.
+pub const MAX_NOTES: usize = 4000;
+
+fn check_notes(notes: &str) -> Result<(), Invalid> {
+    let control = |c: char| c.is_control() && !matches!(c, '\n' | '\t' | '\r');
+    if notes.chars().count() > MAX_NOTES || notes.chars().any(control) {
+        let expected = format!("at most {MAX_NOTES} characters without control characters other than line breaks and tabs");
+        return Err(Invalid::new("notes", format!("{notes:?}"), expected));
+    }
+    Ok(())
+}
+
+/// Checks the name of a job or the key of a label.
+///
+/// # Errors
+/// [`Invalid`] with `field`.
+pub fn check_name(field: &str, name: &str) -> Result<(), Invalid> {
     let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
     if (1..=63).contains(&name.len()) && name.chars().all(allowed) && name.starts_with(|c: char| c.is_ascii_alphanumeric()) {
         return Ok(());
@@ -164,6 +256,8 @@ mod tests {
             (json!({"labels": {"a": 1}}), "labels.a", true),
             (json!({"labels": {"a b": "c"}}), "labels", false),
             (json!({"labels": {"a": "\n"}}), "labels.a", false),
+            (json!({"notes": "a\u{0}b"}), "notes", false),
+            (json!({"notes": "x".repeat(4001)}), "notes", false),
         ];
         for (document, field, schema) in cases {
             let e = resolve(document.clone()).expect_err("must be refused");

@@ -4,6 +4,7 @@
 use jiff::Timestamp;
 
 use super::attempts::is_active;
+use super::metric_summaries::summarize;
 use super::{JobId, Lease, Result, Store, timestamp};
 
 /// A metric as a worker reports it.
@@ -73,6 +74,7 @@ impl Store {
                 .execute(&mut *tx)
                 .await?;
         }
+        summarize(&mut tx, lease.job_row, metrics).await?;
         tx.commit().await?;
         self.notify(lease.job_row);
         Ok(true)

@@ -4,8 +4,8 @@
 /// Declares a struct whose fields are read from the columns of their names. It stands in for sqlx's derive macro, for which
 /// Cargo compiles SQLite and sqlx a second time.
 macro_rules! from_row {
-    (struct $name:ident { $($(#[$doc:meta])* $field:ident: $type:ty,)+ }) => {
-        struct $name {
+    ($vis:vis struct $name:ident { $($(#[$doc:meta])* $field:ident: $type:ty,)+ }) => {
+        $vis struct $name {
             $($(#[$doc])* $field: $type,)+
         }
 
@@ -22,16 +22,21 @@ mod attempts;
 mod backup;
 mod checkpoints;
 mod events;
+mod job_changes;
+mod job_list;
 mod jobs;
 mod keys;
+mod metric_summaries;
 mod metrics;
 mod named_enum;
 mod policies;
 #[cfg(test)]
 mod query_plans;
+mod queue;
 mod snapshots;
 mod space;
 mod specs;
+mod submission;
 mod upkeep;
 mod writes;
 
@@ -40,12 +45,16 @@ pub use attempts::{Attempt, AttemptOutcome, EndedAttempt, Lease, LeaseRecord, Wo
 pub use backup::{BackupError, backup, restore};
 pub use checkpoints::{Checkpoint, CheckpointKind, NewCheckpoint};
 pub use events::{JobEvent, JobEventKind};
-pub use jobs::{ActionResult, Job, JobAction, JobFilter, JobId, JobState, NewJob, PendingAction, SubmitResult};
+pub use job_changes::{ActionResult, JobAction, JobEdit};
+pub use job_list::{JobCursor, JobFilter, JobList, JobOrder, JobSort, ListedJob, SortKey};
+pub use jobs::{Job, JobId, JobState, PendingAction};
 pub use keys::KeyRecord;
+pub use metric_summaries::{MetricSummary, larger_is_better};
 pub use metrics::{Metric, MetricCursor, MetricRow, is_metric_name};
 pub use policies::{NewPolicyVersion, PolicyVersion, PublishedPolicy, VersionKey};
 pub use snapshots::{PartialSnapshot, Snapshot};
 pub use specs::{JobKind, JobSpec, StoredSpec, UnreadableSpec};
+pub use submission::{NewJob, SubmitResult};
 pub use writes::WriteFailure;
 
 use std::path::{Path, PathBuf};
@@ -76,6 +85,7 @@ const MIGRATIONS: &[(&str, &str)] = &migrations![
     "0007_versions.sql",
     "0008_owners.sql",
     "0009_consecutive_failures.sql",
+    "0010_finding_jobs.sql",
 ];
 
 /// Name of the database file inside the data directory.
@@ -265,7 +275,7 @@ mod tests {
     use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
     use sqlx::{ConnectOptions, Connection};
 
-    use super::{Error, FILE, JobFilter, Store};
+    use super::{Error, FILE, JobList, Store};
 
     async fn raw(dir: &Path) -> SqliteConnection {
         SqliteConnectOptions::new().filename(dir.join(FILE)).create_if_missing(true).connect().await.unwrap()
@@ -302,8 +312,8 @@ mod tests {
         old.close().await.unwrap();
 
         let store = Store::open(dir.path()).await.unwrap();
-        let (jobs, _) = store.jobs(JobFilter::default(), 10, usize::MAX).await.unwrap();
-        let specs: Vec<_> = jobs.into_iter().rev().map(|job| job.spec).collect();
+        let (jobs, _) = store.jobs(&JobList { limit: 10, max_bytes: usize::MAX, ..JobList::default() }).await.unwrap();
+        let specs: Vec<_> = jobs.into_iter().rev().map(|listed| listed.job.spec).collect();
         assert_eq!((specs[0].seed, specs[0].steps, specs[0].labels["a"].as_str()), (Some(u64::MAX), 7, "b"));
         assert_eq!((specs[0].algorithm.as_deref(), specs[0].name.as_deref()), (Some("vdn"), Some("n")));
         assert_eq!((specs[1].seed, specs[1].steps, specs[1].kind.as_deref()), (None, 0, Some("3")));

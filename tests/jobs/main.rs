@@ -2,6 +2,7 @@
 
 mod command_line;
 mod events;
+mod finding;
 mod harness;
 #[path = "../process/mod.rs"]
 mod process;

@@ -1,13 +1,16 @@
 //! Messages of `JobService` and `WorkerService`.
 
+use jiff::Timestamp;
 use serde_json::{Value, json};
 
 use super::response::timestamp;
 use super::structs::to_struct;
 use crate::invalid::Invalid;
 use crate::jobs::Directive;
+use crate::service::jobs::{JobView, ListRequest, Waiting};
 use crate::store::{
-    CheckpointKind, Job, JobEvent, JobEventKind, JobState, Metric, MetricRow, NewCheckpoint, StoredSpec, WorkerResult,
+    CheckpointKind, JobEvent, JobEventKind, JobKind, JobState, Metric, MetricRow, MetricSummary, NewCheckpoint, StoredSpec,
+    WorkerResult,
 };
 use crate::train_config::TrainConfig;
 use crate::wire::v1;
@@ -25,11 +28,39 @@ impl From<JobState> for v1::JobState {
     }
 }
 
-/// The state to filter by; `None` for `UNSPECIFIED`.
+/// The request of a list.
 ///
 /// # Errors
-/// [`Invalid`] for a number without a state.
-pub fn state_filter(state: i32) -> Result<Option<JobState>, Invalid> {
+/// [`Invalid`] for a number without a state, and for a kind, an algorithm or a time that does not exist.
+pub fn list_request(request: v1::ListJobsRequest) -> Result<ListRequest, Invalid> {
+    let v1::ListJobsRequest { state, kind, algorithm, name, labels, parent, created_after, created_before, .. } = request;
+    let v1::ListJobsRequest { sort, metrics, .. } = request;
+    let known = |kind: &String| {
+        JobKind::parse(kind).ok_or_else(|| Invalid::new("kind", format!("{kind:?}"), format!("one of {}", JobKind::NAMES.join(", "))))
+    };
+    let algorithm = Some(algorithm).filter(|algorithm| !algorithm.is_empty());
+    let read = |name: String| serde_json::from_value(name.into()).map_err(|e| Invalid::from_parser("algorithm", &e));
+    Ok(ListRequest {
+        state: state_filter(state)?,
+        kind: Some(kind).filter(|kind| !kind.is_empty()).as_ref().map(known).transpose()?,
+        algorithm: algorithm.map(read).transpose()?,
+        name,
+        labels,
+        parent,
+        created_after: created_after.map(|time| read_timestamp("created_after", time)).transpose()?,
+        created_before: created_before.map(|time| read_timestamp("created_before", time)).transpose()?,
+        sort,
+        metrics,
+    })
+}
+
+fn read_timestamp(field: &str, time: prost_types::Timestamp) -> Result<Timestamp, Invalid> {
+    let invalid = || Invalid::new(field, format!("{} s, {} ns", time.seconds, time.nanos), "a time from year 1 to 9999");
+    Timestamp::new(time.seconds, time.nanos).map_err(|_| invalid())
+}
+
+/// The state to filter by; `None` for `UNSPECIFIED`.
+fn state_filter(state: i32) -> Result<Option<JobState>, Invalid> {
     let known = v1::JobState::try_from(state);
     Ok(Some(match known.map_err(|_| Invalid::new("state", state, "the number of a JobState"))? {
         v1::JobState::Unspecified => return Ok(None),
@@ -43,18 +74,19 @@ pub fn state_filter(state: i32) -> Result<Option<JobState>, Invalid> {
 }
 
 /// A job as `ListJobs` returns it: without environment and training configuration.
-pub fn job_summary(job: Job) -> v1::Job {
-    job_message(job, |_| json!({}))
+pub fn job_summary(view: JobView) -> v1::Job {
+    job_message(view, |_| json!({}))
 }
 
-impl From<Job> for v1::Job {
-    fn from(job: Job) -> Self {
-        job_message(job, |TrainConfig { environment, training, .. }| json!({"environment": environment, "training": training}))
+impl From<JobView> for v1::Job {
+    fn from(view: JobView) -> Self {
+        job_message(view, |TrainConfig { environment, training, .. }| json!({"environment": environment, "training": training}))
     }
 }
 
 /// The message of a job, whose `spec` also has the fields that `details` selects.
-fn job_message(job: Job, details: impl Fn(&TrainConfig) -> Value) -> v1::Job {
+fn job_message(view: JobView, details: impl Fn(&TrainConfig) -> Value) -> v1::Job {
+    let JobView { job, waiting, metrics } = view;
     let decoded = job.spec.decode();
     let StoredSpec { kind, name, labels, threads, priority, algorithm, preset, seed, steps, document } = job.spec;
     let mut spec = json!({
@@ -86,7 +118,25 @@ fn job_message(job: Job, details: impl Fn(&TrainConfig) -> Value) -> v1::Job {
         ended_at: job.ended_at.map(timestamp),
         last_event_id: job.last_event,
         owner: job.owner.unwrap_or_default(),
+        notes: job.notes,
+        parent: job.parent.map(|parent| parent.to_string()).unwrap_or_default(),
+        metrics: metrics.into_iter().map(|(name, summary)| (name, summary.into())).collect(),
+        waiting: waiting.map(Into::into),
         unreadable,
+    }
+}
+
+impl From<MetricSummary> for v1::MetricSummary {
+    fn from(summary: MetricSummary) -> Self {
+        let MetricSummary { best, best_step, last, last_step } = summary;
+        Self { best, best_step, last, last_step }
+    }
+}
+
+impl From<Waiting> for v1::Waiting {
+    fn from(waiting: Waiting) -> Self {
+        let Waiting { reason, threads, threads_free, jobs_before } = waiting;
+        Self { reason, threads: threads as u32, threads_free: threads_free as u32, jobs_before }
     }
 }
 

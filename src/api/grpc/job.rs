@@ -8,10 +8,10 @@ use tonic::{Request, Response, Status};
 
 use super::GrpcResult;
 use crate::api::auth::caller;
-use crate::api::convert::jobs::{job_summary, state_filter};
+use crate::api::convert::jobs::{job_summary, list_request};
 use crate::api::convert::structs::from_struct;
 use crate::api::errors::stream_status;
-use crate::jobs::spec::JobRequest;
+use crate::jobs::spec::{EditRequest, JobRequest};
 use crate::service::keys::Caller;
 use crate::service::{App, Error, PageRequest, events, jobs};
 use crate::store::JobAction;
@@ -50,16 +50,23 @@ impl JobService for Service {
 
     async fn get_job(&self, request: Request<v1::GetJobRequest>) -> GrpcResult<v1::Job> {
         let caller = caller(request.extensions());
-        Ok(Response::new(jobs::get(&self.0, &caller, &request.into_inner().id).await?.into()))
+        Ok(Response::new(jobs::show(&self.0, &caller, &request.into_inner().id).await?.into()))
     }
 
     async fn list_jobs(&self, request: Request<v1::ListJobsRequest>) -> GrpcResult<v1::ListJobsResponse> {
         let caller = caller(request.extensions());
-        let v1::ListJobsRequest { state, page_size, page_token } = request.into_inner();
-        let state = state_filter(state).map_err(Error::from)?;
-        let page =
-            jobs::list(&self.0, &caller, state, &PageRequest { size: page_size, token: page_token }).await?.map(job_summary);
+        let request = request.into_inner();
+        let page = PageRequest { size: request.page_size, token: request.page_token.clone() };
+        let page = jobs::list(&self.0, &caller, list_request(request).map_err(Error::from)?, &page).await?.map(job_summary);
         Ok(Response::new(v1::ListJobsResponse { jobs: page.items, next_page_token: page.next_token }))
+    }
+
+    async fn edit_job(&self, request: Request<v1::EditJobRequest>) -> GrpcResult<v1::Job> {
+        let caller = caller(request.extensions());
+        let v1::EditJobRequest { id, changes } = request.into_inner();
+        let document = from_struct("changes", changes.unwrap_or_default()).map_err(Error::from)?;
+        let edit = EditRequest::from_json(document).map_err(Error::from)?;
+        Ok(Response::new(jobs::edit(&self.0, &caller, &id, edit).await?.into()))
     }
 
     async fn cancel_job(&self, request: Request<v1::CancelJobRequest>) -> GrpcResult<v1::Job> {

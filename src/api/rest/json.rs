@@ -97,6 +97,20 @@ pub(super) fn optional_integer<'de, D: Deserializer<'de>, T: TryFrom<i128>>(dese
     Option::deserialize(deserializer).map(|value| value.map(|Integer(value)| value))
 }
 
+/// For `deserialize_with`: a value or null, told from an absent one.
+pub(super) fn present<'de, D: Deserializer<'de>, T: Deserialize<'de>>(deserializer: D) -> Result<Option<Option<T>>, D::Error> {
+    Option::deserialize(deserializer).map(Some)
+}
+
+/// For `deserialize_with`: an integer or null, told from an absent one.
+pub(super) fn present_integer<'de, D, T>(deserializer: D) -> Result<Option<Option<T>>, D::Error>
+where
+    D: Deserializer<'de>,
+    T: TryFrom<i128>,
+{
+    optional_integer(deserializer).map(Some)
+}
+
 /// For `deserialize_with`: a list of integers.
 pub(super) fn integers<'de, D: Deserializer<'de>, T: TryFrom<i128>>(deserializer: D) -> Result<Vec<T>, D::Error> {
     Vec::deserialize(deserializer).map(|values| values.into_iter().map(|Integer(value)| value).collect())
@@ -211,6 +225,14 @@ where
     D: Deserializer<'de>,
 {
     Option::deserialize(deserializer).map(|object| object.map(|Object(entries)| entries))
+}
+
+/// For `deserialize_with`: an object of texts and nulls, or null, told from an absent one.
+pub(super) fn present_texts<'de, D>(deserializer: D) -> Result<Option<Option<BTreeMap<String, Option<String>>>>, D::Error>
+where
+    D: Deserializer<'de>,
+{
+    Option::deserialize(deserializer).map(|object| Some(object.map(|Object(entries)| entries)))
 }
 
 #[cfg(test)]

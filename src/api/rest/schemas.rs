@@ -52,6 +52,31 @@ pub(super) fn number_token() -> RefOr<Schema> {
     string("^[0-9]{0,18}$")
 }
 
+/// Name of a job, or the beginning of a name before `*`.
+pub(super) fn name_filter() -> RefOr<Schema> {
+    string("^([A-Za-z0-9][A-Za-z0-9._-]{0,62}\\*?)?$")
+}
+
+/// Labels of jobs, separated by commas.
+pub(super) fn label_filter() -> RefOr<Schema> {
+    string("^([A-Za-z0-9][A-Za-z0-9._-]{0,62}(=[^,]*)?(,[A-Za-z0-9][A-Za-z0-9._-]{0,62}(=[^,]*)?)*)?$")
+}
+
+/// Order of a list of jobs.
+pub(super) fn job_order() -> RefOr<Schema> {
+    string("^(-?(created|name|(best|last):[A-Za-z0-9_/.-]{1,63}))?$")
+}
+
+/// Names of metrics, separated by commas.
+pub(super) fn metric_names() -> RefOr<Schema> {
+    string("^([A-Za-z0-9_/.-]{1,63}(,[A-Za-z0-9_/.-]{1,63}){0,15})?$")
+}
+
+/// Page token of a list of jobs: a row id, after the name or value by which the list is sorted.
+pub(super) fn job_token() -> RefOr<Schema> {
+    string("^(([A-Za-z0-9._-]{0,63}~)?[0-9]{1,18})?$")
+}
+
 /// Page token that contains the name and step of a metric.
 pub(super) fn metric_token() -> RefOr<Schema> {
     string("^([A-Za-z0-9_/.-]{1,63}@[0-9]{1,18})?$")

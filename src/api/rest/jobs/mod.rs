@@ -7,6 +7,7 @@ use std::sync::Arc;
 use axum::extract::State;
 use axum::http::{HeaderMap, HeaderName, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 use utoipa_axum::router::OpenApiRouter;
@@ -18,9 +19,10 @@ use super::schemas;
 use crate::invalid::Invalid;
 use crate::service::keys::Caller;
 use crate::service::{App, Error, PageRequest, checkpoints, jobs};
-use crate::store::{JobAction, JobState};
+use crate::store::{JobAction, JobKind, JobState};
+use crate::train_config::Algorithm;
 pub(super) use types::MetricRow;
-use types::{Attempt, Checkpoint, Job, JobRequest, JobSummary, to_csv};
+use types::{Attempt, Checkpoint, Job, JobEdit, JobRequest, JobSummary, to_csv};
 
 type AppState = State<Arc<App>>;
 
@@ -28,7 +30,7 @@ type AppState = State<Arc<App>>;
 pub(super) fn router() -> OpenApiRouter<Arc<App>> {
     OpenApiRouter::new()
         .routes(routes!(submit, list))
-        .routes(routes!(get, delete))
+        .routes(routes!(get, edit, delete))
         .routes(routes!(cancel))
         .routes(routes!(pause))
         .routes(routes!(resume))
@@ -84,7 +86,7 @@ async fn submit(
         },
     };
     let (job, new) = jobs::submit(&app, &caller, request.into(), key).await?;
-    let location = (header::LOCATION, format!("/v1/jobs/{}", job.id));
+    let location = (header::LOCATION, format!("/v1/jobs/{}", job.job.id));
     let replayed = (HeaderName::from_static("idempotency-replayed"), (!new).to_string());
     // The status is the one of the first response, which the caller of a retry did not receive.
     Ok((StatusCode::CREATED, [location, replayed], axum::Json(Job::from(job))).into_response())
@@ -97,14 +99,58 @@ struct ListQuery {
     /// Only jobs in this state.
     #[param(nullable = false)]
     state: Option<JobState>,
+    /// Only jobs of this kind.
+    #[param(schema_with = types::kind, required = false)]
+    kind: Option<JobKind>,
+    /// Only jobs with this algorithm.
+    #[param(nullable = false)]
+    algorithm: Option<Algorithm>,
+    /// Only jobs with this name; with `*` at the end: jobs whose names begin like this.
+    #[serde(default)]
+    #[param(schema_with = schemas::name_filter, required = false, example = "night-*")]
+    name: String,
+    /// Only jobs with all of these labels, separated by commas: `KEY=VALUE`, or `KEY` for any value.
+    #[serde(default)]
+    #[param(schema_with = schemas::label_filter, required = false, example = "team=a,urgent")]
+    labels: String,
+    /// Only jobs that the job with this id has made.
+    #[serde(default)]
+    #[param(value_type = Option<Uuid>, nullable = false)]
+    parent: String,
+    /// Only jobs that were submitted at or after this time.
+    #[param(nullable = false, example = "2026-01-31T00:00:00Z")]
+    created_after: Option<Timestamp>,
+    /// Only jobs that were submitted before this time.
+    #[param(nullable = false, example = "2026-02-28T00:00:00Z")]
+    created_before: Option<Timestamp>,
+    /// `created`, `name`, `best:METRIC` or `last:METRIC`, after `-` in descending order; default: `-created`. Jobs without the name
+    /// or the metric come last. The best value of `eval/coverage`, `eval/fairness`, `q_tot` and `env_steps_per_s` is the largest,
+    /// that of all other metrics the smallest.
+    #[serde(default)]
+    #[param(schema_with = schemas::job_order, required = false, example = "best:eval/mean_aoi")]
+    sort: String,
+    /// Metrics whose best and last values each job shows, separated by commas; at most 16.
+    #[serde(default)]
+    #[param(schema_with = schemas::metric_names, required = false, example = "eval/mean_aoi,loss")]
+    metrics: String,
     /// Maximum number of jobs. 0: 100. A page has fewer jobs if it would exceed about 1 MiB.
     #[serde(default)]
     #[param(maximum = 1000)]
     page_size: u32,
     /// `next_page_token` of the previous page.
     #[serde(default)]
-    #[param(schema_with = schemas::number_token, required = false)]
+    #[param(schema_with = schemas::job_token, required = false)]
     page_token: String,
+}
+
+impl From<ListQuery> for (jobs::ListRequest, PageRequest) {
+    fn from(query: ListQuery) -> Self {
+        let ListQuery { state, kind, algorithm, name, labels, parent, created_after, created_before, .. } = query;
+        let ListQuery { sort, metrics, page_size: size, page_token: token, .. } = query;
+        let request =
+            jobs::ListRequest { state, kind, algorithm, name, labels, parent, created_after, created_before, sort, metrics };
+        (request, PageRequest { size, token })
+    }
 }
 
 #[derive(Serialize, ToSchema)]
@@ -114,14 +160,14 @@ struct JobPage {
     next_page_token: String,
 }
 
-/// List summaries of jobs, newest first
+/// List summaries of jobs, newest first unless sorted otherwise
 #[utoipa::path(
     get, path = "/v1/jobs", operation_id = "listJobs", tag = "jobs", params(ListQuery),
     responses((status = 200, description = "A page of jobs.", body = JobPage), BadRequest)
 )]
 async fn list(State(app): AppState, caller: Caller, Query(query): Query<ListQuery>) -> Result<axum::Json<JobPage>, Error> {
-    let ListQuery { state, page_size, page_token } = query;
-    let page = jobs::list(&app, &caller, state, &PageRequest { size: page_size, token: page_token }).await?.map(Into::into);
+    let (request, page) = query.into();
+    let page = jobs::list(&app, &caller, request, &page).await?.map(Into::into);
     Ok(axum::Json(JobPage { jobs: page.items, next_page_token: page.next_token }))
 }
 
@@ -131,7 +177,23 @@ async fn list(State(app): AppState, caller: Caller, Query(query): Query<ListQuer
     responses((status = 200, description = "The job.", body = Job), BadRequest, NotFound)
 )]
 async fn get(State(app): AppState, caller: Caller, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Job>, Error> {
-    Ok(axum::Json(jobs::get(&app, &caller, &id).await?.into()))
+    Ok(axum::Json(jobs::show(&app, &caller, &id).await?.into()))
+}
+
+/// Edit the name, the labels, the priority or the notes of a job, in any state
+///
+/// The body is a JSON merge patch (RFC 7396). The name of a job that has not ended is the policy that it will publish.
+#[utoipa::path(
+    patch, path = "/v1/jobs/{id}", operation_id = "editJob", tag = "jobs", params(JobPath), request_body = JobEdit,
+    responses((status = 200, description = "The job.", body = Job), BadBody, NotFound)
+)]
+async fn edit(
+    State(app): AppState,
+    caller: Caller,
+    Path(JobPath { id }): Path<JobPath>,
+    Json(edit): Json<JobEdit>,
+) -> Result<axum::Json<Job>, Error> {
+    Ok(axum::Json(jobs::edit(&app, &caller, &id, edit.into()).await?.into()))
 }
 
 /// Delete a job that has ended

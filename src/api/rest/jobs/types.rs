@@ -14,6 +14,7 @@ use crate::api::rest::config_schemas::{partial_training, schema};
 use crate::api::rest::json;
 use crate::env::EnvConfig;
 use crate::jobs::spec;
+use crate::service::jobs::{self, JobView};
 use crate::store::{self, AttemptOutcome, CheckpointKind, JobId, JobKind, JobState, PendingAction, StoredSpec};
 use crate::train_config::{Algorithm, Preset, Training};
 
@@ -31,6 +32,9 @@ pub(super) struct JobRequest {
     #[serde(default, deserialize_with = "json::optional_texts")]
     #[schema(schema_with = labels)]
     labels: Option<BTreeMap<String, String>>,
+    /// Notes for people.
+    #[schema(max_length = 4000)]
+    notes: Option<String>,
     /// Threads that the job may use.
     #[serde(default, deserialize_with = "json::optional_integer")]
     #[schema(minimum = 1)]
@@ -58,9 +62,51 @@ pub(super) struct JobRequest {
 
 impl From<JobRequest> for spec::JobRequest {
     fn from(request: JobRequest) -> Self {
-        let JobRequest { kind, name, labels, threads, priority, algorithm, preset, environment, training, seed } = request;
-        Self { kind, name, labels, threads, priority, algorithm, preset, environment, training, seed }
+        let JobRequest { kind, name, labels, notes, threads, priority, algorithm, preset, environment, training, seed } = request;
+        Self { kind, name, labels, notes, threads, priority, algorithm, preset, environment, training, seed }
     }
+}
+
+/// What to change of a job. What is absent stays; null is the default.
+#[derive(Debug, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+#[schema(example = json!({"labels": {"keep": "yes", "draft": null}, "notes": "the baseline of the talk"}))]
+pub(super) struct JobEdit {
+    /// Null: no name.
+    #[serde(default, deserialize_with = "json::present")]
+    #[schema(value_type = Option<String>, pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$")]
+    name: Option<Option<String>>,
+    /// Labels to add or to replace; labels that are null are removed. Null: all are removed.
+    #[serde(default, deserialize_with = "json::present_texts")]
+    #[schema(schema_with = label_changes)]
+    labels: Option<Option<BTreeMap<String, Option<String>>>>,
+    /// Null: 0.
+    #[serde(default, deserialize_with = "json::present_integer")]
+    #[schema(value_type = Option<i64>, minimum = -100, maximum = 100)]
+    priority: Option<Option<i64>>,
+    /// Null: none.
+    #[serde(default, deserialize_with = "json::present")]
+    #[schema(value_type = Option<String>, max_length = 4000)]
+    notes: Option<Option<String>>,
+}
+
+impl From<JobEdit> for spec::EditRequest {
+    fn from(JobEdit { name, labels, priority, notes }: JobEdit) -> Self {
+        Self { name, labels, priority, notes }
+    }
+}
+
+fn label_changes() -> RefOr<Schema> {
+    schema(json!({
+        "type": ["object", "null"], "maxProperties": 32,
+        "propertyNames": {"type": "string", "pattern": "^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$"},
+        "additionalProperties": {"type": ["string", "null"], "pattern": "^[^\\u0000-\\u001f\\u007f-\\u009f]{0,255}$"}
+    }))
+}
+
+/// A kind of jobs that this version runs.
+pub(super) fn kind() -> RefOr<Schema> {
+    schema(json!({"type": "string", "enum": [JobKind::Train]}))
 }
 
 /// The only kind of jobs that this version runs.
@@ -100,6 +146,15 @@ pub(super) struct JobSummary {
     #[schema(required = true)]
     policy: Option<String>,
     last_event_id: u64,
+    /// Why it has not started; null unless the job is queued.
+    #[schema(required = true)]
+    waiting: Option<Waiting>,
+    /// The best and the last value of each metric, by name. In lists: of the metrics that were asked for.
+    metrics: BTreeMap<String, MetricSummary>,
+    notes: String,
+    /// Id of the job that made this one; null: a caller made it.
+    #[schema(value_type = Option<Uuid>, required = true)]
+    parent: Option<JobId>,
     created_at: Timestamp,
     #[schema(required = true)]
     started_at: Option<Timestamp>,
@@ -122,6 +177,48 @@ pub(super) struct JobSummary {
     /// Null, unless this version of the server cannot read the specification.
     #[schema(required = true)]
     unreadable: Option<UnreadableSpec>,
+}
+
+/// Why a queued job has not started.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct Waiting {
+    /// In words.
+    #[schema(example = "needs 2 threads, 1 free; 3 jobs before it")]
+    reason: String,
+    /// Threads that it needs.
+    threads: usize,
+    /// Threads of the CPU budget that no running job uses.
+    threads_free: usize,
+    /// Jobs before it in the queue.
+    jobs_before: u64,
+}
+
+impl From<jobs::Waiting> for Waiting {
+    fn from(waiting: jobs::Waiting) -> Self {
+        let jobs::Waiting { reason, threads, threads_free, jobs_before } = waiting;
+        Self { reason, threads, threads_free, jobs_before }
+    }
+}
+
+/// The best and the last value of a metric. Values are null if none was finite.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct MetricSummary {
+    /// The largest value of `eval/coverage`, `eval/fairness`, `q_tot` and `env_steps_per_s`, and the smallest of all other metrics.
+    #[schema(required = true)]
+    best: Option<f64>,
+    /// Environment steps of the best value.
+    #[schema(required = true)]
+    best_step: Option<u64>,
+    #[schema(required = true)]
+    last: Option<f64>,
+    last_step: u64,
+}
+
+impl From<store::MetricSummary> for MetricSummary {
+    fn from(summary: store::MetricSummary) -> Self {
+        let store::MetricSummary { best, best_step, last, last_step } = summary;
+        Self { best, best_step, last, last_step }
+    }
 }
 
 /// A specification that this version of the server cannot read, because another version has written it.
@@ -153,14 +250,14 @@ pub(super) struct Job {
     training: Option<Training>,
 }
 
-impl From<store::Job> for JobSummary {
-    fn from(job: store::Job) -> Self {
-        Job::from(job).summary
+impl From<JobView> for JobSummary {
+    fn from(view: JobView) -> Self {
+        Job::from(view).summary
     }
 }
 
-impl From<store::Job> for Job {
-    fn from(job: store::Job) -> Self {
+impl From<JobView> for Job {
+    fn from(JobView { job, waiting, metrics }: JobView) -> Self {
         let decoded = job.spec.decode();
         let StoredSpec { kind, name, labels, threads, priority, algorithm, preset, seed, steps, document } = job.spec;
         let (config, unreadable) = match decoded {
@@ -179,6 +276,10 @@ impl From<store::Job> for Job {
             failures: job.failures,
             policy: job.policy,
             last_event_id: job.last_event,
+            waiting: waiting.map(Into::into),
+            metrics: metrics.into_iter().map(|(name, summary)| (name, summary.into())).collect(),
+            notes: job.notes,
+            parent: job.parent,
             created_at: job.created_at,
             started_at: job.started_at,
             ended_at: job.ended_at,

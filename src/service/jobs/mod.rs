@@ -1,20 +1,25 @@
-//! The use cases of jobs: submit, get, list, cancel, pause, resume, retry, delete, and read metrics, checkpoints and logs.
+//! The use cases of jobs: submit, get, list, edit, cancel, pause, resume, retry, delete, and read metrics, checkpoints and logs.
+
+mod listing;
+mod view;
 
 use uuid::Uuid;
 
+pub use listing::{ListRequest, list};
+pub use view::{JobView, Waiting};
+
 use super::keys::Caller;
-use super::paging::{self, parse_number};
+use super::paging::parse_number;
 use super::policies::{self, Publisher};
 use super::{App, Error, Page, PageRequest};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::jobs::SchedulerConfig;
 use crate::jobs::memory::check as check_memory;
-use crate::jobs::spec::JobRequest;
-use crate::serving::Owner;
+use crate::jobs::spec::{EditRequest, JobRequest};
 use crate::store::{
-    ActionResult, Attempt, Checkpoint, Job, JobAction, JobFilter, JobId, JobState, MetricCursor, MetricRow, NewJob,
-    PendingAction, SubmitResult, is_metric_name,
+    ActionResult, Attempt, Checkpoint, Job, JobAction, JobId, MetricCursor, MetricRow, NewJob, PendingAction, SubmitResult,
+    is_metric_name,
 };
 
 /// Puts a job into the queue. Returns the job, which is in the database, and whether it is new: the same `idempotency_key` with
@@ -25,6 +30,16 @@ use crate::store::{
 /// request.
 /// [`Error::PermissionDenied`]: another owner made the policy with the job's name. [`Error::Draining`].
 pub async fn submit(
+    app: &App,
+    caller: &Caller,
+    request: JobRequest,
+    idempotency_key: Option<String>,
+) -> Result<(JobView, bool), Error> {
+    let (job, new) = submit_job(app, caller, request, idempotency_key).await?;
+    Ok((view::view(app, job).await?, new))
+}
+
+async fn submit_job(
     app: &App,
     caller: &Caller,
     request: JobRequest,
@@ -44,6 +59,7 @@ pub async fn submit(
         return submitted(app, result);
     }
     let SchedulerConfig { cpu_budget, memory, .. } = app.scheduler.config();
+    let notes = request.notes.clone().unwrap_or_default();
     let spec = request.resolve(*cpu_budget)?;
     check_memory(&spec.config, spec.threads, *memory)?;
     if let Some(name) = &spec.name {
@@ -53,7 +69,8 @@ pub async fn submit(
     }
     app.admit()?;
     let Publisher { owner, any_name, .. } = caller.into();
-    let new = NewJob { id: JobId(Uuid::now_v7()), owner, any_name, spec, now: app.clock.now(), idempotency };
+    let id = JobId(Uuid::now_v7());
+    let new = NewJob { id, owner, any_name, spec, notes, parent: None, now: app.clock.now(), idempotency };
     submitted(app, app.store.submit_job(new).await?)
 }
 
@@ -86,22 +103,36 @@ pub async fn get(app: &App, caller: &Caller, id: &str) -> Result<Job, Error> {
     job.ok_or_else(|| Error::not_found("job", id))
 }
 
-/// Summaries of the jobs that the caller sees, newest first.
+/// The job `id` as the caller sees it.
 ///
 /// # Errors
-/// [`Error::Invalid`]: the page size is over 1000, or the token is invalid.
-pub async fn list(app: &App, caller: &Caller, state: Option<JobState>, page: &PageRequest) -> Result<Page<Job>, Error> {
-    let (limit, before) = (page.usual_limit()?, page.parse_token(parse_number)?);
-    let filter = JobFilter { owner: caller.sees().and_then(Owner::id), state, before };
-    let (jobs, more) = app.store.jobs(filter, limit, paging::MAX_BYTES).await?;
-    Ok(Page::new(jobs, more, |job| job.row_id.to_string()))
+/// [`Error::NotFound`].
+pub async fn show(app: &App, caller: &Caller, id: &str) -> Result<JobView, Error> {
+    view::view(app, get(app, caller, id).await?).await
+}
+
+/// Edits the name, the labels, the priority or the notes of the job `id`, in any state.
+///
+/// # Errors
+/// [`Error::NotFound`]. [`Error::Invalid`]: a field of the request. [`Error::PermissionDenied`]: another owner made the policy with
+/// the new name.
+pub async fn edit(app: &App, caller: &Caller, id: &str, request: EditRequest) -> Result<JobView, Error> {
+    let job = get(app, caller, id).await?;
+    let edit = request.resolve(&job)?;
+    if let Some(Some(name)) = edit.name.as_ref().filter(|_| !job.state.ended()) {
+        policies::check_publishable(name)?;
+        policies::check_owner(app, &Publisher::from(caller), name).await?;
+    }
+    let edited = app.store.edit_job(job.id, edit).await?.ok_or_else(|| Error::not_found("job", id))?;
+    app.scheduler.job_changed(edited.row_id);
+    view::view(app, edited).await
 }
 
 /// Applies `action` to the job `id`. A running job gets a pending action and changes when its worker has stopped.
 ///
 /// # Errors
 /// [`Error::NotFound`], or [`Error::Precondition`] when the state of the job does not allow the action.
-pub async fn change(app: &App, caller: &Caller, id: &str, action: JobAction) -> Result<Job, Error> {
+pub async fn change(app: &App, caller: &Caller, id: &str, action: JobAction) -> Result<JobView, Error> {
     if matches!(action, JobAction::Resume | JobAction::Retry) {
         app.admit()?;
     }
@@ -109,7 +140,7 @@ pub async fn change(app: &App, caller: &Caller, id: &str, action: JobAction) -> 
         ActionResult::Accepted(job) => {
             tracing::info!(job = %job.id, state = %job.state, ?action, "job changed");
             app.scheduler.job_changed(job.row_id);
-            Ok(*job)
+            view::view(app, *job).await
         }
         ActionResult::NotFound => Err(Error::not_found("job", id)),
         ActionResult::WrongState(job) => {

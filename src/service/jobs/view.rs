@@ -1,0 +1,90 @@
+//! A job as callers see it: its record, why it waits, and how its metrics stand.
+
+use std::collections::BTreeMap;
+
+use crate::service::{App, Error};
+use crate::store::{Job, JobState, MetricSummary};
+
+/// Most metrics that a single job shows. Lists show those that are asked for.
+const MAX_METRICS: u32 = 100;
+
+/// A job, and what is known of it at the moment.
+#[derive(Clone, Debug, PartialEq)]
+pub struct JobView {
+    /// The record.
+    pub job: Job,
+    /// Why the job has not started; only for a queued job.
+    pub waiting: Option<Waiting>,
+    /// The best and the last value of metrics, by name.
+    pub metrics: BTreeMap<String, MetricSummary>,
+}
+
+/// Why a queued job has not started.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Waiting {
+    /// In words: `needs 2 threads, 1 free; 3 jobs before it`.
+    pub reason: String,
+    /// Threads that the job needs.
+    pub threads: usize,
+    /// Threads of the CPU budget that no running job uses.
+    pub threads_free: usize,
+    /// Jobs that come before it in the queue.
+    pub jobs_before: u64,
+}
+
+impl Waiting {
+    fn new(threads: usize, threads_free: usize, jobs_before: u64) -> Self {
+        let plural = |n: u64, what: &str| format!("{n} {what}{}", if n == 1 { "" } else { "s" });
+        let mut reason = format!("needs {}, {threads_free} free", plural(threads as u64, "thread"));
+        if jobs_before > 0 {
+            reason += &format!("; {} before it", plural(jobs_before, "job"));
+        }
+        Self { reason, threads, threads_free, jobs_before }
+    }
+}
+
+/// The view of one job.
+pub(super) async fn view(app: &App, job: Job) -> Result<JobView, Error> {
+    let metrics = app.store.job_metric_summaries(job.row_id, MAX_METRICS).await?.into_iter().collect();
+    let waiting = waiting(app, std::slice::from_ref(&job)).await?.remove(&job.row_id);
+    Ok(JobView { job, waiting, metrics })
+}
+
+/// The views of the jobs of a list, with the metrics `names`.
+pub(super) async fn views(app: &App, jobs: Vec<Job>, names: &[String]) -> Result<Vec<JobView>, Error> {
+    let rows: Vec<i64> = jobs.iter().map(|job| job.row_id).collect();
+    let mut metrics = app.store.metric_summaries(&rows, names).await?;
+    let mut waiting = waiting(app, &jobs).await?;
+    let view = |job: Job| {
+        let metrics = metrics.remove(&job.row_id).unwrap_or_default().into_iter().collect();
+        JobView { waiting: waiting.remove(&job.row_id), metrics, job }
+    };
+    Ok(jobs.into_iter().map(view).collect())
+}
+
+/// Why the queued ones among `jobs` wait, by row id.
+async fn waiting(app: &App, jobs: &[Job]) -> Result<BTreeMap<i64, Waiting>, Error> {
+    let queued: Vec<&Job> = jobs.iter().filter(|job| job.state == JobState::Queued).collect();
+    if queued.is_empty() {
+        return Ok(BTreeMap::new());
+    }
+    let before = app.store.jobs_before(&queued.iter().map(|job| job.row_id).collect::<Vec<_>>()).await?;
+    let budget = app.scheduler.config().cpu_budget;
+    let free = budget.saturating_sub(app.scheduler.threads_busy());
+    let waiting = |job: &&Job| {
+        let before = before.get(&job.row_id).copied().unwrap_or_default();
+        (job.row_id, Waiting::new(job.spec.threads.min(budget), free, before))
+    };
+    Ok(queued.iter().map(waiting).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Waiting;
+
+    #[test]
+    fn reasons_are_sentences() {
+        assert_eq!(Waiting::new(2, 1, 3).reason, "needs 2 threads, 1 free; 3 jobs before it");
+        assert_eq!(Waiting::new(1, 0, 0).reason, "needs 1 thread, 0 free");
+    }
+}

@@ -1,0 +1,52 @@
+//! The queue of jobs: highest priority first, then first come, first served.
+
+use std::collections::BTreeMap;
+
+use jiff::Timestamp;
+
+use super::jobs::{JobRow, Transition, find, transition};
+use super::{Job, JobState, Result, Store};
+
+impl Store {
+    /// The queued job that starts next: highest priority, then first come, first served.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn head_of_queue(&self) -> Result<Option<Job>> {
+        let sql = "SELECT * FROM jobs WHERE state = 'queued' ORDER BY priority DESC, number LIMIT 1";
+        let row: Option<JobRow> = sqlx::query_as(sql).fetch_optional(&self.read).await?;
+        row.map(Job::try_from).transpose()
+    }
+
+    /// Ends a queued job that cannot be started. Returns whether it was queued.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn fail_queued_job(&self, job: &Job, reason: &str, now: Timestamp) -> Result<bool> {
+        let mut tx = self.begin().await?;
+        let queued = find(&mut tx, job.id).await?.is_some_and(|job| job.state == JobState::Queued);
+        if queued {
+            let (to, attempt, reason) = (JobState::Failed, job.attempts, Some(reason));
+            transition(&mut tx, Transition { job: job.row_id, to, attempt, reason, now }).await?;
+            tx.commit().await?;
+            self.notify(job.row_id);
+        } else {
+            tx.abandon().await?;
+        }
+        Ok(queued)
+    }
+
+    /// How many jobs of the queue come before each of these, by row id.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn jobs_before(&self, jobs: &[i64]) -> Result<BTreeMap<i64, u64>> {
+        // The whole queue is numbered, because counting for each of the jobs would read it once per job.
+        let sql = "SELECT number, place - 1 FROM (
+                       SELECT number, row_number() OVER (ORDER BY priority DESC, number) AS place FROM jobs WHERE state = 'queued'
+                   ) WHERE number IN (SELECT value FROM json_each(?))";
+        let rows = sqlx::query_as(sql).bind(serde_json::Value::from(jobs).to_string());
+        let rows: Vec<(i64, i64)> = rows.fetch_all(&self.read).await?;
+        Ok(rows.into_iter().map(|(job, before)| (job, before as u64)).collect())
+    }
+}

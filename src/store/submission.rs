@@ -1,0 +1,148 @@
+//! Submitting jobs, once per idempotency key.
+
+use std::collections::BTreeMap;
+
+use jiff::Timestamp;
+use serde::Serialize;
+use sqlx::SqliteConnection;
+
+use super::jobs::{Transition, find, get_existing, transition};
+use super::specs::JobSpec;
+use super::{Job, JobId, JobState, Result, Store, corrupt};
+
+/// A job to submit.
+#[derive(Clone, Debug)]
+pub struct NewJob {
+    /// The id.
+    pub id: JobId,
+    /// Who submits the job; `None`: nobody, on a server without keys.
+    pub owner: Option<String>,
+    /// Whether the job may publish under a name that another owner made.
+    pub any_name: bool,
+    /// The specification.
+    pub spec: JobSpec,
+    /// What people write about the job.
+    pub notes: String,
+    /// The job that makes this one; `None`: a caller makes it.
+    pub parent: Option<JobId>,
+    /// The current time.
+    pub now: Timestamp,
+    /// The idempotency key of the request, which belongs to the owner, and the SHA-256 of its body.
+    pub idempotency: Option<(String, [u8; 32])>,
+}
+
+impl NewJob {
+    /// The owner of the idempotency key.
+    fn owner(&self) -> &str {
+        self.owner.as_deref().unwrap_or_default()
+    }
+}
+
+/// The result of a submission.
+#[derive(Clone, Debug, PartialEq)]
+pub enum SubmitResult {
+    /// The job was created and queued.
+    Created(Job),
+    /// A job with the same idempotency key and body exists.
+    Existing(Job),
+    /// A job with the same idempotency key and another body exists.
+    Conflict,
+}
+
+async fn find_submitted(
+    db: &mut SqliteConnection,
+    owner: Option<&str>,
+    key: &str,
+    body: &[u8; 32],
+) -> Result<Option<SubmitResult>> {
+    let sql = "SELECT k.body, j.id FROM idempotency_keys k JOIN jobs j ON j.number = k.job WHERE k.owner = ? AND k.key = ?";
+    let query = sqlx::query_as(sql).bind(owner.unwrap_or_default()).bind(key);
+    let first: Option<(Vec<u8>, String)> = query.fetch_optional(&mut *db).await?;
+    let Some((first, id)) = first else { return Ok(None) };
+    if first != body {
+        return Ok(Some(SubmitResult::Conflict));
+    }
+    let id = JobId::parse(&id).ok_or_else(|| corrupt("job", &id, "not an id"))?;
+    Ok(find(db, id).await?.map(SubmitResult::Existing))
+}
+
+impl Store {
+    /// Queues a job.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn submit_job(&self, new: NewJob) -> Result<SubmitResult> {
+        let mut tx = self.begin().await?;
+        if let Some((key, body)) = &new.idempotency
+            && let Some(first) = find_submitted(&mut tx, new.owner.as_deref(), key, body).await?
+        {
+            tx.abandon().await?;
+            return Ok(first);
+        }
+        let job = insert(&mut tx, &new).await?;
+        tx.commit().await?;
+        Ok(SubmitResult::Created(job))
+    }
+
+    /// The result of repeating a submission of `owner` with this idempotency key and SHA-256 of its body; `None` if the key is new.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn submitted_job(&self, owner: Option<&str>, key: &str, body: &[u8; 32]) -> Result<Option<SubmitResult>> {
+        find_submitted(&mut *self.read.acquire().await?, owner, key, body).await
+    }
+}
+
+async fn insert(tx: &mut SqliteConnection, new: &NewJob) -> Result<Job> {
+    let spec = serde_json::to_string(&new.spec).map_err(|e| corrupt("job", new.id, e))?;
+    let now = new.now.as_millisecond();
+    let NewJob { id, owner, any_name, spec: JobSpec { kind, name, labels, threads, priority, config }, .. } = new;
+    let labels_document = serde_json::to_string(labels).map_err(|e| corrupt("job", id, e))?;
+    let sql = "INSERT INTO jobs
+               (id, owner, any_name, state, notes, parent, spec, threads, priority, created_at, kind, name, labels, algorithm,
+                preset, seed, steps)
+               VALUES (?, ?, ?, 'queued', ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)";
+    let row_id = sqlx::query(sql)
+        .bind(id.to_string())
+        .bind(owner)
+        .bind(any_name)
+        .bind(&new.notes)
+        .bind(new.parent.map(|parent| parent.to_string()))
+        .bind(spec)
+        .bind(*threads as i64)
+        .bind(priority)
+        .bind(now)
+        .bind(kind.as_str())
+        .bind(name)
+        .bind(labels_document)
+        .bind(text_of(&config.algorithm))
+        .bind(text_of(&config.preset))
+        .bind(config.seed.to_string())
+        .bind(config.training.steps as i64)
+        .execute(&mut *tx)
+        .await?
+        .last_insert_rowid();
+    set_labels(tx, row_id, labels).await?;
+    transition(tx, Transition { job: row_id, to: JobState::Queued, attempt: 0, reason: None, now: new.now }).await?;
+    if let Some((key, body)) = &new.idempotency {
+        let sql = "INSERT INTO idempotency_keys (owner, key, body, job, created_at) VALUES (?, ?, ?, ?, ?)";
+        sqlx::query(sql).bind(new.owner()).bind(key).bind(body.as_slice()).bind(row_id).bind(now).execute(&mut *tx).await?;
+    }
+    get_existing(tx, new.id).await
+}
+
+/// Makes these the labels by which the job is found.
+pub(super) async fn set_labels(db: &mut SqliteConnection, job: i64, labels: &BTreeMap<String, String>) -> Result<()> {
+    sqlx::query("DELETE FROM job_labels WHERE job = ?").bind(job).execute(&mut *db).await?;
+    for (key, value) in labels {
+        let sql = "INSERT INTO job_labels (key, value, job) VALUES (?, ?, ?)";
+        sqlx::query(sql).bind(key).bind(value).bind(job).execute(&mut *db).await?;
+    }
+    Ok(())
+}
+
+/// The name of a value in documents.
+pub(super) fn text_of(value: &impl Serialize) -> Option<String> {
+    serde_json::to_value(value).ok()?.as_str().map(str::to_owned)
+}
+
