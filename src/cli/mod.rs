@@ -21,6 +21,7 @@ mod report;
 mod rest;
 mod run_args;
 mod serve;
+mod server;
 mod signals;
 mod table;
 mod train;
@@ -54,6 +55,8 @@ enum Command {
     Evaluate(evaluate::EvaluateArgs),
     /// List, upload, export, load and unload policies of a server, and move aliases
     Policies(policies::PoliciesArgs),
+    /// Show or change a running server: its CPU budget
+    Server(server::ServerArgs),
     /// Run or resume an experiment: many training runs, with tables and plots of the results
     Experiment(experiment::ExperimentArgs),
     /// Create, list, rotate and revoke the API keys of a server
@@ -81,6 +84,7 @@ pub fn run() -> ExitCode {
         Command::Jobs(args) => block_on(jobs::run(args)),
         Command::Evaluate(args) => block_on(evaluate::run(args)),
         Command::Policies(args) => block_on(policies::run(args)),
+        Command::Server(args) => block_on(server::run(args)),
         Command::Experiment(args) => block_on(experiment::run(args)),
         Command::Keys(args) => block_on(keys::run(args)),
         Command::Backup(args) => block_on(backup::backup(args)),

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use futures::future::BoxFuture;
-use tokio::sync::Notify;
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use crate::store::Lease;
@@ -44,8 +44,8 @@ pub struct LogTail(Arc<Shared>);
 #[derive(Debug, Default)]
 struct Shared {
     tail: Mutex<Tail>,
-    /// Notified when output has arrived.
-    pushed: Notify,
+    /// Bytes that have ever arrived.
+    total: watch::Sender<u64>,
 }
 
 #[derive(Debug, Default)]
@@ -66,13 +66,14 @@ impl LogTail {
         tail.bytes.extend(bytes);
         let excess = tail.bytes.len().saturating_sub(Self::LIMIT);
         tail.bytes.drain(..excess);
+        let total = tail.total;
         drop(tail);
-        self.0.pushed.notify_one();
+        self.0.total.send_replace(total);
     }
 
-    /// Returns when output has arrived since the last call.
-    pub async fn pushed(&self) {
-        self.0.pushed.notified().await;
+    /// The number of bytes that have ever arrived; changes when output arrives.
+    pub fn subscribe(&self) -> watch::Receiver<u64> {
+        self.0.total.subscribe()
     }
 
     /// Number of bytes that have ever arrived.
@@ -89,6 +90,27 @@ impl LogTail {
         String::from_utf8_lossy(&bytes).replace('\0', "\u{fffd}")
     }
 
+    /// The kept lines after the first `sent` bytes of the output, and the number of bytes of the output up to their end. The last
+    /// line may be incomplete if `all`.
+    pub fn text_after(&self, sent: u64, all: bool) -> (String, u64) {
+        let tail = self.tail();
+        let first = tail.total - tail.bytes.len() as u64;
+        let skip = sent.saturating_sub(first) as usize;
+        let mut bytes: Vec<u8> = tail.bytes.iter().skip(skip).copied().collect();
+        // Lines that are no longer kept entirely are left out.
+        if sent < first {
+            let whole = bytes.iter().position(|&b| b == b'\n').map_or(bytes.len(), |i| i + 1);
+            bytes.drain(..whole);
+        }
+        let mut total = tail.total;
+        if !all {
+            let whole = bytes.iter().rposition(|&b| b == b'\n').map_or(0, |i| i + 1);
+            total -= (bytes.len() - whole) as u64;
+            bytes.truncate(whole);
+        }
+        (String::from_utf8_lossy(&bytes).replace('\0', "\u{fffd}"), total)
+    }
+
     fn tail(&self) -> MutexGuard<'_, Tail> {
         self.0.tail.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -97,6 +119,20 @@ impl LogTail {
 #[cfg(test)]
 mod tests {
     use super::LogTail;
+
+    #[test]
+    fn output_is_followed_line_by_line() {
+        let log = LogTail::default();
+        log.push(b"one\ntw");
+        assert_eq!(log.text_after(0, false), ("one\n".into(), 4));
+        log.push(b"o\nthree");
+        assert_eq!(log.text_after(4, false), ("two\n".into(), 8));
+        assert_eq!(log.text_after(8, false), (String::new(), 8));
+        assert_eq!(log.text_after(8, true), ("three".into(), 13));
+        log.push(&[b'x'; LogTail::LIMIT]);
+        log.push(b"\nlast\n");
+        assert_eq!(log.text_after(8, false).0, "last\n");
+    }
 
     #[test]
     fn long_log_keeps_its_last_lines() {

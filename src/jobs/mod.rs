@@ -3,6 +3,7 @@
 //! The scheduler and the service change jobs through [`crate::store`]. A worker reaches the server only through the
 //! `WorkerService` protocol, so it can run on any machine.
 
+mod backfill;
 mod executor;
 mod local;
 pub mod memory;
@@ -11,6 +12,7 @@ pub mod spec;
 pub mod worker;
 
 use std::collections::HashMap;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -28,7 +30,7 @@ use crate::store::{self, Lease, PendingAction, Store};
 /// Limits and times of the scheduler.
 #[derive(Clone, Debug)]
 pub struct SchedulerConfig {
-    /// Threads that all running jobs may use together.
+    /// Threads that all running jobs may use together, until that is changed.
     pub cpu_budget: usize,
     /// Consecutive attempts that fail without progress after which a job has failed.
     pub max_attempts: u32,
@@ -52,7 +54,7 @@ impl SchedulerConfig {
             max_attempts: 3,
             snapshot_every: Duration::from_secs(10),
             heartbeat_timeout: Duration::from_secs(30),
-            cancel_grace: Duration::from_secs(3),
+            cancel_grace: Duration::from_millis(600),
             pause_grace: Duration::from_secs(30),
             memory: memory::available(),
         }
@@ -77,6 +79,8 @@ pub struct Scheduler(Arc<Inner>);
 struct Inner {
     store: Store,
     config: SchedulerConfig,
+    /// Threads that all running jobs may use together; at first [`SchedulerConfig::cpu_budget`].
+    cpu_budget: AtomicUsize,
     executor: Arc<dyn Executor>,
     clock: Clock,
     draining: Draining,
@@ -97,6 +101,8 @@ struct RunningAttempt {
     log: LogTail,
     /// Notified when the job has changed while its worker runs.
     job_changed: Arc<Notify>,
+    /// Monotonic time at which the job exceeds its timeout.
+    deadline: Option<Duration>,
     /// Monotonic time of the last call of the worker.
     last_heartbeat: Arc<Mutex<Duration>>,
 }
@@ -125,6 +131,7 @@ impl Scheduler {
         }
         Ok(Self(Arc::new(Inner {
             store,
+            cpu_budget: AtomicUsize::new(config.cpu_budget),
             config,
             executor,
             clock,
@@ -139,6 +146,18 @@ impl Scheduler {
     /// Limits and times.
     pub fn config(&self) -> &SchedulerConfig {
         &self.0.config
+    }
+
+    /// Threads that all running jobs may use together.
+    pub fn cpu_budget(&self) -> usize {
+        self.0.cpu_budget.load(Ordering::Relaxed)
+    }
+
+    /// Changes the CPU budget until the server stops. Jobs that run stay, so a smaller budget is reached when some have ended.
+    pub fn set_cpu_budget(&self, threads: usize) {
+        let before = self.0.cpu_budget.swap(threads, Ordering::Relaxed);
+        tracing::info!(before, threads, "the CPU budget has changed");
+        self.0.wake.notify_one();
     }
 
     /// Whether the last read of the queue succeeded.
@@ -177,9 +196,9 @@ impl Scheduler {
     }
 
     /// The output of the worker of attempt `attempt` so far; `None` unless that attempt is running.
-    pub fn live_log(&self, job: i64, attempt: u32) -> Option<String> {
+    pub fn live_log(&self, job: i64, attempt: u32) -> Option<LogTail> {
         let running = self.running().get(&job).filter(|running| running.attempt == attempt).cloned()?;
-        Some(running.log.text())
+        Some(running.log)
     }
 
     /// Begins draining, lets the workers pause, and waits until their processes have ended, at most for `timeout`. Workers

@@ -1,7 +1,7 @@
 //! Starts queued jobs while their threads fit into the CPU budget, and supervises every attempt until its worker has ended.
 //!
-//! The order is strict: highest priority first, then first come, first served. A job that does not fit yet holds back the
-//! jobs behind it, so that a job with many threads does not wait forever.
+//! Highest priority first, then first come, first served. A job that does not fit yet holds back the jobs behind it, so that a job
+//! with many threads does not wait forever; only what cannot delay it may start before it (`backfill`).
 
 use std::collections::HashMap;
 use std::convert::Infallible;
@@ -13,6 +13,7 @@ use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
+use super::backfill::backfill_limit;
 use super::{Launch, LogTail, RunningAttempt, Scheduler, WorkerExit, token_digest};
 use crate::store::{EndedAttempt, Job, JobState, Lease, PendingAction, WorkerResult};
 
@@ -21,6 +22,8 @@ use crate::store::{EndedAttempt, Job, JobState, Lease, PendingAction, WorkerResu
 enum KillReason {
     /// The worker did not stop within its grace period.
     GraceExpired,
+    /// All attempts together ran for the timeout of the job.
+    TimedOut,
     /// No heartbeat arrived within [`super::SchedulerConfig::heartbeat_timeout`].
     HeartbeatLost,
 }
@@ -60,13 +63,42 @@ impl Scheduler {
             }
             tokio::select! {
                 () = wake => {}
+                () = self.delayed() => {}
                 () = self.0.draining.wait() => {}
             }
         }
     }
 
+    /// Returns when a job may start that waits for a time. If that cannot be found out, the next wake-up looks again.
+    async fn delayed(&self) {
+        let now = self.0.clock.now();
+        match self.0.store.next_delayed(now).await {
+            Ok(Some(time)) => {
+                let wait = Duration::try_from(time.duration_since(now)).unwrap_or_default();
+                self.0.clock.sleep_until(self.0.clock.monotonic().saturating_add(wait)).await;
+            }
+            Ok(None) | Err(_) => std::future::pending().await,
+        }
+    }
+
+    /// The job to start next: the head of the queue if it fits, or else the first that cannot delay it.
+    async fn next_to_start(&self) -> Result<Option<Job>, crate::store::Error> {
+        let now = self.0.clock.now();
+        let Some(head) = self.0.store.first_in_queue(usize::MAX, now).await? else { return Ok(None) };
+        let budget = self.cpu_budget();
+        let running: Vec<usize> = self.running().values().map(|running| running.threads).collect();
+        let threads = head.spec.threads.min(budget);
+        if running.iter().sum::<usize>() + threads <= budget {
+            return Ok(Some(head));
+        }
+        match backfill_limit(budget, &running, threads) {
+            0 => Ok(None),
+            limit => self.0.store.first_in_queue(limit, now).await,
+        }
+    }
+
     async fn start_all(&self, server: &str) -> Result<(), StartError> {
-        while let Some(job) = self.0.store.head_of_queue().await? {
+        while let Some(job) = self.next_to_start().await? {
             if let Err(unreadable) = job.spec.decode() {
                 tracing::error!(job = %job.id, reason = %unreadable, "the job cannot be started");
                 self.0.store.fail_queued_job(&job, &unreadable.to_string(), self.0.clock.now()).await?;
@@ -99,7 +131,7 @@ impl Scheduler {
     /// attempt or prevents it.
     fn reserve(&self, job: &Job) -> Option<RunningAttempt> {
         let mut all = self.running();
-        let budget = self.0.config.cpu_budget;
+        let budget = self.cpu_budget();
         let threads = job.spec.threads.min(budget);
         // The worker of the previous attempt may not have ended yet.
         if self.0.draining.begun() || threads_used(&all) + threads > budget || all.contains_key(&job.row_id) {
@@ -110,6 +142,10 @@ impl Scheduler {
             threads,
             log: LogTail::default(),
             job_changed: Arc::new(Notify::new()),
+            deadline: job.spec.decode().ok().and_then(|spec| spec.limits.timeout).map(|seconds| {
+                let left = Duration::from_secs(seconds).saturating_sub(job.ran);
+                self.0.clock.monotonic().saturating_add(left)
+            }),
             last_heartbeat: Arc::new(Mutex::new(self.0.clock.monotonic())),
         };
         all.insert(job.row_id, running.clone());
@@ -177,9 +213,13 @@ impl Scheduler {
     /// Stores the output of the worker while it runs, so that it survives a crash of this server. Never returns.
     async fn store_log(&self, lease: Lease, log: &LogTail) -> Infallible {
         let [short, long] = LOG_INTERVAL;
-        let mut stored = 0;
+        let (mut stored, mut arrivals) = (0, log.subscribe());
         loop {
-            log.pushed().await;
+            // The sender lives in `log`. Output that arrived before this began has not been seen.
+            if log.total() == stored {
+                let _ = arrivals.changed().await;
+            }
+            arrivals.borrow_and_update();
             tokio::time::sleep(LOG_DELAY).await;
             let (total, text) = (log.total(), log.text());
             if let Err(error) = self.0.store.store_log(lease, &text).await {
@@ -213,6 +253,9 @@ impl Scheduler {
                 exit.await;
                 match reason {
                     KillReason::GraceExpired => WorkerResult::Stopped,
+                    KillReason::TimedOut => {
+                        WorkerResult::Failed { reason: "the job has run for its timeout".into(), permanent: true }
+                    }
                     KillReason::HeartbeatLost => {
                         let timeout = self.0.config.heartbeat_timeout.as_secs_f64();
                         failed(format!("no heartbeat of the worker for {timeout} s"))
@@ -233,6 +276,9 @@ impl Scheduler {
         let mut last_tick = clock.monotonic();
         let mut deadline: Option<Duration> = None;
         let mut drained = false;
+        let next_tick = |last_tick: Duration, deadline: Option<Duration>| {
+            [deadline, running.deadline].into_iter().flatten().fold(last_tick.saturating_add(tick), Duration::min)
+        };
         loop {
             let ticked = tokio::select! {
                 () = running.job_changed.notified() => false,
@@ -240,7 +286,7 @@ impl Scheduler {
                     drained = true;
                     false
                 }
-                () = clock.sleep_until(last_tick.saturating_add(tick)) => true,
+                () = clock.sleep_until(next_tick(last_tick, deadline)) => true,
             };
             let now = clock.monotonic();
             let gap = now.saturating_sub(last_tick);
@@ -253,6 +299,9 @@ impl Scheduler {
             if ticked {
                 if deadline.is_some_and(|deadline| deadline <= now) {
                     return KillReason::GraceExpired;
+                }
+                if running.deadline.is_some_and(|deadline| deadline <= now) {
+                    return KillReason::TimedOut;
                 }
                 if running.last_heartbeat().saturating_add(config.heartbeat_timeout) <= now {
                     return KillReason::HeartbeatLost;
@@ -338,7 +387,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).await.unwrap();
         let config = TrainConfig::preset(Algorithm::Qmix, Preset::Practical);
-        let spec = JobSpec { kind: JobKind::Train, name: None, labels: BTreeMap::new(), threads: 1, priority: 0, config };
+        let spec = JobSpec::train(config);
         let id = JobId(Uuid::from_u128(1));
         store.submit_job(NewJob { id, owner: None, any_name: false, spec, notes: String::new(), parent: None, now: clock.now(), idempotency: None }).await.unwrap();
         let config = SchedulerConfig { max_attempts: 1, ..SchedulerConfig::new(1) };
@@ -350,7 +399,7 @@ mod tests {
     async fn no_attempt_starts_after_drain_has_seen_none() {
         let (_dir, scheduler, _) = with_a_job(Clock::system()).await;
         // The scheduler has read the queue and is about to reserve the threads when the server drains.
-        let job = scheduler.0.store.head_of_queue().await.unwrap().unwrap();
+        let job = scheduler.next_to_start().await.unwrap().unwrap();
         scheduler.drain(Duration::from_secs(30)).await;
         assert!(scheduler.reserve(&job).is_none());
     }
@@ -358,7 +407,7 @@ mod tests {
     #[tokio::test]
     async fn drain_does_not_wait_for_an_attempt_that_could_not_begin() {
         let (_dir, scheduler, _) = with_a_job(Clock::system()).await;
-        let job = scheduler.0.store.head_of_queue().await.unwrap().unwrap();
+        let job = scheduler.next_to_start().await.unwrap().unwrap();
         scheduler.reserve(&job).unwrap();
         let mut drain = std::pin::pin!(scheduler.drain(Duration::from_secs(3600)));
         assert!(futures::poll!(&mut drain).is_pending());

@@ -8,7 +8,7 @@ use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 
 use crate::invalid::{Invalid, in_range};
-use crate::store::{Job, JobEdit, JobKind, JobSpec};
+use crate::store::{EarlyStop, Job, JobEdit, JobId, JobKind, JobLimits, JobSpec, is_metric_name};
 use crate::train_config::{Algorithm, Preset, TrainConfig, floats_to_integers};
 
 /// A job as it is submitted; what is absent has a default.
@@ -33,6 +33,21 @@ pub struct JobRequest {
     /// Higher runs first; default: 0.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub priority: Option<i64>,
+    /// Consecutive attempts that fail without progress after which the job has failed; default: the server's limit.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_attempts: Option<u32>,
+    /// Seconds that all attempts together may run; default: no limit.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub timeout: Option<u64>,
+    /// Seconds between a failed attempt and the next one; default: 0.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub backoff: Option<u64>,
+    /// Ids of the jobs that must succeed before this one starts.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub after: Option<Vec<String>>,
+    /// When training ends before all steps are done.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stop: Option<EarlyStop>,
     /// Algorithm.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub algorithm: Option<Algorithm>,
@@ -89,6 +104,11 @@ impl JobRequest {
         let labels = self.labels.unwrap_or_default();
         check_labels(&labels)?;
         check_notes(&self.notes.unwrap_or_default())?;
+        let limits = resolve_limits(self.max_attempts, self.timeout, self.backoff)?;
+        let after = resolve_dependencies(self.after.unwrap_or_default())?;
+        if let Some(stop) = &self.stop {
+            check_stop(stop)?;
+        }
         let [environment, training] = [self.environment, self.training].map(|section| {
             let mut fields = section.unwrap_or_default();
             fields.values_mut().for_each(floats_to_integers);
@@ -96,7 +116,7 @@ impl JobRequest {
         });
         let (algorithm, preset) = (self.algorithm.unwrap_or_default(), self.preset.unwrap_or_default());
         let config = TrainConfig::resolve(algorithm, preset, &environment, &training, self.seed.unwrap_or(1))?;
-        Ok(JobSpec { kind, name: self.name, labels, threads, priority, config })
+        Ok(JobSpec { kind, name: self.name, labels, threads, priority, limits, after, stop: self.stop, config })
     }
 }
 
@@ -169,6 +189,49 @@ fn from_json<T: DeserializeOwned>(mut document: Value) -> Result<T, Invalid> {
         return Err(Invalid::schema("job", document, "an object"));
     }
     serde_path_to_error::deserialize(document).map_err(|e| Invalid::from_parser(&e.path().to_string(), e.inner()))
+}
+
+/// Most jobs that a job comes after.
+const MAX_AFTER: usize = 100;
+/// Most seconds of a timeout or a back-off: a year.
+const MAX_SECONDS: u64 = 366 * 24 * 3600;
+
+fn resolve_limits(max_attempts: Option<u32>, timeout: Option<u64>, backoff: Option<u64>) -> Result<JobLimits, Invalid> {
+    let backoff = backoff.unwrap_or(0);
+    in_range("max_attempts", max_attempts.unwrap_or(1), 1..=1000)?;
+    in_range("timeout", timeout.unwrap_or(1), 1..=MAX_SECONDS)?;
+    in_range("backoff", backoff, 0..=MAX_SECONDS)?;
+    Ok(JobLimits { max_attempts, timeout, backoff })
+}
+
+fn resolve_dependencies(ids: Vec<String>) -> Result<Vec<JobId>, Invalid> {
+    in_range("after", ids.len(), 0..=MAX_AFTER)?;
+    let mut jobs = Vec::new();
+    for (i, id) in ids.iter().enumerate() {
+        let job = JobId::parse(id).ok_or_else(|| Invalid::new(format!("after[{i}]"), format!("{id:?}"), "the id of a job"))?;
+        if jobs.contains(&job) {
+            return Err(Invalid::new(format!("after[{i}]"), id, "each job once"));
+        }
+        jobs.push(job);
+    }
+    Ok(jobs)
+}
+
+fn check_stop(stop: &EarlyStop) -> Result<(), Invalid> {
+    let EarlyStop { metric, at_most, at_least, patience } = stop;
+    if !is_metric_name(metric) {
+        return Err(Invalid::new("stop.metric", format!("{metric:?}"), "the name of a metric, such as eval/mean_aoi"));
+    }
+    for (field, limit) in [("stop.at_most", at_most), ("stop.at_least", at_least)] {
+        if let Some(limit) = limit.filter(|limit| !limit.is_finite()) {
+            return Err(Invalid::new(field, limit, "a finite number"));
+        }
+    }
+    in_range("stop.patience", patience.unwrap_or(1), 1..=1_000_000)?;
+    if at_most.is_none() && at_least.is_none() && patience.is_none() {
+        return Err(Invalid::missing("stop.at_most", "at_most, at_least or patience"));
+    }
+    Ok(())
 }
 
 fn check_priority(priority: i64) -> Result<(), Invalid> {
@@ -256,6 +319,16 @@ mod tests {
             (json!({"labels": {"a": 1}}), "labels.a", true),
             (json!({"labels": {"a b": "c"}}), "labels", false),
             (json!({"labels": {"a": "\n"}}), "labels.a", false),
+            (json!({"max_attempts": 0}), "max_attempts", false),
+            (json!({"timeout": 0}), "timeout", false),
+            (json!({"timeout": -1}), "timeout", true),
+            (json!({"backoff": u64::MAX}), "backoff", false),
+            (json!({"after": ["me"]}), "after[0]", false),
+            (json!({"after": [null]}), "after[0]", true),
+            (json!({"stop": {"metric": "loss"}}), "stop.at_most", false),
+            (json!({"stop": {"metric": "a b", "patience": 1}}), "stop.metric", false),
+            (json!({"stop": {"metric": "loss", "patience": 0}}), "stop.patience", false),
+            (json!({"stop": {"metric": "loss", "atmost": 0}}), "stop.atmost", true),
             (json!({"notes": "a\u{0}b"}), "notes", false),
             (json!({"notes": "x".repeat(4001)}), "notes", false),
         ];

@@ -52,18 +52,26 @@ pub struct Watch {
     _permit: OwnedSemaphorePermit,
 }
 
+/// The permit of one more watch.
+///
+/// # Errors
+/// [`Error::Busy`] when too many watches are open, [`Error::Draining`].
+pub(super) fn permit(app: &App) -> Result<OwnedSemaphorePermit, Error> {
+    app.admit()?;
+    let WatchLimit { permits, max, .. } = &app.watchers;
+    permits.clone().try_acquire_owned().map_err(|_| Error::Busy {
+        message: format!("{max} watches are open, which is the limit"),
+        retry_after: Duration::from_secs(5),
+    })
+}
+
 /// Watches job `id` from the event after `after`; 0 is from the beginning.
 ///
 /// # Errors
 /// [`Error::NotFound`], [`Error::Invalid`] when the job has no event `after` yet, [`Error::Busy`] when too many watches are
 /// open, [`Error::Draining`].
 pub async fn watch(app: &Arc<App>, caller: &Caller, id: &str, after: u64) -> Result<Watch, Error> {
-    app.admit()?;
-    let WatchLimit { permits, max, .. } = &app.watchers;
-    let permit = permits.clone().try_acquire_owned().map_err(|_| Error::Busy {
-        message: format!("{max} watches are open, which is the limit"),
-        retry_after: Duration::from_secs(5),
-    })?;
+    let permit = permit(app)?;
     let Job { row_id: job, state, last_event, .. } = jobs::get(app, caller, id).await?;
     in_range("after", after, 0..=last_event)?;
     let ended = state.ended() && after == last_event;

@@ -115,8 +115,35 @@ pub async fn server_metrics(app: &App) -> ServerMetrics {
         policy_loads: app.loads.count(),
         engine_queue: app.engine.waiting(),
         threads_busy: app.scheduler.threads_busy(),
-        threads: app.scheduler.config().cpu_budget,
+        threads: app.scheduler.cpu_budget(),
         watchers: app.watchers.open(),
         jobs,
     }
+}
+
+/// The CPU budget of training.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Budget {
+    /// Threads that all running jobs may use together.
+    pub threads: usize,
+    /// Threads that running jobs use; more than `threads` while a smaller budget is not reached yet.
+    pub threads_busy: usize,
+}
+
+/// The CPU budget.
+pub fn budget(app: &App) -> Budget {
+    Budget { threads: app.scheduler.cpu_budget(), threads_busy: app.scheduler.threads_busy() }
+}
+
+/// Largest CPU budget.
+pub const MAX_CPU_BUDGET: usize = 4096;
+
+/// Changes the CPU budget until the server stops.
+///
+/// # Errors
+/// [`Error::Invalid`]: the number is out of range.
+pub fn set_budget(app: &App, threads: usize) -> Result<Budget, Error> {
+    in_range("threads", threads, 1..=MAX_CPU_BUDGET)?;
+    app.scheduler.set_cpu_budget(threads);
+    Ok(budget(app))
 }

@@ -10,7 +10,7 @@ use crate::error_code::ErrorCode;
 use crate::invalid::{Invalid, in_range};
 use crate::jobs::{Directive, equal_secrets, token_digest};
 use crate::store::{
-    EndedAttempt, Job, JobId, Lease, Metric, NewCheckpoint, PartialSnapshot, Snapshot, WorkerResult, is_metric_name,
+    EarlyStop, EndedAttempt, Job, JobId, Lease, Metric, NewCheckpoint, PartialSnapshot, Snapshot, WorkerResult, is_metric_name,
 };
 use crate::train_config::TrainConfig;
 
@@ -20,6 +20,8 @@ pub const MAX_CHUNK: usize = 1 << 20;
 const MAX_CHECKPOINT: u64 = 256 << 20;
 /// Maximum number of metrics in one report.
 const MAX_METRICS: usize = 10_000;
+/// Most values that an early stop looks back to. Workers report fewer.
+const MAX_OBSERVED: u32 = 50_000;
 
 /// The credentials in the metadata of a call.
 #[derive(Clone, Debug)]
@@ -43,6 +45,10 @@ pub struct AttemptTask {
     pub snapshot: Option<Snapshot>,
     /// Time between snapshots.
     pub snapshot_every: std::time::Duration,
+    /// When training ends before all steps are done.
+    pub stop: Option<EarlyStop>,
+    /// The values that `stop` has observed up to the snapshot.
+    pub observed: Vec<Metric>,
 }
 
 /// The attempt that the credentials belong to. Counts as a heartbeat.
@@ -78,13 +84,27 @@ fn require_active(active: bool, lease: Lease) -> Result<(), Error> {
 /// [`Error::Precondition`] when the job was deleted.
 pub async fn fetch(app: &App, lease: Lease) -> Result<AttemptTask, Error> {
     let job = app.store.job(lease.job_id).await?.ok_or_else(|| attempt_ended(lease))?;
-    let config = app.scheduler.config();
+    let spec = job.spec.decode().map_err(Error::internal)?;
+    let snapshot = app.store.snapshot(lease.job_id).await?;
+    let observed = match (&spec.stop, &snapshot) {
+        (Some(stop), Some(snapshot)) => observed(app, lease, &stop.metric, snapshot.step).await?,
+        _ => Vec::new(),
+    };
     Ok(AttemptTask {
-        threads: job.spec.threads.min(config.cpu_budget),
-        config: job.spec.decode().map_err(Error::internal)?.config,
-        snapshot: app.store.snapshot(lease.job_id).await?,
-        snapshot_every: config.snapshot_every,
+        threads: job.spec.threads.min(app.scheduler.cpu_budget()),
+        config: spec.config,
+        snapshot,
+        snapshot_every: app.scheduler.config().snapshot_every,
+        stop: spec.stop,
+        observed,
     })
+}
+
+/// The values of a metric up to `step`, by step.
+async fn observed(app: &App, lease: Lease, metric: &str, step: u64) -> Result<Vec<Metric>, Error> {
+    let rows = app.store.metrics(lease.job_id, Some(metric), None, MAX_OBSERVED).await?;
+    let rows = rows.into_iter().filter(|row| row.step <= step);
+    Ok(rows.map(|row| Metric { name: row.name, step: row.step, value: row.value.unwrap_or(f64::NAN) }).collect())
 }
 
 /// The newest snapshot of the job.

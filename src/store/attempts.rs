@@ -4,7 +4,8 @@
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 
-use super::jobs::{Transition, find, transition};
+use super::jobs::find;
+use super::transitions::{Transition, transition};
 use super::named_enum::named_enum;
 use super::policies::{NewPolicyVersion, PublishedPolicy, may_publish, publish};
 use super::{Job, JobId, JobState, PendingAction, Result, Store, corrupt, timestamp};
@@ -135,6 +136,8 @@ async fn end(db: &mut SqliteConnection, ended: EndedAttempt<'_>) -> Result<Optio
         }
         _ => result,
     };
+    let limits = job.spec.decode().map(|spec| spec.limits).unwrap_or_default();
+    let max_attempts = limits.max_attempts.unwrap_or(max_attempts);
     // An acknowledged cancel wins, even over a worker that succeeded before it noticed.
     let (outcome, state) = match (result, job.pending_action) {
         (WorkerResult::Succeeded | WorkerResult::Stopped, Some(PendingAction::Cancel)) => {
@@ -171,9 +174,15 @@ async fn end(db: &mut SqliteConnection, ended: EndedAttempt<'_>) -> Result<Optio
         published = Some(new);
     }
     let sql = "UPDATE jobs SET failures = failures + ?2, consecutive_failures = consecutive_failures + ?2,
-               policy = coalesce(?3, policy) WHERE number = ?1";
-    sqlx::query(sql).bind(lease.job_row).bind(failed).bind(name).execute(&mut *db).await?;
+               policy = coalesce(?3, policy),
+               ran = ran + (SELECT max(ended_at - started_at, 0) FROM attempts WHERE job = ?1 AND number = ?4) WHERE number = ?1";
+    sqlx::query(sql).bind(lease.job_row).bind(failed).bind(name).bind(lease.attempt).execute(&mut *db).await?;
     transition(db, Transition { job: lease.job_row, to: state, attempt: lease.attempt, reason, now }).await?;
+    let delay = limits.delay(job.consecutive_failures + 1);
+    if outcome == AttemptOutcome::Failed && state == JobState::Queued && delay > 0 {
+        let not_before = now.as_millisecond().saturating_add_unsigned(delay.saturating_mul(1000));
+        sqlx::query("UPDATE jobs SET not_before = ? WHERE number = ?").bind(not_before).bind(lease.job_row).execute(&mut *db).await?;
+    }
     Ok(find(db, lease.job_id).await?.map(|job| (job, published)))
 }
 
@@ -216,10 +225,9 @@ impl Store {
     /// [`Error`](super::Error) when the database fails.
     pub async fn end_attempt(&self, ended: EndedAttempt<'_>) -> Result<Option<(Job, Option<PublishedPolicy>)>> {
         let mut tx = self.begin().await?;
-        let job_row = ended.lease.job_row;
         let result = end(&mut tx, ended).await?;
         tx.commit().await?;
-        self.notify(job_row);
+        self.notify_all();
         Ok(result)
     }
 

@@ -72,6 +72,11 @@ impl Store {
         self.notifier.channel(job).send_replace(());
     }
 
+    /// Notifies all listeners: events of several jobs were committed.
+    pub(super) fn notify_all(&self) {
+        self.notifier.0.iter().for_each(|channel| drop(channel.send_replace(())));
+    }
+
     /// A receiver that changes whenever an event of the job with row id `job` was committed, and sometimes without one.
     pub fn changes(&self, job: i64) -> watch::Receiver<()> {
         self.notifier.channel(job).subscribe()

@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 
-use super::jobs::{Transition, find, get_existing, transition};
+use super::jobs::{find, get_existing};
+use super::transitions::{Transition, release_dependents, transition};
 use super::submission::set_labels;
 use super::{Job, JobId, JobState, PendingAction, Result, Store, corrupt};
 
@@ -55,7 +56,7 @@ impl Store {
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
     pub async fn change_job(&self, id: JobId, action: JobAction, now: Timestamp) -> Result<ActionResult> {
-        use JobState::{Cancelled, Failed, Paused, Queued, Running};
+        use JobState::{Cancelled, Failed, Paused, Queued, Running, Succeeded};
         let mut tx = self.begin().await?;
         let Some(job) = find(&mut tx, id).await? else {
             tx.abandon().await?;
@@ -75,16 +76,17 @@ impl Store {
             (JobAction::Pause, Queued, _) => transition_now(&mut tx, &job, Paused, now).await?,
             (JobAction::Resume, Paused, _) => transition_now(&mut tx, &job, Queued, now).await?,
             (JobAction::Retry, Failed, _) => {
-                let sql = "UPDATE jobs SET consecutive_failures = 0 WHERE number = ?";
+                let sql = "UPDATE jobs SET consecutive_failures = 0, ran = 0 WHERE number = ?";
                 sqlx::query(sql).bind(job.row_id).execute(&mut *tx).await?;
                 transition_now(&mut tx, &job, Queued, now).await?;
             }
             (JobAction::Cancel, Running, _) => set_pending_action(&mut tx, &job, PendingAction::Cancel).await?,
             (JobAction::Pause, Running, None) => set_pending_action(&mut tx, &job, PendingAction::Pause).await?,
             (JobAction::Delete, state, _) if state.ended() => {
+                release_dependents(&mut tx, job.row_id, state == Succeeded, now).await?;
                 sqlx::query("DELETE FROM jobs WHERE number = ?").bind(job.row_id).execute(&mut *tx).await?;
                 tx.commit().await?;
-                self.notify(job.row_id);
+                self.notify_all();
                 return Ok(ActionResult::Accepted(Box::new(job)));
             }
             _ => {
@@ -94,7 +96,7 @@ impl Store {
         }
         let job = get_existing(&mut tx, id).await?;
         tx.commit().await?;
-        self.notify(job.row_id);
+        self.notify_all();
         Ok(ActionResult::Accepted(Box::new(job)))
     }
 

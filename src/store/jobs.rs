@@ -1,9 +1,10 @@
 //! Jobs: their records, their states, and how a state changes.
 
 use std::fmt;
+use std::time::Duration;
 
 use jiff::Timestamp;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use sqlx::SqliteConnection;
 use uuid::Uuid;
 
@@ -12,7 +13,7 @@ use super::specs::StoredSpec;
 use super::{Error, Result, Store, corrupt, timestamp};
 
 /// Identifies a job.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct JobId(pub Uuid);
 
@@ -100,6 +101,12 @@ pub struct Job {
     pub policy: Option<String>,
     /// Id of the newest event.
     pub last_event: u64,
+    /// Number of jobs that must succeed before this one can start and have not.
+    pub blocked: u64,
+    /// When the next attempt may begin; `None`: at once.
+    pub not_before: Option<Timestamp>,
+    /// Time for which the attempts that have ended ran, since the job was last retried.
+    pub ran: Duration,
     /// When the job was submitted.
     pub created_at: Timestamp,
     /// When the first attempt began.
@@ -136,6 +143,9 @@ from_row! {
         step: i64,
         policy: Option<String>,
         seq: i64,
+        blocked: i64,
+        not_before: Option<i64>,
+        ran: i64,
         created_at: i64,
         started_at: Option<i64>,
         ended_at: Option<i64>,
@@ -174,40 +184,14 @@ impl TryFrom<JobRow> for Job {
             step: row.step as u64,
             policy: row.policy,
             last_event: row.seq as u64,
+            blocked: row.blocked as u64,
+            not_before: row.not_before.map(timestamp).transpose()?,
+            ran: Duration::from_millis(row.ran.max(0) as u64),
             created_at: timestamp(row.created_at)?,
             started_at: row.started_at.map(timestamp).transpose()?,
             ended_at: row.ended_at.map(timestamp).transpose()?,
         })
     }
-}
-
-/// A change of state and its entry in the event log.
-pub(super) struct Transition<'a> {
-    pub(super) job: i64,
-    pub(super) to: JobState,
-    pub(super) attempt: u32,
-    pub(super) reason: Option<&'a str>,
-    pub(super) now: Timestamp,
-}
-
-/// Moves a job to another state and appends an event. Deletes the snapshot of a job that ends, unless it failed: a failed job can
-/// be retried.
-pub(super) async fn transition(db: &mut SqliteConnection, t: Transition<'_>) -> Result<()> {
-    let now = t.now.as_millisecond();
-    let ended = t.to.ended().then_some(now);
-    let started = (t.to == JobState::Running).then_some(now);
-    let state = t.to.as_str();
-    let sql = "UPDATE jobs SET state = ?2, wanted = NULL, reason = ?3, ended_at = ?4, started_at = coalesce(started_at, ?5),
-               seq = seq + 1 WHERE number = ?1 RETURNING seq";
-    let update = sqlx::query_scalar(sql).bind(t.job).bind(state).bind(t.reason).bind(ended).bind(started);
-    let seq: i64 = update.fetch_one(&mut *db).await?;
-    let sql = "INSERT INTO events (job, at, state, attempt, reason, seq) VALUES (?, ?, ?, ?, ?, ?)";
-    let insert = sqlx::query(sql).bind(t.job).bind(now).bind(state).bind(t.attempt).bind(t.reason).bind(seq);
-    insert.execute(&mut *db).await?;
-    if t.to.ended() && t.to != JobState::Failed {
-        sqlx::query("DELETE FROM snapshots WHERE job = ?").bind(t.job).execute(&mut *db).await?;
-    }
-    Ok(())
 }
 
 pub(super) async fn find(db: &mut SqliteConnection, id: JobId) -> Result<Option<Job>> {

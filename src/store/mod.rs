@@ -37,6 +37,7 @@ mod snapshots;
 mod space;
 mod specs;
 mod submission;
+mod transitions;
 mod upkeep;
 mod writes;
 
@@ -53,7 +54,7 @@ pub use metric_summaries::{MetricSummary, larger_is_better};
 pub use metrics::{Metric, MetricCursor, MetricRow, is_metric_name};
 pub use policies::{NewPolicyVersion, PolicyVersion, PublishedPolicy, VersionKey};
 pub use snapshots::{PartialSnapshot, Snapshot};
-pub use specs::{JobKind, JobSpec, StoredSpec, UnreadableSpec};
+pub use specs::{EarlyStop, JobKind, JobLimits, JobSpec, StoredSpec, UnreadableSpec};
 pub use submission::{NewJob, SubmitResult};
 pub use writes::WriteFailure;
 
@@ -86,6 +87,7 @@ const MIGRATIONS: &[(&str, &str)] = &migrations![
     "0008_owners.sql",
     "0009_consecutive_failures.sql",
     "0010_finding_jobs.sql",
+    "0011_lifecycle.sql",
 ];
 
 /// Name of the database file inside the data directory.

@@ -4,18 +4,33 @@ use std::collections::BTreeMap;
 
 use jiff::Timestamp;
 
-use super::jobs::{JobRow, Transition, find, transition};
-use super::{Job, JobState, Result, Store};
+use super::jobs::{JobRow, find};
+use super::transitions::{Transition, transition};
+use super::{Job, JobState, Result, Store, timestamp};
 
 impl Store {
-    /// The queued job that starts next: highest priority, then first come, first served.
+    /// The first job of the queue with at most `threads` threads that may start at `now`: highest priority, then first come, first
+    /// served.
     ///
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
-    pub async fn head_of_queue(&self) -> Result<Option<Job>> {
-        let sql = "SELECT * FROM jobs WHERE state = 'queued' ORDER BY priority DESC, number LIMIT 1";
-        let row: Option<JobRow> = sqlx::query_as(sql).fetch_optional(&self.read).await?;
+    pub async fn first_in_queue(&self, threads: usize, now: Timestamp) -> Result<Option<Job>> {
+        let sql = "SELECT * FROM jobs WHERE state = 'queued' AND blocked = 0 AND threads <= ?
+                   AND (not_before IS NULL OR not_before <= ?) ORDER BY priority DESC, number LIMIT 1";
+        let threads = i64::try_from(threads).unwrap_or(i64::MAX);
+        let query = sqlx::query_as(sql).bind(threads).bind(now.as_millisecond());
+        let row: Option<JobRow> = query.fetch_optional(&self.read).await?;
         row.map(Job::try_from).transpose()
+    }
+
+    /// The earliest time after `now` at which a job of the queue may start that may not start at `now`.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn next_delayed(&self, now: Timestamp) -> Result<Option<Timestamp>> {
+        let sql = "SELECT min(not_before) FROM jobs WHERE state = 'queued' AND not_before IS NOT NULL AND not_before > ?";
+        let next: Option<i64> = sqlx::query_scalar(sql).bind(now.as_millisecond()).fetch_one(&self.read).await?;
+        next.map(timestamp).transpose()
     }
 
     /// Ends a queued job that cannot be started. Returns whether it was queued.
@@ -43,7 +58,8 @@ impl Store {
     pub async fn jobs_before(&self, jobs: &[i64]) -> Result<BTreeMap<i64, u64>> {
         // The whole queue is numbered, because counting for each of the jobs would read it once per job.
         let sql = "SELECT number, place - 1 FROM (
-                       SELECT number, row_number() OVER (ORDER BY priority DESC, number) AS place FROM jobs WHERE state = 'queued'
+                       SELECT number, row_number() OVER (ORDER BY priority DESC, number) AS place FROM jobs
+                       WHERE state = 'queued' AND blocked = 0
                    ) WHERE number IN (SELECT value FROM json_each(?))";
         let rows = sqlx::query_as(sql).bind(serde_json::Value::from(jobs).to_string());
         let rows: Vec<(i64, i64)> = rows.fetch_all(&self.read).await?;

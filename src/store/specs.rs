@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+use super::JobId;
 use super::named_enum::named_enum;
 use crate::train_config::TrainConfig;
 
@@ -33,8 +34,71 @@ pub struct JobSpec {
     pub threads: usize,
     /// Jobs with a higher priority start first.
     pub priority: i64,
+    /// When the job is given up.
+    #[serde(default)]
+    pub limits: JobLimits,
+    /// Jobs that must succeed before this one starts.
+    #[serde(default)]
+    pub after: Vec<JobId>,
+    /// When training ends before all steps are done; `None`: never.
+    #[serde(default)]
+    pub stop: Option<EarlyStop>,
     /// The complete training configuration.
     pub config: TrainConfig,
+}
+
+impl JobSpec {
+    /// A job that trains `config` with one thread.
+    pub fn train(config: TrainConfig) -> Self {
+        Self {
+            kind: JobKind::Train,
+            name: None,
+            labels: BTreeMap::new(),
+            threads: 1,
+            priority: 0,
+            limits: JobLimits::default(),
+            after: Vec::new(),
+            stop: None,
+            config,
+        }
+    }
+}
+
+/// When a job is given up, and how soon an attempt follows one that failed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct JobLimits {
+    /// Consecutive attempts that fail without progress after which the job has failed; `None`: the server's limit.
+    pub max_attempts: Option<u32>,
+    /// Seconds that all attempts together may run; `None`: no limit.
+    pub timeout: Option<u64>,
+    /// Seconds between a failed attempt and the next one. They double with every further failure, up to an hour.
+    pub backoff: u64,
+}
+
+impl JobLimits {
+    /// Longest time between two attempts, in seconds.
+    const LONGEST_BACKOFF: u64 = 3600;
+
+    /// Seconds before the next attempt after `failures` consecutive failures.
+    pub fn delay(&self, failures: u32) -> u64 {
+        let factor = 1_u64.checked_shl(failures.saturating_sub(1)).unwrap_or(u64::MAX);
+        self.backoff.saturating_mul(factor).min(Self::LONGEST_BACKOFF.max(self.backoff))
+    }
+}
+
+/// Ends training before all steps are done: as soon as one of its conditions holds.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct EarlyStop {
+    /// The metric that is observed.
+    pub metric: String,
+    /// A value is at most this.
+    pub at_most: Option<f64>,
+    /// A value is at least this.
+    pub at_least: Option<f64>,
+    /// This many values in a row are not better than the best before them.
+    pub patience: Option<u64>,
 }
 
 /// A specification as stored. `None` is unknown: the document was unreadable when its columns were filled.
@@ -89,5 +153,18 @@ impl StoredSpec {
         let labels: usize = self.labels.iter().map(|(key, value)| key.len() + value.len() + 8).sum();
         let document = if self.decode().is_ok() { 0 } else { self.document.len() };
         self.name.as_ref().map_or(0, String::len) + labels + document
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::JobLimits;
+
+    #[test]
+    fn back_off_doubles_up_to_an_hour() {
+        let delays = |backoff: u64| [0, 1, 2, 3, 100, u32::MAX].map(|n| JobLimits { backoff, ..JobLimits::default() }.delay(n));
+        assert_eq!(delays(0), [0; 6]);
+        assert_eq!(delays(10), [10, 10, 20, 40, 3600, 3600]);
+        assert_eq!(delays(7200), [7200; 6]);
     }
 }

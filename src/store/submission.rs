@@ -6,7 +6,8 @@ use jiff::Timestamp;
 use serde::Serialize;
 use sqlx::SqliteConnection;
 
-use super::jobs::{Transition, find, get_existing, transition};
+use super::jobs::{find, get_existing};
+use super::transitions::{Transition, count_blockers, transition};
 use super::specs::JobSpec;
 use super::{Job, JobId, JobState, Result, Store, corrupt};
 
@@ -96,7 +97,7 @@ impl Store {
 async fn insert(tx: &mut SqliteConnection, new: &NewJob) -> Result<Job> {
     let spec = serde_json::to_string(&new.spec).map_err(|e| corrupt("job", new.id, e))?;
     let now = new.now.as_millisecond();
-    let NewJob { id, owner, any_name, spec: JobSpec { kind, name, labels, threads, priority, config }, .. } = new;
+    let NewJob { id, owner, any_name, spec: JobSpec { kind, name, labels, threads, priority, config, .. }, .. } = new;
     let labels_document = serde_json::to_string(labels).map_err(|e| corrupt("job", id, e))?;
     let sql = "INSERT INTO jobs
                (id, owner, any_name, state, notes, parent, spec, threads, priority, created_at, kind, name, labels, algorithm,
@@ -123,6 +124,11 @@ async fn insert(tx: &mut SqliteConnection, new: &NewJob) -> Result<Job> {
         .await?
         .last_insert_rowid();
     set_labels(tx, row_id, labels).await?;
+    for needed in &new.spec.after {
+        let sql = "INSERT INTO job_dependencies (job, needs) SELECT ?, number FROM jobs WHERE id = ?";
+        sqlx::query(sql).bind(row_id).bind(needed.to_string()).execute(&mut *tx).await?;
+    }
+    count_blockers(tx, row_id).await?;
     transition(tx, Transition { job: row_id, to: JobState::Queued, attempt: 0, reason: None, now: new.now }).await?;
     if let Some((key, body)) = &new.idempotency {
         let sql = "INSERT INTO idempotency_keys (owner, key, body, job, created_at) VALUES (?, ?, ?, ?, ?)";

@@ -217,7 +217,7 @@ async fn many_jobs_are_listed() {
     for i in 0..jobs {
         let labels = BTreeMap::from([("group".to_owned(), (i % 50).to_string())]);
         let name = Some(format!("job-{:05}", (i * 7919) % jobs));
-        let spec = JobSpec { kind: JobKind::Train, name, labels, threads: 1, priority: 0, config: config.clone() };
+        let spec = JobSpec { name, labels, ..JobSpec::train(config.clone()) };
         let (id, now) = (JobId(uuid::Uuid::now_v7()), Timestamp::now());
         let begin = Instant::now();
         let (notes, parent) = (String::new(), None);

@@ -17,7 +17,7 @@ const NOW: Timestamp = Timestamp::UNIX_EPOCH;
 /// A new job that is running, and its attempt.
 async fn running(store: &Store) -> Lease {
     let config = TrainConfig::preset(Algorithm::Qmix, Preset::Practical);
-    let spec = JobSpec { kind: JobKind::Train, name: None, labels: BTreeMap::new(), threads: 1, priority: 0, config };
+    let spec = JobSpec::train(config);
     let new = NewJob { id: JobId(uuid::Uuid::now_v7()), owner: None, any_name: false, spec, notes: String::new(), parent: None, now: NOW, idempotency: None };
     let SubmitResult::Created(job) = store.submit_job(new).await.unwrap() else { panic!("a new job") };
     store.begin_attempt(job.id, [0; 32], NOW).await.unwrap().unwrap()

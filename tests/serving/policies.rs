@@ -107,7 +107,7 @@ async fn a_checkpoint_of_a_job_is_published_by_its_id() {
     let store = Store::open(dir.path()).await.unwrap();
     let (mine, now) = (numbered(5), Timestamp::UNIX_EPOCH);
     let config = mine.config().clone();
-    let spec = JobSpec { kind: JobKind::Train, name: None, labels: BTreeMap::new(), threads: 1, priority: 0, config };
+    let spec = JobSpec::train(config);
     let new = NewJob { id: JobId(uuid::Uuid::from_u128(7)), owner: None, any_name: false, spec, notes: String::new(), parent: None, now, idempotency: None };
     let SubmitResult::Created(job) = store.submit_job(new).await.unwrap() else { panic!("a new job") };
     let lease = store.begin_attempt(job.id, [0; 32], now).await.unwrap().unwrap();

@@ -9,7 +9,7 @@ use crate::invalid::Invalid;
 use crate::jobs::Directive;
 use crate::service::jobs::{JobView, ListRequest, Waiting};
 use crate::store::{
-    CheckpointKind, JobEvent, JobEventKind, JobKind, JobState, Metric, MetricRow, MetricSummary, NewCheckpoint, StoredSpec,
+    Attempt, Checkpoint, CheckpointKind, JobEvent, JobEventKind, JobKind, JobSpec, JobState, Metric, MetricRow, MetricSummary, NewCheckpoint, StoredSpec,
     WorkerResult,
 };
 use crate::train_config::TrainConfig;
@@ -80,12 +80,18 @@ pub fn job_summary(view: JobView) -> v1::Job {
 
 impl From<JobView> for v1::Job {
     fn from(view: JobView) -> Self {
-        job_message(view, |TrainConfig { environment, training, .. }| json!({"environment": environment, "training": training}))
+        job_message(view, |JobSpec { limits, after, stop, config, .. }| {
+            let TrainConfig { environment, training, .. } = config;
+            json!({
+                "environment": environment, "training": training, "max_attempts": limits.max_attempts, "timeout": limits.timeout,
+                "backoff": limits.backoff, "after": after, "stop": stop,
+            })
+        })
     }
 }
 
 /// The message of a job, whose `spec` also has the fields that `details` selects.
-fn job_message(view: JobView, details: impl Fn(&TrainConfig) -> Value) -> v1::Job {
+fn job_message(view: JobView, details: impl Fn(&JobSpec) -> Value) -> v1::Job {
     let JobView { job, waiting, metrics } = view;
     let decoded = job.spec.decode();
     let StoredSpec { kind, name, labels, threads, priority, algorithm, preset, seed, steps, document } = job.spec;
@@ -95,7 +101,7 @@ fn job_message(view: JobView, details: impl Fn(&TrainConfig) -> Value) -> v1::Jo
     });
     let unreadable = match decoded {
         Ok(decoded) => {
-            if let (Value::Object(all), Value::Object(more)) = (&mut spec, details(&decoded.config)) {
+            if let (Value::Object(all), Value::Object(more)) = (&mut spec, details(&decoded)) {
                 all.extend(more);
             }
             None
@@ -140,6 +146,28 @@ impl From<Waiting> for v1::Waiting {
     }
 }
 
+impl From<Attempt> for v1::JobAttempt {
+    fn from(attempt: Attempt) -> Self {
+        Self {
+            attempt: attempt.number,
+            started_at: Some(timestamp(attempt.started_at)),
+            ended_at: attempt.ended_at.map(timestamp),
+            outcome: attempt.outcome.map(|outcome| outcome.to_string()).unwrap_or_default(),
+            reason: attempt.reason.unwrap_or_default(),
+            log: attempt.log,
+        }
+    }
+}
+
+impl From<Checkpoint> for v1::JobCheckpoint {
+    fn from(checkpoint: Checkpoint) -> Self {
+        let Checkpoint { id, job, kind, attempt, step, sha256, size, metrics, config: _, created_at } = checkpoint;
+        let (id, job, kind) = (id.to_string(), job.to_string(), kind.to_string());
+        let metrics = metrics.into_iter().collect();
+        Self { id, job, kind, attempt, step, sha256, size, metrics, created_at: Some(timestamp(created_at)) }
+    }
+}
+
 impl From<MetricRow> for v1::MetricRow {
     fn from(row: MetricRow) -> Self {
         Self { name: row.name, step: row.step, value: row.value, at: Some(timestamp(row.at)) }
@@ -164,6 +192,12 @@ impl From<JobEvent> for v1::JobEvent {
 
 impl From<v1::ReportedMetric> for Metric {
     fn from(m: v1::ReportedMetric) -> Self {
+        Self { name: m.name, step: m.step, value: m.value }
+    }
+}
+
+impl From<Metric> for v1::ReportedMetric {
+    fn from(m: Metric) -> Self {
         Self { name: m.name, step: m.step, value: m.value }
     }
 }

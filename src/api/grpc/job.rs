@@ -3,6 +3,7 @@
 use std::future::ready;
 use std::sync::Arc;
 
+use bytes::Bytes;
 use futures::stream::{BoxStream, StreamExt, TryStreamExt};
 use tonic::{Request, Response, Status};
 
@@ -13,7 +14,9 @@ use crate::api::convert::structs::from_struct;
 use crate::api::errors::stream_status;
 use crate::jobs::spec::{EditRequest, JobRequest};
 use crate::service::keys::Caller;
-use crate::service::{App, Error, PageRequest, events, jobs};
+use crate::service::jobs::LogLines;
+use crate::service::worker::MAX_CHUNK;
+use crate::service::{App, Error, PageRequest, checkpoints, events, jobs};
 use crate::store::JobAction;
 use crate::wire::v1;
 use crate::wire::v1::job_service_server::{JobService, JobServiceServer};
@@ -101,5 +104,44 @@ impl JobService for Service {
         let events = events::watch(&self.0, &caller, &id, after).await?.events();
         let events = events.and_then(move |event| ready(caller.check(clock.now()).map(|()| event)));
         Ok(Response::new(events.map_ok(Into::into).map_err(stream_status).boxed()))
+    }
+    async fn delete_job(&self, request: Request<v1::DeleteJobRequest>) -> GrpcResult<v1::DeleteJobResponse> {
+        self.change(caller(request.extensions()), &request.into_inner().id, JobAction::Delete).await?;
+        Ok(Response::new(v1::DeleteJobResponse {}))
+    }
+
+    async fn get_job_logs(&self, request: Request<v1::GetJobLogsRequest>) -> GrpcResult<v1::GetJobLogsResponse> {
+        let caller = caller(request.extensions());
+        let attempts = jobs::logs(&self.0, &caller, &request.into_inner().id).await?.into_iter().map(Into::into).collect();
+        Ok(Response::new(v1::GetJobLogsResponse { attempts }))
+    }
+
+    type WatchJobLogsStream = BoxStream<'static, Result<v1::JobOutput, Status>>;
+
+    async fn watch_job_logs(&self, request: Request<v1::WatchJobLogsRequest>) -> GrpcResult<Self::WatchJobLogsStream> {
+        let (clock, caller) = (self.0.clock.clone(), caller(request.extensions()));
+        let lines = jobs::follow_logs(&self.0, &caller, &request.into_inner().id).await?;
+        let lines = lines.and_then(move |lines| ready(caller.check(clock.now()).map(|()| lines)));
+        let output = |LogLines { attempt, text }| v1::JobOutput { attempt, text };
+        Ok(Response::new(lines.map_ok(output).map_err(stream_status).boxed()))
+    }
+
+    async fn list_checkpoints(&self, request: Request<v1::ListCheckpointsRequest>) -> GrpcResult<v1::ListCheckpointsResponse> {
+        let caller = caller(request.extensions());
+        let checkpoints = jobs::checkpoints(&self.0, &caller, &request.into_inner().id).await?;
+        Ok(Response::new(v1::ListCheckpointsResponse { checkpoints: checkpoints.into_iter().map(Into::into).collect() }))
+    }
+
+    type DownloadCheckpointStream = BoxStream<'static, Result<v1::CheckpointData, Status>>;
+
+    async fn download_checkpoint(
+        &self,
+        request: Request<v1::DownloadCheckpointRequest>,
+    ) -> GrpcResult<Self::DownloadCheckpointStream> {
+        let caller = caller(request.extensions());
+        let (_, bytes) = checkpoints::get(&self.0, &caller, &request.into_inner().id).await?;
+        let bytes = Bytes::from(bytes);
+        let parts = (0..bytes.len()).step_by(MAX_CHUNK).map(move |at| bytes.slice(at..bytes.len().min(at + MAX_CHUNK)));
+        Ok(Response::new(futures::stream::iter(parts.map(|data| Ok(v1::CheckpointData { data }))).boxed()))
     }
 }

@@ -46,6 +46,8 @@ impl WorkerService for Service {
             threads: task.threads as u32,
             snapshot_step: task.snapshot.map(|snapshot| snapshot.step),
             snapshot_every_ms: task.snapshot_every.as_millis() as u64,
+            stop: task.stop.map_or_else(|| Ok(String::new()), |stop| serde_json::to_string(&stop)).map_err(Error::internal)?,
+            observed: task.observed.into_iter().map(Into::into).collect(),
         }))
     }
 

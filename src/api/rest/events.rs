@@ -1,4 +1,4 @@
-//! `/v1/jobs/{id}/events`: the events of a job, as server-sent events.
+//! `/v1/jobs/{id}/events` and `/v1/jobs/{id}/logs/events`: the events and the output of a job, as server-sent events.
 
 use std::convert::Infallible;
 use std::future::ready;
@@ -21,12 +21,13 @@ use super::openapi::{BadRequest, Draining, NotFound};
 use crate::api::errors::log_internal;
 use crate::invalid::Invalid;
 use crate::service::keys::Caller;
-use crate::service::{App, Error, events};
+use crate::service::jobs::LogLines;
+use crate::service::{App, Error, events, jobs};
 use crate::store::{JobEvent, JobEventKind, JobState};
 
 /// The route.
 pub(super) fn router() -> OpenApiRouter<Arc<App>> {
-    OpenApiRouter::new().routes(routes!(follow))
+    OpenApiRouter::new().routes(routes!(follow)).routes(routes!(follow_logs))
 }
 
 #[derive(Deserialize, IntoParams)]
@@ -145,6 +146,56 @@ async fn follow(
     let events = watch.events().and_then(to_event).inspect_err(log_internal);
     let events = events.map(Result::ok).take_while(|event| ready(event.is_some())).filter_map(ready);
     let events = events.map(|event| Ok::<_, Infallible>(Event::from(event)));
+    let heartbeat = KeepAlive::new().interval(app.watchers.heartbeat());
+    Ok(([UNBUFFERED], Sse::new(events).keep_alive(heartbeat)).into_response())
+}
+
+/// One event of the stream of output.
+#[derive(ToSchema)]
+#[allow(dead_code, reason = "describes the events in the document")]
+struct OutputEvent {
+    event: OutputEventName,
+    /// JSON: `{attempt, text}`, where `text` has one or more lines.
+    #[schema(content_media_type = "application/json")]
+    data: String,
+}
+
+#[derive(ToSchema)]
+#[schema(rename_all = "lowercase")]
+#[allow(dead_code, reason = "describes the events in the document")]
+enum OutputEventName {
+    Output,
+}
+
+#[derive(Serialize)]
+struct Output {
+    attempt: u32,
+    text: String,
+}
+
+/// Follow the output of a job: that of its newest attempt so far, then every line that arrives
+///
+/// The stream goes on with the next attempt, and ends when the job has ended, when the server drains, or on an internal error.
+#[utoipa::path(
+    get, path = "/v1/jobs/{id}/logs/events", operation_id = "followJobLogs", tag = "jobs", params(JobPath),
+    responses(
+        (status = 200, description = "Output as it arrives.", content((OutputEvent = "text/event-stream"))),
+        BadRequest, NotFound, Draining
+    )
+)]
+async fn follow_logs(
+    State(app): State<Arc<App>>,
+    caller: Caller,
+    Path(JobPath { id }): Path<JobPath>,
+) -> Result<Response, Error> {
+    let clock = app.clock.clone();
+    let lines = jobs::follow_logs(&app, &caller, &id).await?;
+    let to_event = move |LogLines { attempt, text }| {
+        let data = serde_json::to_string(&Output { attempt, text }).map_err(Error::internal);
+        ready(caller.check(clock.now()).and(data).map(|data| Event::default().event("output").data(data)))
+    };
+    let events = lines.and_then(to_event).inspect_err(log_internal);
+    let events = events.map(Result::ok).take_while(|event| ready(event.is_some())).filter_map(ready).map(Ok::<_, Infallible>);
     let heartbeat = KeepAlive::new().interval(app.watchers.heartbeat());
     Ok(([UNBUFFERED], Sse::new(events).keep_alive(heartbeat)).into_response())
 }

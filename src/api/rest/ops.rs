@@ -2,15 +2,18 @@
 
 use std::sync::Arc;
 
-use axum::Extension;
+use axum::{Extension, Json};
 use axum::extract::State;
 use axum::http::header;
 use axum::response::{Html, IntoResponse, Response};
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::extract::Path;
-use super::openapi::{BadRequest, Description, Draining, Fault, NotFound};
+use super::extract::{Json as Body, Path};
+use super::json;
+use super::openapi::{BadBody, BadRequest, Description, Draining, Fault, NotFound};
 use super::schemas;
 use crate::service::{App, Error, operations};
 
@@ -20,6 +23,7 @@ pub(super) fn router() -> OpenApiRouter<Arc<App>> {
         .routes(routes!(live))
         .routes(routes!(ready))
         .routes(routes!(metrics))
+        .routes(routes!(budget, set_budget))
         .routes(routes!(openapi))
         .routes(routes!(docs))
         .routes(routes!(docs_file))
@@ -42,6 +46,54 @@ async fn live() -> &'static str {
 async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Error> {
     app.ready().await?;
     Ok("ok\n")
+}
+
+/// The CPU budget of training.
+#[derive(Serialize, ToSchema)]
+struct Budget {
+    /// Threads that all running jobs may use together.
+    threads: usize,
+    /// Threads that running jobs use; more than `threads` while a smaller budget is not reached yet.
+    threads_busy: usize,
+}
+
+impl From<operations::Budget> for Budget {
+    fn from(operations::Budget { threads, threads_busy }: operations::Budget) -> Self {
+        Self { threads, threads_busy }
+    }
+}
+
+#[derive(Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+#[schema(example = json!({"threads": 2}))]
+struct BudgetChange {
+    /// Threads that all running jobs may use together.
+    #[serde(deserialize_with = "json::integer")]
+    #[schema(minimum = 1, maximum = 4096)]
+    threads: usize,
+}
+
+/// Get the CPU budget of training
+#[utoipa::path(
+    get, path = "/v1/server/budget", operation_id = "getBudget", tag = "operations",
+    responses((status = 200, description = "The budget, and what is used of it.", body = Budget))
+)]
+async fn budget(State(app): State<Arc<App>>) -> Json<Budget> {
+    Json(operations::budget(&app).into())
+}
+
+/// Change the CPU budget of training until the server stops
+///
+/// Jobs that run stay: a smaller budget is reached when some of them have ended.
+#[utoipa::path(
+    put, path = "/v1/server/budget", operation_id = "setBudget", tag = "operations", request_body = BudgetChange,
+    responses((status = 200, description = "The new budget.", body = Budget), BadBody)
+)]
+async fn set_budget(
+    State(app): State<Arc<App>>,
+    Body(BudgetChange { threads }): Body<BudgetChange>,
+) -> Result<Json<Budget>, Error> {
+    Ok(Json(operations::set_budget(&app, threads)?.into()))
 }
 
 /// Metrics for Prometheus

@@ -5,6 +5,7 @@
 //! that come before a snapshot. Training waits only when the queue is full, because the server does not answer for long.
 
 mod client;
+mod early_stop;
 mod report;
 mod training;
 
@@ -18,6 +19,7 @@ use std::time::Duration;
 use tokio::sync::{mpsc, oneshot};
 
 use self::client::{Client, ClientError};
+use self::early_stop::StopRule;
 use self::training::{ReportQueue, TrainingTask};
 use super::Directive;
 use crate::store::WorkerResult;
@@ -182,7 +184,13 @@ async fn train(client: &Client, stop: Arc<StopSignal>) -> Result<WorkerResult, E
     };
     tracing::info!(threads = task.threads, from_step = task.snapshot_step, "training");
     let snapshot_every = Duration::from_millis(task.snapshot_every_ms);
-    let task = TrainingTask { config, threads: task.threads as usize, snapshot, snapshot_every };
+    let stop_rule = match task.stop.as_str() {
+        "" => None,
+        rule => Some(serde_json::from_str(rule).map_err(Error::Configuration)?),
+    };
+    let observed: Vec<_> = task.observed.iter().map(|metric| (metric.step, metric.value)).collect();
+    let stop_rule = stop_rule.map(|rule| StopRule::new(rule, &observed));
+    let task = TrainingTask { config, threads: task.threads as usize, snapshot, snapshot_every, stop_rule };
 
     let (sender, receiver) = mpsc::channel(QUEUE);
     let reports = ReportQueue::new(sender);

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::mpsc::Sender;
 
 use super::StopSignal;
+use super::early_stop::StopRule;
 use crate::checkpoint::Checkpoint;
 use crate::invalid::Invalid;
 use crate::jobs::Directive;
@@ -37,6 +38,8 @@ pub(super) struct TrainingTask {
     pub threads: usize,
     pub snapshot: Option<Vec<u8>>,
     pub snapshot_every: Duration,
+    /// When training ends before all steps are done.
+    pub stop_rule: Option<StopRule>,
 }
 
 /// The queue of reports. Adding a report waits while the queue is full.
@@ -87,7 +90,7 @@ pub(super) fn train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal
 }
 
 fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Result<WorkerResult, Box<dyn std::error::Error>> {
-    let TrainingTask { config, threads, snapshot, snapshot_every } = task;
+    let TrainingTask { config, threads, snapshot, snapshot_every, mut stop_rule } = task;
     let mut trainer = match &snapshot {
         Some(bytes) => Trainer::restore(bytes, threads)?,
         None => Trainer::new(config, threads)?,
@@ -99,6 +102,7 @@ fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Re
     let mut last_snapshot = Instant::now();
     while let Some(event) = trainer.next() {
         let rows = curve.rows(&event);
+        let ends = stop_rule.as_mut().is_some_and(|rule| rows.iter().any(|&(step, name, value)| rule.observes(name, step, value)));
         if !rows.is_empty() {
             reports.push(Report::Metrics { step: trainer.env_steps(), rows });
         }
@@ -115,6 +119,11 @@ fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Re
                 return Ok(WorkerResult::Failed { reason, permanent: true });
             }
             _ => {}
+        }
+        if ends {
+            tracing::info!(step = trainer.env_steps(), "training ends early");
+            reports.checkpoint(CheckpointKind::Last, &trainer.checkpoint()?);
+            return Ok(WorkerResult::Succeeded);
         }
         if last_snapshot.elapsed() >= snapshot_every && !reports.snapshot_pending.load(Ordering::Acquire) {
             reports.snapshot(&trainer);

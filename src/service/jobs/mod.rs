@@ -1,11 +1,13 @@
 //! The use cases of jobs: submit, get, list, edit, cancel, pause, resume, retry, delete, and read metrics, checkpoints and logs.
 
 mod listing;
+mod logs;
 mod view;
 
 use uuid::Uuid;
 
 pub use listing::{ListRequest, list};
+pub use logs::{LogLines, follow_logs, logs};
 pub use view::{JobView, Waiting};
 
 use super::keys::Caller;
@@ -18,7 +20,7 @@ use crate::jobs::SchedulerConfig;
 use crate::jobs::memory::check as check_memory;
 use crate::jobs::spec::{EditRequest, JobRequest};
 use crate::store::{
-    ActionResult, Attempt, Checkpoint, Job, JobAction, JobId, MetricCursor, MetricRow, NewJob, PendingAction, SubmitResult,
+    ActionResult, Checkpoint, Job, JobAction, JobId, JobState, MetricCursor, MetricRow, NewJob, PendingAction, SubmitResult,
     is_metric_name,
 };
 
@@ -58,14 +60,17 @@ async fn submit_job(
     {
         return submitted(app, result);
     }
-    let SchedulerConfig { cpu_budget, memory, .. } = app.scheduler.config();
+    let SchedulerConfig { memory, .. } = app.scheduler.config();
     let notes = request.notes.clone().unwrap_or_default();
-    let spec = request.resolve(*cpu_budget)?;
+    let spec = request.resolve(app.scheduler.cpu_budget())?;
     check_memory(&spec.config, spec.threads, *memory)?;
     if let Some(name) = &spec.name {
         // Reported now instead of after training.
         policies::check_publishable(name)?;
         policies::check_owner(app, &Publisher::from(caller), name).await?;
+    }
+    for (i, needed) in spec.after.iter().enumerate() {
+        check_dependency(app, caller, i, *needed).await?;
     }
     app.admit()?;
     let Publisher { owner, any_name, .. } = caller.into();
@@ -87,6 +92,18 @@ fn submitted(app: &App, result: SubmitResult) -> Result<(Job, bool), Error> {
             let message = "this idempotency key was used with another job; use a new key for a new job".into();
             Err(Error::Conflict { code: ErrorCode::IdempotencyConflict, message })
         }
+    }
+}
+
+/// Checks that a job can come after the job `needed`.
+async fn check_dependency(app: &App, caller: &Caller, index: usize, needed: JobId) -> Result<(), Error> {
+    let found = app.store.job(needed).await?.filter(|job| caller.sees_id(job.owner.as_deref()));
+    match found.map(|job| job.state) {
+        None => Err(Invalid::new(format!("after[{index}]"), needed, "the id of a job that exists").into()),
+        Some(JobState::Cancelled) => {
+            Err(Invalid::new(format!("after[{index}]"), needed, "a job that can still succeed; this one was cancelled").into())
+        }
+        Some(_) => Ok(()),
     }
 }
 
@@ -194,19 +211,4 @@ fn parse_metric_cursor(cursor: &str) -> Option<MetricCursor> {
 pub async fn checkpoints(app: &App, caller: &Caller, id: &str) -> Result<Vec<Checkpoint>, Error> {
     let job = get(app, caller, id).await?;
     Ok(app.store.checkpoints(job.id).await?)
-}
-
-/// The newest attempts of a job with the last output of their workers, oldest first.
-///
-/// # Errors
-/// [`Error::NotFound`].
-pub async fn logs(app: &App, caller: &Caller, id: &str) -> Result<Vec<Attempt>, Error> {
-    let job = get(app, caller, id).await?;
-    let mut attempts = app.store.attempts(job.id).await?;
-    for attempt in &mut attempts {
-        if let Some(log) = app.scheduler.live_log(job.row_id, attempt.number) {
-            attempt.log = log;
-        }
-    }
-    Ok(attempts)
 }

@@ -2,6 +2,8 @@
 
 use std::collections::BTreeMap;
 
+use jiff::Timestamp;
+
 use crate::service::{App, Error};
 use crate::store::{Job, JobState, MetricSummary};
 
@@ -22,7 +24,7 @@ pub struct JobView {
 /// Why a queued job has not started.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Waiting {
-    /// In words: `needs 2 threads, 1 free; 3 jobs before it`.
+    /// In words: `comes after 1 job that has not succeeded`, or `needs 2 threads, 1 free; 3 jobs before it`.
     pub reason: String,
     /// Threads that the job needs.
     pub threads: usize,
@@ -33,11 +35,18 @@ pub struct Waiting {
 }
 
 impl Waiting {
-    fn new(threads: usize, threads_free: usize, jobs_before: u64) -> Self {
+    fn new(blocked: u64, not_before: Option<Timestamp>, threads: usize, threads_free: usize, jobs_before: u64) -> Self {
         let plural = |n: u64, what: &str| format!("{n} {what}{}", if n == 1 { "" } else { "s" });
         let mut reason = format!("needs {}, {threads_free} free", plural(threads as u64, "thread"));
         if jobs_before > 0 {
             reason += &format!("; {} before it", plural(jobs_before, "job"));
+        }
+        if let Some(time) = not_before {
+            reason = format!("waits until {time:.0} after a failed attempt");
+        }
+        if blocked > 0 {
+            let has = if blocked == 1 { "has" } else { "have" };
+            reason = format!("comes after {} that {has} not succeeded", plural(blocked, "job"));
         }
         Self { reason, threads, threads_free, jobs_before }
     }
@@ -69,22 +78,27 @@ async fn waiting(app: &App, jobs: &[Job]) -> Result<BTreeMap<i64, Waiting>, Erro
         return Ok(BTreeMap::new());
     }
     let before = app.store.jobs_before(&queued.iter().map(|job| job.row_id).collect::<Vec<_>>()).await?;
-    let budget = app.scheduler.config().cpu_budget;
+    let budget = app.scheduler.cpu_budget();
     let free = budget.saturating_sub(app.scheduler.threads_busy());
+    let now = app.clock.now();
     let waiting = |job: &&Job| {
         let before = before.get(&job.row_id).copied().unwrap_or_default();
-        (job.row_id, Waiting::new(job.spec.threads.min(budget), free, before))
+        let not_before = job.not_before.filter(|time| *time > now);
+        (job.row_id, Waiting::new(job.blocked, not_before, job.spec.threads.min(budget), free, before))
     };
     Ok(queued.iter().map(waiting).collect())
 }
 
 #[cfg(test)]
 mod tests {
-    use super::Waiting;
+    use super::*;
 
     #[test]
     fn reasons_are_sentences() {
-        assert_eq!(Waiting::new(2, 1, 3).reason, "needs 2 threads, 1 free; 3 jobs before it");
-        assert_eq!(Waiting::new(1, 0, 0).reason, "needs 1 thread, 0 free");
+        assert_eq!(Waiting::new(0, None, 2, 1, 3).reason, "needs 2 threads, 1 free; 3 jobs before it");
+        assert_eq!(Waiting::new(0, None, 1, 0, 0).reason, "needs 1 thread, 0 free");
+        assert_eq!(Waiting::new(2, None, 1, 0, 0).reason, "comes after 2 jobs that have not succeeded");
+        let time = Some(Timestamp::from_second(1_800_000_000).unwrap());
+        assert_eq!(Waiting::new(0, time, 1, 0, 0).reason, "waits until 2027-01-15T08:00:00Z after a failed attempt");
     }
 }

@@ -43,6 +43,23 @@ pub(super) struct JobRequest {
     #[serde(default, deserialize_with = "json::optional_integer")]
     #[schema(minimum = -100, maximum = 100)]
     priority: Option<i64>,
+    /// Consecutive attempts that fail without progress after which the job has failed. Default: the limit of the server.
+    #[serde(default, deserialize_with = "json::optional_integer")]
+    #[schema(minimum = 1, maximum = 1000)]
+    max_attempts: Option<u32>,
+    /// Seconds that all attempts together may run; then the job has failed. Default: no limit.
+    #[serde(default, deserialize_with = "json::optional_integer")]
+    #[schema(minimum = 1, maximum = 31_622_400)]
+    timeout: Option<u64>,
+    /// Seconds between a failed attempt and the next one. They double with every further failure, up to an hour. Default: 0.
+    #[serde(default, deserialize_with = "json::optional_integer")]
+    #[schema(minimum = 0, maximum = 31_622_400)]
+    backoff: Option<u64>,
+    /// Ids of the jobs that must succeed before this one starts. When one of them is cancelled or deleted, this job is cancelled.
+    #[schema(value_type = Option<Vec<Uuid>>, max_items = 100)]
+    after: Option<Vec<String>>,
+    /// When training ends before all steps are done; the job then succeeds. Default: never.
+    stop: Option<EarlyStop>,
     /// Default: `qedgix`.
     algorithm: Option<Algorithm>,
     /// The configuration that `environment` and `training` start from; default: `practical`.
@@ -62,8 +79,58 @@ pub(super) struct JobRequest {
 
 impl From<JobRequest> for spec::JobRequest {
     fn from(request: JobRequest) -> Self {
-        let JobRequest { kind, name, labels, notes, threads, priority, algorithm, preset, environment, training, seed } = request;
-        Self { kind, name, labels, notes, threads, priority, algorithm, preset, environment, training, seed }
+        let JobRequest { kind, name, labels, notes, threads, priority, algorithm, preset, environment, training, seed, .. } = request;
+        let JobRequest { max_attempts, timeout, backoff, after, stop, .. } = request;
+        let stop = stop.map(Into::into);
+        Self {
+            kind,
+            name,
+            labels,
+            notes,
+            threads,
+            priority,
+            max_attempts,
+            timeout,
+            backoff,
+            after,
+            stop,
+            algorithm,
+            preset,
+            environment,
+            training,
+            seed,
+        }
+    }
+}
+
+/// Ends training as soon as one of its conditions holds. At least one is required.
+#[derive(Debug, Default, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields, remote = "Self")]
+pub(super) struct EarlyStop {
+    /// The metric that is observed.
+    #[schema(pattern = "^[A-Za-z0-9_/.-]{1,63}$", example = "eval/mean_aoi")]
+    metric: String,
+    /// A value is at most this.
+    at_most: Option<f64>,
+    /// A value is at least this.
+    at_least: Option<f64>,
+    /// This many values in a row are not better than the best before them.
+    #[serde(default, deserialize_with = "json::optional_integer")]
+    #[schema(minimum = 1, maximum = 1_000_000)]
+    patience: Option<u64>,
+}
+
+json::objects_only!(Serialize + EarlyStop);
+
+impl From<EarlyStop> for store::EarlyStop {
+    fn from(EarlyStop { metric, at_most, at_least, patience }: EarlyStop) -> Self {
+        Self { metric, at_most, at_least, patience }
+    }
+}
+
+impl From<store::EarlyStop> for EarlyStop {
+    fn from(store::EarlyStop { metric, at_most, at_least, patience }: store::EarlyStop) -> Self {
+        Self { metric, at_most, at_least, patience }
     }
 }
 
@@ -243,6 +310,20 @@ struct Progress {
 pub(super) struct Job {
     #[serde(flatten)]
     summary: JobSummary,
+    /// Null: the limit of the server.
+    #[schema(required = true)]
+    max_attempts: Option<u32>,
+    /// Seconds that all attempts together may run; null: no limit.
+    #[schema(required = true)]
+    timeout: Option<u64>,
+    /// Seconds between a failed attempt and the next one.
+    backoff: u64,
+    /// Jobs that must succeed before this one starts.
+    #[schema(value_type = Vec<Uuid>)]
+    after: Vec<JobId>,
+    /// When training ends before all steps are done; null: never.
+    #[schema(required = true)]
+    stop: Option<EarlyStop>,
     /// Null, like `training`, only if the specification is unreadable.
     #[schema(required = true)]
     environment: Option<EnvConfig>,
@@ -260,10 +341,12 @@ impl From<JobView> for Job {
     fn from(JobView { job, waiting, metrics }: JobView) -> Self {
         let decoded = job.spec.decode();
         let StoredSpec { kind, name, labels, threads, priority, algorithm, preset, seed, steps, document } = job.spec;
-        let (config, unreadable) = match decoded {
-            Ok(spec) => (Some(spec.config), None),
+        let (spec, unreadable) = match decoded {
+            Ok(spec) => (Some(spec), None),
             Err(reason) => (None, Some(UnreadableSpec { reason: reason.to_string(), document })),
         };
+        let limits = spec.as_ref().map(|spec| spec.limits).unwrap_or_default();
+        let (after, stop, config) = spec.map_or_else(Default::default, |spec| (spec.after, spec.stop, Some(spec.config)));
         let (environment, training) = config.map(|config| (config.environment, config.training)).unzip();
         let summary = JobSummary {
             id: job.id,
@@ -293,7 +376,16 @@ impl From<JobView> for Job {
             seed,
             unreadable,
         };
-        Self { summary, environment, training }
+        Self {
+            summary,
+            max_attempts: limits.max_attempts,
+            timeout: limits.timeout,
+            backoff: limits.backoff,
+            after,
+            stop: stop.map(Into::into),
+            environment,
+            training,
+        }
     }
 }
 
