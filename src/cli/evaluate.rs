@@ -6,14 +6,14 @@ use std::sync::Arc;
 use anyhow::{Context, ensure};
 use clap::Args;
 
-use super::comparison::{Comparison, PolicyEvaluation};
 use super::connect::ConnectArgs;
 use super::output::outln;
 use super::{act_client, ports, progress, report, run_args::all_cores, table};
 use crate::checkpoint::Checkpoint;
 use crate::env::EnvConfig;
 use crate::learner::{
-    Disturbance, LayoutList, LostUav, TracedEvaluation, Trajectory, evaluate_list, evaluate_traced, layout_list,
+    Comparison, Disturbance, LayoutList, LostUav, PolicyEvaluation, TracedEvaluation, Trajectory, evaluate_list, evaluate_traced,
+    layout_list,
 };
 use crate::policy::{Policy, baselines};
 use crate::serving::bundled;

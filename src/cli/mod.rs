@@ -4,7 +4,6 @@ mod act_client;
 mod backup;
 mod bench;
 mod client;
-mod comparison;
 mod connect;
 mod demo;
 mod evaluate;

@@ -4,11 +4,13 @@
 //! `WorkerService` protocol, so it can run on any machine.
 
 mod backfill;
+pub mod evaluation;
 mod executor;
 mod local;
 pub mod memory;
 mod scheduler;
 pub mod spec;
+pub mod sweep;
 pub mod worker;
 
 use std::collections::HashMap;
@@ -175,6 +177,12 @@ impl Scheduler {
         if let Some(running) = self.running().get(&job) {
             running.job_changed.notify_one();
         }
+        self.0.wake.notify_one();
+    }
+
+    /// Notifies the scheduler that the queue, or the states or pending actions of several jobs have changed.
+    pub fn all_jobs_changed(&self) {
+        self.running().values().for_each(|running| running.job_changed.notify_one());
         self.0.wake.notify_one();
     }
 

@@ -340,7 +340,7 @@ impl Scheduler {
             let ended = async {
                 self.0.store.store_log(lease, &text).await?;
                 let (max_attempts, now) = (self.0.config.max_attempts, self.0.clock.now());
-                self.0.store.end_attempt(EndedAttempt { lease, result, publish: None, max_attempts, now }).await
+                self.0.store.end_attempt(EndedAttempt { lease, result, publish: None, document: None, max_attempts, now }).await
             };
             match ended.await {
                 Ok(Some((job, _))) => {
@@ -357,8 +357,6 @@ impl Scheduler {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeMap;
-
     use futures::FutureExt;
     use jiff::Timestamp;
     use uuid::Uuid;
@@ -367,7 +365,7 @@ mod tests {
     use crate::clock::{Clock, ManualClock};
     use crate::draining::Draining;
     use crate::jobs::{Executor, SchedulerConfig};
-    use crate::store::{JobId, JobKind, JobSpec, NewJob, Store};
+    use crate::store::{JobId, JobSpec, NewJob, Store};
     use crate::train_config::{Algorithm, Preset, TrainConfig};
 
     /// Starts workers that run until they are killed.
@@ -389,7 +387,19 @@ mod tests {
         let config = TrainConfig::preset(Algorithm::Qmix, Preset::Practical);
         let spec = JobSpec::train(config);
         let id = JobId(Uuid::from_u128(1));
-        store.submit_job(NewJob { id, owner: None, any_name: false, spec, notes: String::new(), parent: None, now: clock.now(), idempotency: None }).await.unwrap();
+        store
+            .submit_job(NewJob {
+                id,
+                owner: None,
+                any_name: false,
+                spec,
+                notes: String::new(),
+                parent: None,
+                now: clock.now(),
+                idempotency: None,
+            })
+            .await
+            .unwrap();
         let config = SchedulerConfig { max_attempts: 1, ..SchedulerConfig::new(1) };
         let scheduler = Scheduler::open(store, config, Arc::new(Endless), clock, Draining::default()).await.unwrap();
         (dir, scheduler, id)

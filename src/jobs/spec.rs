@@ -7,6 +7,8 @@ use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 
+use super::evaluation::EvaluationRequest;
+use super::sweep::SweepRequest;
 use crate::invalid::{Invalid, in_range};
 use crate::store::{EarlyStop, Job, JobEdit, JobId, JobKind, JobLimits, JobSpec, is_metric_name};
 use crate::train_config::{Algorithm, Preset, TrainConfig, floats_to_integers};
@@ -60,6 +62,12 @@ pub struct JobRequest {
     /// Fields of the training configuration that replace those of the preset.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub training: Option<Map<String, Value>>,
+    /// What a job of the kind `evaluate` does.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub evaluation: Option<EvaluationRequest>,
+    /// What a job of the kind `sweep` varies.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sweep: Option<SweepRequest>,
     /// Seed of every random stream; default: 1.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub seed: Option<u64>,
@@ -89,9 +97,7 @@ impl JobRequest {
     /// The first field that is out of range, or the first unknown or mistyped field of `environment` and `training`.
     pub fn resolve(self, cpu_budget: usize) -> Result<JobSpec, Invalid> {
         let kind = self.kind.unwrap_or(JobKind::Train);
-        if kind != JobKind::Train {
-            return Err(Invalid::new("kind", kind, "train, the only kind that this version supports"));
-        }
+        self.check_kind(kind)?;
         let (threads, priority) = (self.threads.unwrap_or(1), self.priority.unwrap_or(0));
         if !(1..=cpu_budget).contains(&threads) {
             let expected = format!("a number from 1 to {cpu_budget}, the server's CPU budget");
@@ -114,9 +120,54 @@ impl JobRequest {
             fields.values_mut().for_each(floats_to_integers);
             fields
         });
+        let base = JobSpec {
+            kind,
+            name: self.name,
+            labels,
+            threads,
+            priority,
+            limits,
+            after,
+            stop: self.stop,
+            config: None,
+            evaluation: None,
+            sweep: None,
+            point: None,
+            work: 0,
+        };
+        if let Some(evaluation) = self.evaluation {
+            let evaluation = evaluation.resolve(&environment)?;
+            let work = evaluation.steps();
+            let document = serde_json::to_value(evaluation).expect("an evaluation is plain data");
+            return Ok(JobSpec { evaluation: Some(document), work, ..base });
+        }
         let (algorithm, preset) = (self.algorithm.unwrap_or_default(), self.preset.unwrap_or_default());
         let config = TrainConfig::resolve(algorithm, preset, &environment, &training, self.seed.unwrap_or(1))?;
-        Ok(JobSpec { kind, name: self.name, labels, threads, priority, limits, after, stop: self.stop, config })
+        Ok(JobSpec { config: Some(config), ..base })
+    }
+
+    /// Checks that the request has what its kind needs, and nothing that belongs to another kind.
+    fn check_kind(&self, kind: JobKind) -> Result<(), Invalid> {
+        let training = [
+            ("algorithm", self.algorithm.is_some()),
+            ("preset", self.preset.is_some()),
+            ("training", self.training.is_some()),
+            ("seed", self.seed.is_some()),
+            ("stop", self.stop.is_some()),
+        ];
+        let unwanted: &[(&str, bool)] = match kind {
+            JobKind::Train => &[("evaluation", self.evaluation.is_some()), ("sweep", self.sweep.is_some())],
+            JobKind::Evaluate if self.evaluation.is_none() => {
+                return Err(Invalid::missing("evaluation", "what a job of the kind evaluate does"));
+            }
+            JobKind::Evaluate => &training,
+            // Its jobs are checked one by one.
+            JobKind::Sweep => &[],
+        };
+        match unwanted.iter().find(|(_, given)| *given) {
+            Some((field, _)) => Err(Invalid::new(*field, "a value", format!("no value in a job of the kind {kind}"))),
+            None => Ok(()),
+        }
     }
 }
 
@@ -290,8 +341,8 @@ mod tests {
     fn defaults_are_filled_in() {
         let spec = resolve(json!({})).unwrap();
         assert_eq!((spec.kind, spec.threads, spec.priority), (JobKind::Train, 1, 0));
-        assert_eq!(spec.config.seed, 1);
-        assert_eq!(spec.config.environment.uavs, 3);
+        let config = spec.config.unwrap();
+        assert_eq!((config.seed, config.environment.uavs), (1, 3));
     }
 
     #[test]
@@ -301,7 +352,23 @@ mod tests {
             (json!({"algoritm": "qmix"}), "algoritm", true),
             (json!({"algorithm": "dqn"}), "algorithm", true),
             (json!({"kind": "dance"}), "kind", true),
-            (json!({"kind": "sweep"}), "kind", false),
+            (json!({"kind": "evaluate"}), "evaluation", false),
+            (json!({"evaluation": {"policies": ["sweep"]}}), "evaluation", false),
+            (json!({"kind": "evaluate", "evaluation": {"policies": ["sweep"]}, "seed": 1}), "seed", false),
+            (json!({"kind": "evaluate", "evaluation": {"policies": []}}), "evaluation.policies", false),
+            (json!({"kind": "evaluate", "evaluation": {"policies": ["sweep"], "layouts": "x"}}), "evaluation.layouts", false),
+            (json!({"kind": "evaluate", "evaluation": {"policies": ["sweep"], "episodes": 257}}), "evaluation.episodes", false),
+            (
+                json!({"kind": "evaluate", "evaluation": {"policies": ["sweep"], "lose": {"uav": 3, "slot": 0}}}),
+                "evaluation.lose.uav",
+                false,
+            ),
+            (json!({"kind": "evaluate", "evaluation": {"policies": "sweep"}}), "evaluation.policies", true),
+            (
+                json!({"kind": "evaluate", "environment": {"uavs": 0}, "evaluation": {"policies": ["a"]}}),
+                "environment.uavs",
+                false,
+            ),
             (json!({"environment": 3}), "environment", true),
             (json!({"environment": {"uvas": 3}}), "environment.uvas", true),
             (json!({"environment": {"uavs": "three"}}), "environment.uavs", true),
@@ -347,7 +414,7 @@ mod tests {
 
     #[test]
     fn seeds_are_exact() {
-        let config = resolve(json!({"seed": u64::MAX})).unwrap().config;
+        let config = resolve(json!({"seed": u64::MAX})).unwrap().config.unwrap();
         assert_eq!(serde_json::to_value(config).unwrap()["seed"], u64::MAX);
     }
 
@@ -355,7 +422,7 @@ mod tests {
     fn a_configuration_survives_json_to_the_bit() {
         // Numbers whose shortest decimal form has more than 2^53 units: the ones that hasty parsers round twice.
         let text = r#"{"environment": {"slots": 11, "speed": 0.09232400000000001}, "training": {"gamma": 0.9232400000000001}}"#;
-        let config = resolve(serde_json::from_str(text).unwrap()).unwrap().config;
+        let config = resolve(serde_json::from_str(text).unwrap()).unwrap().config.unwrap();
         assert_eq!(config.training.gamma, 0.923_240_000_000_000_1);
         assert_eq!(config.environment.reward_scale, Some(1.0 / 11.0));
         let again: TrainConfig = serde_json::from_str(&serde_json::to_string(&config).unwrap()).unwrap();

@@ -38,19 +38,20 @@ pub fn evaluate_list(
     Ok(parts?.concat())
 }
 
-/// As [`evaluate`], unless `stop` is set before the last slot: then `None`, within a slot.
+/// As [`evaluate`], under a disturbance, unless `stop` is set before the last slot: then `None`, within a slot.
 ///
 /// # Errors
 /// As [`evaluate`].
-pub(super) fn evaluate_until(
+pub fn evaluate_until(
     policy: &dyn Policy,
     env: &EnvConfig,
     seeds: &[u64],
     threads: usize,
+    disturbance: &Disturbance,
     stop: &AtomicBool,
 ) -> Result<Option<Vec<EpisodeMetrics>>, Invalid> {
     let observer = |_| StopObserver { stop, stopped: false };
-    let parts = run_parallel(policy, env, seeds, threads, &Disturbance::default(), observer)?;
+    let parts = run_parallel(policy, env, seeds, threads, disturbance, observer)?;
     let stopped = parts.iter().any(|(_, observer)| observer.stopped);
     Ok((!stopped).then(|| parts.into_iter().flat_map(|(metrics, _)| metrics).collect()))
 }

@@ -1,5 +1,6 @@
 //! Learning: replay, rollout, loss, update, training as an iterator of events, evaluation (docs/model.md, "Learner").
 
+mod comparison;
 mod disturbance;
 mod episodes;
 mod evaluation;
@@ -16,9 +17,10 @@ mod teacher;
 mod trainer;
 mod update;
 
+pub use comparison::{Comparison, Pair, PolicyEvaluation};
 pub use disturbance::{Disturbance, LostUav};
 pub use episodes::{Episodes, Symmetry};
-pub use evaluation::{TracedEvaluation, Trajectory, evaluate, evaluate_list, evaluate_traced};
+pub use evaluation::{TracedEvaluation, Trajectory, evaluate, evaluate_list, evaluate_traced, evaluate_until};
 pub use event::{Evaluation, Event, Iteration};
 pub use layouts::{LAYOUT_LISTS, LayoutList, layout_list};
 pub use loss::LossMetrics;

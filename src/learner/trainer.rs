@@ -19,7 +19,7 @@ use super::replay::{Replay, group_environment};
 use super::rollout::Rollout;
 use super::snapshot::{self, SnapshotError};
 use super::state::{Counters, Phase, RunState};
-use super::{Episodes, Evaluation, Event, Iteration, Learner, TrainConfig, Training, layout_list};
+use super::{Disturbance, Episodes, Evaluation, Event, Iteration, Learner, TrainConfig, Training, layout_list};
 use crate::checkpoint::{self, Checkpoint};
 use crate::env::EpisodeMetrics;
 use crate::invalid::Invalid;
@@ -159,7 +159,7 @@ impl Trainer {
         let agent_parameters = parameters[..self.learner.agent().layout().len()].to_vec();
         let policy = LearnedPolicy::new(config.agent(), config.dims(), agent_parameters)
             .expect("the parameters have the length of the agent's layout");
-        let metrics = evaluate_until(&policy, &config.environment, part, self.threads, &self.stop);
+        let metrics = evaluate_until(&policy, &config.environment, part, self.threads, &Disturbance::default(), &self.stop);
         run.layouts.extend(metrics.expect("an agent fits its environment")?);
         let env_steps = run.counters.env_steps;
         if run.layouts.len() < seeds.len() {

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::{App, Error};
+use crate::invalid::in_range;
 use crate::store::JobState;
 
 /// If the database takes longer to answer, it counts as unavailable.

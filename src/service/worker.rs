@@ -1,6 +1,7 @@
 //! The use cases of workers: fetch a task, report metrics, upload snapshots and checkpoints, receive directives, finish.
 //! Every call carries the token of its attempt.
 
+use serde_json::Value;
 use sha2::{Digest, Sha256};
 use uuid::Uuid;
 
@@ -8,6 +9,7 @@ use super::policies::{self, Publisher};
 use super::{App, Error};
 use crate::error_code::ErrorCode;
 use crate::invalid::{Invalid, in_range};
+use crate::jobs::evaluation::EvaluationSpec;
 use crate::jobs::{Directive, equal_secrets, token_digest};
 use crate::store::{
     EarlyStop, EndedAttempt, Job, JobId, Lease, Metric, NewCheckpoint, PartialSnapshot, Snapshot, WorkerResult, is_metric_name,
@@ -20,6 +22,8 @@ pub const MAX_CHUNK: usize = 1 << 20;
 const MAX_CHECKPOINT: u64 = 256 << 20;
 /// Maximum number of metrics in one report.
 const MAX_METRICS: usize = 10_000;
+/// Maximum size of the result of a job, in bytes.
+const MAX_RESULT: usize = 1 << 20;
 /// Most values that an early stop looks back to. Workers report fewer.
 const MAX_OBSERVED: u32 = 50_000;
 
@@ -37,8 +41,10 @@ pub struct Credentials {
 /// What a worker needs to run an attempt.
 #[derive(Clone, Debug)]
 pub struct AttemptTask {
-    /// The training configuration.
-    pub config: TrainConfig,
+    /// The training configuration of a job that trains.
+    pub config: Option<TrainConfig>,
+    /// What a job evaluates.
+    pub evaluation: Option<Value>,
     /// Threads that the worker may use.
     pub threads: usize,
     /// The snapshot to resume from.
@@ -93,6 +99,7 @@ pub async fn fetch(app: &App, lease: Lease) -> Result<AttemptTask, Error> {
     Ok(AttemptTask {
         threads: job.spec.threads.min(app.scheduler.cpu_budget()),
         config: spec.config,
+        evaluation: spec.evaluation,
         snapshot,
         snapshot_every: app.scheduler.config().snapshot_every,
         stop: spec.stop,
@@ -121,6 +128,20 @@ pub async fn snapshot(app: &App, lease: Lease) -> Result<Snapshot, Error> {
 /// [`Error::Internal`] when the database fails.
 pub async fn snapshot_chunk(app: &App, snapshot: &Snapshot, index: u32) -> Result<Option<Vec<u8>>, Error> {
     Ok(app.store.snapshot_chunk(snapshot.id, index).await?)
+}
+
+/// The checkpoint of a policy that the job evaluates, as safetensors.
+///
+/// # Errors
+/// [`Error::NotFound`] when the version is deleted. [`Error::Invalid`] when the job does not evaluate it.
+pub async fn policy(app: &App, lease: Lease, name: &str) -> Result<Vec<u8>, Error> {
+    let job = app.store.job(lease.job_id).await?.ok_or_else(|| attempt_ended(lease))?;
+    let evaluation = job.spec.decode().map_err(Error::internal)?.evaluation;
+    let evaluation: Option<EvaluationSpec> = evaluation.map(serde_json::from_value).transpose().map_err(Error::internal)?;
+    if !evaluation.is_some_and(|evaluation| evaluation.policies.iter().any(|policy| policy == name)) {
+        return Err(Invalid::new("policy", format!("{name:?}"), "a policy that this job evaluates").into());
+    }
+    Ok(policies::export(app, &name.parse()?).await?.1)
 }
 
 /// Stores metrics and progress in one transaction.
@@ -158,22 +179,29 @@ pub async fn heartbeat(app: &App, lease: Lease) -> Result<Directive, Error> {
 ///
 /// # Errors
 /// [`Error::Precondition`] when the attempt has ended, [`Error::Internal`] when the database fails.
-pub async fn finish(app: &App, lease: Lease, result: WorkerResult) -> Result<(), Error> {
+pub async fn finish(app: &App, lease: Lease, result: WorkerResult, document: Option<String>) -> Result<(), Error> {
+    if let Some(document) = &document {
+        in_range("result", document.len(), 0..=MAX_RESULT)?;
+        if !serde_json::from_str::<Value>(document).is_ok_and(|document| document.is_object()) {
+            return Err(Invalid::new("result", document, "a JSON object").into());
+        }
+    }
+    let document = document.as_deref();
     let job = match result {
         WorkerResult::Succeeded => match new_version(app, lease).await {
             Ok(Some(version)) => policies::publish_and_end(app, version, lease).await?,
-            Ok(None) => end(app, lease, &WorkerResult::Succeeded).await?,
+            Ok(None) => end(app, lease, &WorkerResult::Succeeded, document).await?,
             // Another attempt would fail with the same checkpoint.
             Err(Error::Invalid(e)) => {
                 let reason = format!("the policy cannot be published: {e}");
-                end(app, lease, &WorkerResult::Failed { reason, permanent: true }).await?
+                end(app, lease, &WorkerResult::Failed { reason, permanent: true }, None).await?
             }
             Err(e) => return Err(e),
         },
-        WorkerResult::Stopped => end(app, lease, &WorkerResult::Stopped).await?,
+        WorkerResult::Stopped => end(app, lease, &WorkerResult::Stopped, None).await?,
         WorkerResult::Failed { reason, permanent } => {
             let reason = reason.chars().take(2000).collect();
-            end(app, lease, &WorkerResult::Failed { reason, permanent }).await?
+            end(app, lease, &WorkerResult::Failed { reason, permanent }, None).await?
         }
     };
     let job = job.ok_or_else(|| attempt_ended(lease))?;
@@ -183,9 +211,9 @@ pub async fn finish(app: &App, lease: Lease, result: WorkerResult) -> Result<(),
 }
 
 /// Ends the attempt without publishing anything.
-async fn end(app: &App, lease: Lease, result: &WorkerResult) -> Result<Option<Job>, Error> {
+async fn end(app: &App, lease: Lease, result: &WorkerResult, document: Option<&str>) -> Result<Option<Job>, Error> {
     let max_attempts = app.scheduler.config().max_attempts;
-    let ended = EndedAttempt { lease, result, publish: None, max_attempts, now: app.clock.now() };
+    let ended = EndedAttempt { lease, result, publish: None, document, max_attempts, now: app.clock.now() };
     Ok(app.store.end_attempt(ended).await?.map(|(job, _)| job))
 }
 

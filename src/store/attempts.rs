@@ -5,9 +5,9 @@ use jiff::Timestamp;
 use sqlx::SqliteConnection;
 
 use super::jobs::find;
-use super::transitions::{Transition, transition};
 use super::named_enum::named_enum;
 use super::policies::{NewPolicyVersion, PublishedPolicy, may_publish, publish};
+use super::transitions::{Transition, transition};
 use super::{Job, JobId, JobState, PendingAction, Result, Store, corrupt, timestamp};
 
 named_enum! {
@@ -74,6 +74,8 @@ pub struct EndedAttempt<'a> {
     pub result: &'a WorkerResult,
     /// The policy to publish if the job succeeds, in the same transaction.
     pub publish: Option<NewPolicyVersion<'a>>,
+    /// The result of a job that succeeds, as JSON.
+    pub document: Option<&'a str>,
     /// Consecutive attempts that fail without progress after which the job has failed.
     pub max_attempts: u32,
     /// When it ended.
@@ -121,7 +123,7 @@ pub(super) async fn is_active(db: &mut SqliteConnection, lease: Lease) -> Result
 /// Ends an attempt and changes the state of its job; publishes the policy of a job that succeeds. Does nothing if the attempt
 /// has already ended.
 async fn end(db: &mut SqliteConnection, ended: EndedAttempt<'_>) -> Result<Option<(Job, Option<PublishedPolicy>)>> {
-    let EndedAttempt { lease, result, publish: policy, max_attempts, now } = ended;
+    let EndedAttempt { lease, result, publish: policy, document, max_attempts, now } = ended;
     if !is_active(db, lease).await? {
         return Ok(None);
     }
@@ -178,10 +180,17 @@ async fn end(db: &mut SqliteConnection, ended: EndedAttempt<'_>) -> Result<Optio
                ran = ran + (SELECT max(ended_at - started_at, 0) FROM attempts WHERE job = ?1 AND number = ?4) WHERE number = ?1";
     sqlx::query(sql).bind(lease.job_row).bind(failed).bind(name).bind(lease.attempt).execute(&mut *db).await?;
     transition(db, Transition { job: lease.job_row, to: state, attempt: lease.attempt, reason, now }).await?;
+    if let Some(document) = document.filter(|_| state == JobState::Succeeded) {
+        sqlx::query("UPDATE jobs SET result = ? WHERE number = ?").bind(document).bind(lease.job_row).execute(&mut *db).await?;
+    }
     let delay = limits.delay(job.consecutive_failures + 1);
     if outcome == AttemptOutcome::Failed && state == JobState::Queued && delay > 0 {
         let not_before = now.as_millisecond().saturating_add_unsigned(delay.saturating_mul(1000));
-        sqlx::query("UPDATE jobs SET not_before = ? WHERE number = ?").bind(not_before).bind(lease.job_row).execute(&mut *db).await?;
+        sqlx::query("UPDATE jobs SET not_before = ? WHERE number = ?")
+            .bind(not_before)
+            .bind(lease.job_row)
+            .execute(&mut *db)
+            .await?;
     }
     Ok(find(db, lease.job_id).await?.map(|job| (job, published)))
 }
@@ -258,7 +267,14 @@ impl Store {
             };
             let lease = Lease { job_id: id, job_row: job, attempt: attempt as u32 };
             // A stopped attempt is not a failure, so the limit has no effect.
-            let ended = EndedAttempt { lease, result: &WorkerResult::Stopped, publish: None, max_attempts: u32::MAX, now };
+            let ended = EndedAttempt {
+                lease,
+                result: &WorkerResult::Stopped,
+                publish: None,
+                document: None,
+                max_attempts: u32::MAX,
+                now,
+            };
             jobs.extend(end(&mut tx, ended).await?.map(|(job, _)| job));
         }
         sqlx::query("DELETE FROM snapshots WHERE sha256 IS NULL").execute(&mut *tx).await?;

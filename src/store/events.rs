@@ -74,7 +74,7 @@ impl Store {
 
     /// Notifies all listeners: events of several jobs were committed.
     pub(super) fn notify_all(&self) {
-        self.notifier.0.iter().for_each(|channel| drop(channel.send_replace(())));
+        self.notifier.0.iter().for_each(|channel| channel.send_replace(()));
     }
 
     /// A receiver that changes whenever an event of the job with row id `job` was committed, and sometimes without one.

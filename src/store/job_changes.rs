@@ -6,8 +6,10 @@ use jiff::Timestamp;
 use sqlx::SqliteConnection;
 
 use super::jobs::{find, get_existing};
-use super::transitions::{Transition, release_dependents, transition};
 use super::submission::set_labels;
+use super::sweeps::{change_jobs, is_sweep};
+use super::transitions::{Transition, release_dependents, transition};
+use super::writes::WriteTransaction;
 use super::{Job, JobId, JobState, PendingAction, Result, Store, corrupt};
 
 /// What a caller changes of a job; what is absent stays.
@@ -62,6 +64,9 @@ impl Store {
             tx.abandon().await?;
             return Ok(ActionResult::NotFound);
         };
+        if is_sweep(&job) && action != JobAction::Delete {
+            return self.change_sweep(tx, job, action, now).await;
+        }
         match (action, job.state, job.pending_action) {
             (JobAction::Cancel, Cancelled, _)
             | (JobAction::Cancel, Running, Some(PendingAction::Cancel))
@@ -84,6 +89,7 @@ impl Store {
             (JobAction::Pause, Running, None) => set_pending_action(&mut tx, &job, PendingAction::Pause).await?,
             (JobAction::Delete, state, _) if state.ended() => {
                 release_dependents(&mut tx, job.row_id, state == Succeeded, now).await?;
+                sqlx::query("DELETE FROM jobs WHERE parent = ?").bind(id.to_string()).execute(&mut *tx).await?;
                 sqlx::query("DELETE FROM jobs WHERE number = ?").bind(job.row_id).execute(&mut *tx).await?;
                 tx.commit().await?;
                 self.notify_all();
@@ -98,6 +104,32 @@ impl Store {
         tx.commit().await?;
         self.notify_all();
         Ok(ActionResult::Accepted(Box::new(job)))
+    }
+
+    /// Applies `action` to the jobs of a sweep, whose state follows.
+    async fn change_sweep(
+        &self,
+        mut tx: WriteTransaction,
+        sweep: Job,
+        action: JobAction,
+        now: Timestamp,
+    ) -> Result<ActionResult> {
+        let changed = change_jobs(&mut tx, &sweep, action, now).await?;
+        // Where nothing is left to do, the sweep has the state that was asked for, or one that does not allow the action.
+        let done = matches!(
+            (action, sweep.state),
+            (JobAction::Cancel, JobState::Cancelled)
+                | (JobAction::Pause, JobState::Paused)
+                | (JobAction::Resume, JobState::Running)
+        );
+        if !changed && !done {
+            tx.abandon().await?;
+            return Ok(ActionResult::WrongState(Box::new(sweep)));
+        }
+        let sweep = get_existing(&mut tx, sweep.id).await?;
+        tx.commit().await?;
+        self.notify_all();
+        Ok(ActionResult::Accepted(Box::new(sweep)))
     }
 
     /// Edits what people choose of a job, in any state. Returns the job after it, or `None` if there is no such job.

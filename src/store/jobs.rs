@@ -213,6 +213,15 @@ impl Store {
         find(&mut *self.read.acquire().await?, id).await
     }
 
+    /// The result of the job `id`, as JSON.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn job_result(&self, id: JobId) -> Result<Option<String>> {
+        let query = sqlx::query_scalar("SELECT result FROM jobs WHERE id = ?").bind(id.to_string());
+        Ok(query.fetch_optional(&self.read).await?.flatten())
+    }
+
     /// The number of jobs in each state.
     ///
     /// # Errors

@@ -35,7 +35,13 @@ impl MetricSummary {
     /// Adds a later summary of the metric `name`. The first of equal values is the best.
     fn add(&mut self, name: &str, next: &Self) {
         let better = match (self.best, next.best) {
-            (Some(best), Some(next)) => if larger_is_better(name) { next > best } else { next < best },
+            (Some(best), Some(next)) => {
+                if larger_is_better(name) {
+                    next > best
+                } else {
+                    next < best
+                }
+            }
             (None, Some(_)) => true,
             (_, None) => false,
         };

@@ -37,6 +37,7 @@ mod snapshots;
 mod space;
 mod specs;
 mod submission;
+mod sweeps;
 mod transitions;
 mod upkeep;
 mod writes;

@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use super::JobId;
 use super::named_enum::named_enum;
@@ -43,8 +44,21 @@ pub struct JobSpec {
     /// When training ends before all steps are done; `None`: never.
     #[serde(default)]
     pub stop: Option<EarlyStop>,
-    /// The complete training configuration.
-    pub config: TrainConfig,
+    /// The complete training configuration of a job that trains.
+    #[serde(default)]
+    pub config: Option<TrainConfig>,
+    /// What a job evaluates, as a document that the store does not read.
+    #[serde(default)]
+    pub evaluation: Option<Value>,
+    /// What a sweep varies, as a document that the store does not read.
+    #[serde(default)]
+    pub sweep: Option<Value>,
+    /// Number of the combination of its sweep that the job has, from 0.
+    #[serde(default)]
+    pub point: Option<u64>,
+    /// The amount of work of a job that does not train, in steps of its progress.
+    #[serde(default)]
+    pub work: u64,
 }
 
 impl JobSpec {
@@ -59,7 +73,11 @@ impl JobSpec {
             limits: JobLimits::default(),
             after: Vec::new(),
             stop: None,
-            config,
+            config: Some(config),
+            evaluation: None,
+            sweep: None,
+            point: None,
+            work: 0,
         }
     }
 }

@@ -7,8 +7,8 @@ use serde::Serialize;
 use sqlx::SqliteConnection;
 
 use super::jobs::{find, get_existing};
-use super::transitions::{Transition, count_blockers, transition};
 use super::specs::JobSpec;
+use super::transitions::{Transition, count_blockers, transition};
 use super::{Job, JobId, JobState, Result, Store, corrupt};
 
 /// A job to submit.
@@ -50,7 +50,7 @@ pub enum SubmitResult {
     Conflict,
 }
 
-async fn find_submitted(
+pub(super) async fn find_submitted(
     db: &mut SqliteConnection,
     owner: Option<&str>,
     key: &str,
@@ -94,10 +94,10 @@ impl Store {
     }
 }
 
-async fn insert(tx: &mut SqliteConnection, new: &NewJob) -> Result<Job> {
+pub(super) async fn insert(tx: &mut SqliteConnection, new: &NewJob) -> Result<Job> {
     let spec = serde_json::to_string(&new.spec).map_err(|e| corrupt("job", new.id, e))?;
     let now = new.now.as_millisecond();
-    let NewJob { id, owner, any_name, spec: JobSpec { kind, name, labels, threads, priority, config, .. }, .. } = new;
+    let NewJob { id, owner, any_name, spec: JobSpec { kind, name, labels, threads, priority, config, work, .. }, .. } = new;
     let labels_document = serde_json::to_string(labels).map_err(|e| corrupt("job", id, e))?;
     let sql = "INSERT INTO jobs
                (id, owner, any_name, state, notes, parent, spec, threads, priority, created_at, kind, name, labels, algorithm,
@@ -116,10 +116,10 @@ async fn insert(tx: &mut SqliteConnection, new: &NewJob) -> Result<Job> {
         .bind(kind.as_str())
         .bind(name)
         .bind(labels_document)
-        .bind(text_of(&config.algorithm))
-        .bind(text_of(&config.preset))
-        .bind(config.seed.to_string())
-        .bind(config.training.steps as i64)
+        .bind(config.as_ref().and_then(|config| text_of(&config.algorithm)))
+        .bind(config.as_ref().and_then(|config| text_of(&config.preset)))
+        .bind(config.as_ref().map(|config| config.seed.to_string()))
+        .bind(config.as_ref().map_or(*work, |config| config.training.steps) as i64)
         .execute(&mut *tx)
         .await?
         .last_insert_rowid();
@@ -151,4 +151,3 @@ pub(super) async fn set_labels(db: &mut SqliteConnection, job: i64, labels: &BTr
 pub(super) fn text_of(value: &impl Serialize) -> Option<String> {
     serde_json::to_value(value).ok()?.as_str().map(str::to_owned)
 }
-

@@ -22,9 +22,9 @@ pub(super) async fn transition(db: &mut SqliteConnection, t: Transition<'_>) -> 
     let started = (t.to == JobState::Running).then_some(now);
     let state = t.to.as_str();
     let sql = "UPDATE jobs SET state = ?2, wanted = NULL, reason = ?3, not_before = NULL, ended_at = ?4, started_at = coalesce(started_at, ?5),
-               seq = seq + 1 WHERE number = ?1 RETURNING seq";
-    let update = sqlx::query_scalar(sql).bind(t.job).bind(state).bind(t.reason).bind(ended).bind(started);
-    let seq: i64 = update.fetch_one(&mut *db).await?;
+               seq = seq + 1 WHERE number = ?1 RETURNING seq, parent";
+    let update = sqlx::query_as(sql).bind(t.job).bind(state).bind(t.reason).bind(ended).bind(started);
+    let (seq, parent): (i64, Option<String>) = update.fetch_one(&mut *db).await?;
     let sql = "INSERT INTO events (job, at, state, attempt, reason, seq) VALUES (?, ?, ?, ?, ?, ?)";
     let insert = sqlx::query(sql).bind(t.job).bind(now).bind(state).bind(t.attempt).bind(t.reason).bind(seq);
     insert.execute(&mut *db).await?;
@@ -32,7 +32,43 @@ pub(super) async fn transition(db: &mut SqliteConnection, t: Transition<'_>) -> 
         sqlx::query("DELETE FROM snapshots WHERE job = ?").bind(t.job).execute(&mut *db).await?;
         release_dependents(db, t.job, t.to == JobState::Succeeded, t.now).await?;
     }
+    // The first event of a job of a sweep comes with the sweep itself.
+    if let Some(parent) = parent.filter(|_| seq > 1) {
+        follow_jobs(db, &parent, t.now).await?;
+    }
     Ok(())
+}
+
+/// Moves a sweep to the state that follows from the states of its jobs.
+async fn follow_jobs(db: &mut SqliteConnection, sweep: &str, now: Timestamp) -> Result<()> {
+    let sql = "SELECT number, state FROM jobs WHERE id = ?";
+    let found: Option<(i64, String)> = sqlx::query_as(sql).bind(sweep).fetch_optional(&mut *db).await?;
+    // A sweep that is being deleted.
+    let Some((number, state)) = found else { return Ok(()) };
+    let sql = "SELECT state, count(*), sum(step) FROM jobs WHERE parent = ? GROUP BY state";
+    let states: Vec<(String, i64, i64)> = sqlx::query_as(sql).bind(sweep).fetch_all(&mut *db).await?;
+    let count = |state: JobState| states.iter().filter(|row| row.0 == state.as_str()).map(|row| row.1).sum::<i64>();
+    let all: i64 = states.iter().map(|row| row.1).sum();
+    let step = states.iter().fold(0_i64, |sum, row| sum.saturating_add(row.2));
+    sqlx::query("UPDATE jobs SET step = ? WHERE number = ?").bind(step).bind(number).execute(&mut *db).await?;
+    let failed = count(JobState::Failed);
+    let to = if count(JobState::Queued) + count(JobState::Running) > 0 {
+        JobState::Running
+    } else if count(JobState::Paused) > 0 {
+        JobState::Paused
+    } else if failed > 0 {
+        JobState::Failed
+    } else if count(JobState::Cancelled) > 0 {
+        JobState::Cancelled
+    } else {
+        JobState::Succeeded
+    };
+    if to.as_str() == state {
+        return Ok(());
+    }
+    let reason = format!("{failed} of {all} jobs failed");
+    let reason = Some(reason.as_str()).filter(|_| to == JobState::Failed);
+    Box::pin(transition(db, Transition { job: number, to, attempt: 0, reason, now })).await
 }
 
 /// Counts the jobs that must succeed before `job` can start.

@@ -240,7 +240,12 @@ async fn many_jobs_are_listed() {
             let list = JobList { filter: filter.clone(), order, after: None, limit: 100, max_bytes: 1 << 20 };
             let begin = Instant::now();
             let (listed, _) = store.jobs(&list).await.unwrap();
-            println!("{:?} by {by:?}: {} jobs in {:?}", (&filter.labels, &filter.algorithm, &filter.name), listed.len(), begin.elapsed());
+            println!(
+                "{:?} by {by:?}: {} jobs in {:?}",
+                (&filter.labels, &filter.algorithm, &filter.name),
+                listed.len(),
+                begin.elapsed()
+            );
             let sorted = listed.windows(2).all(|pair| match by {
                 JobSort::Name => pair[0].job.spec.name >= pair[1].job.spec.name,
                 _ => pair[0].job.row_id > pair[1].job.row_id,

@@ -4,6 +4,7 @@ mod command_line;
 mod events;
 mod finding;
 mod harness;
+mod kinds;
 mod lifecycle;
 #[path = "../process/mod.rs"]
 mod process;

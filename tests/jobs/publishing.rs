@@ -24,7 +24,7 @@ fn success(lease: Lease, digest: &str) -> EndedAttempt<'_> {
     let now = Timestamp::UNIX_EPOCH;
     let (name, checkpoint, info, any_name) = ("mine", b"weights", "{}", false);
     let new = NewPolicyVersion { name, digest, checkpoint, info, now, alias: None, by: None, owner: None, any_name };
-    EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: Some(new), max_attempts: 3, now }
+    EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: Some(new), document: None, max_attempts: 3, now }
 }
 
 #[tokio::test]

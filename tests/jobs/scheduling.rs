@@ -12,7 +12,7 @@ use tonic::Code;
 use super::harness::{Server, TIMEOUT, Worker, expect, named, signed, tiny, with, within};
 
 async fn finish(server: &Server, worker: &Worker, outcome: v1::Outcome) {
-    let request = v1::FinishRequest { outcome: outcome.into(), reason: "by the test".into(), permanent: false };
+    let request = v1::FinishRequest { outcome: outcome.into(), reason: "by the test".into(), ..Default::default() };
     let request = signed(&worker.launch, &worker.launch.token, request);
     server.worker_client().await.finish(request).await.unwrap();
 }

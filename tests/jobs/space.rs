@@ -18,7 +18,16 @@ const NOW: Timestamp = Timestamp::UNIX_EPOCH;
 async fn running(store: &Store) -> Lease {
     let config = TrainConfig::preset(Algorithm::Qmix, Preset::Practical);
     let spec = JobSpec::train(config);
-    let new = NewJob { id: JobId(uuid::Uuid::now_v7()), owner: None, any_name: false, spec, notes: String::new(), parent: None, now: NOW, idempotency: None };
+    let new = NewJob {
+        id: JobId(uuid::Uuid::now_v7()),
+        owner: None,
+        any_name: false,
+        spec,
+        notes: String::new(),
+        parent: None,
+        now: NOW,
+        idempotency: None,
+    };
     let SubmitResult::Created(job) = store.submit_job(new).await.unwrap() else { panic!("a new job") };
     store.begin_attempt(job.id, [0; 32], NOW).await.unwrap().unwrap()
 }
@@ -31,7 +40,8 @@ pub async fn running_job(dir: &Path) -> (Store, Lease) {
 }
 
 async fn end(store: &Store, lease: Lease) {
-    let ended = EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: None, max_attempts: 3, now: NOW };
+    let ended =
+        EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: None, document: None, max_attempts: 3, now: NOW };
     store.end_attempt(ended).await.unwrap().unwrap();
 }
 

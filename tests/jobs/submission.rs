@@ -52,6 +52,7 @@ async fn invalid_requests_return_the_documented_errors() {
         ("{\"threads\": \"two\"}", 422, "invalid_schema"),
         ("{\"threads\": 3}", 400, "invalid_argument"),
         ("{\"kind\": \"sweep\"}", 400, "invalid_argument"),
+        ("{\"kind\": \"evaluate\", \"evaluation\": {\"policies\": 3}}", 422, "invalid_schema"),
         ("{\"name\": \"random\"}", 400, "invalid_argument"),
         ("{\"environment\": {\"uavs\": 0}}", 400, "invalid_argument"),
     ];

@@ -108,13 +108,22 @@ async fn a_checkpoint_of_a_job_is_published_by_its_id() {
     let (mine, now) = (numbered(5), Timestamp::UNIX_EPOCH);
     let config = mine.config().clone();
     let spec = JobSpec::train(config);
-    let new = NewJob { id: JobId(uuid::Uuid::from_u128(7)), owner: None, any_name: false, spec, notes: String::new(), parent: None, now, idempotency: None };
+    let new = NewJob {
+        id: JobId(uuid::Uuid::from_u128(7)),
+        owner: None,
+        any_name: false,
+        spec,
+        notes: String::new(),
+        parent: None,
+        now,
+        idempotency: None,
+    };
     let SubmitResult::Created(job) = store.submit_job(new).await.unwrap() else { panic!("a new job") };
     let lease = store.begin_attempt(job.id, [0; 32], now).await.unwrap().unwrap();
     let bytes = mine.to_bytes();
     let new = NewCheckpoint { kind: CheckpointKind::Best, step: 1234, sha256: digest(&bytes), metrics: BTreeMap::new(), bytes };
     let id = store.store_checkpoint(lease, new, now).await.unwrap().unwrap();
-    let ended = EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: None, max_attempts: 1, now };
+    let ended = EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: None, document: None, max_attempts: 1, now };
     store.end_attempt(ended).await.unwrap().unwrap();
     drop(store);
 

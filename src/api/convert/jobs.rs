@@ -9,10 +9,9 @@ use crate::invalid::Invalid;
 use crate::jobs::Directive;
 use crate::service::jobs::{JobView, ListRequest, Waiting};
 use crate::store::{
-    Attempt, Checkpoint, CheckpointKind, JobEvent, JobEventKind, JobKind, JobSpec, JobState, Metric, MetricRow, MetricSummary, NewCheckpoint, StoredSpec,
-    WorkerResult,
+    Attempt, Checkpoint, CheckpointKind, JobEvent, JobEventKind, JobKind, JobSpec, JobState, Metric, MetricRow, MetricSummary,
+    NewCheckpoint, StoredSpec, WorkerResult,
 };
-use crate::train_config::TrainConfig;
 use crate::wire::v1;
 
 impl From<JobState> for v1::JobState {
@@ -36,7 +35,8 @@ pub fn list_request(request: v1::ListJobsRequest) -> Result<ListRequest, Invalid
     let v1::ListJobsRequest { state, kind, algorithm, name, labels, parent, created_after, created_before, .. } = request;
     let v1::ListJobsRequest { sort, metrics, .. } = request;
     let known = |kind: &String| {
-        JobKind::parse(kind).ok_or_else(|| Invalid::new("kind", format!("{kind:?}"), format!("one of {}", JobKind::NAMES.join(", "))))
+        JobKind::parse(kind)
+            .ok_or_else(|| Invalid::new("kind", format!("{kind:?}"), format!("one of {}", JobKind::NAMES.join(", "))))
     };
     let algorithm = Some(algorithm).filter(|algorithm| !algorithm.is_empty());
     let read = |name: String| serde_json::from_value(name.into()).map_err(|e| Invalid::from_parser("algorithm", &e));
@@ -80,11 +80,12 @@ pub fn job_summary(view: JobView) -> v1::Job {
 
 impl From<JobView> for v1::Job {
     fn from(view: JobView) -> Self {
-        job_message(view, |JobSpec { limits, after, stop, config, .. }| {
-            let TrainConfig { environment, training, .. } = config;
+        job_message(view, |JobSpec { limits, after, stop, config, evaluation, sweep, point, .. }| {
+            let (environment, training) = config.as_ref().map(|config| (&config.environment, &config.training)).unzip();
             json!({
                 "environment": environment, "training": training, "max_attempts": limits.max_attempts, "timeout": limits.timeout,
-                "backoff": limits.backoff, "after": after, "stop": stop,
+                "backoff": limits.backoff, "after": after, "stop": stop, "evaluation": evaluation, "sweep": sweep,
+                "point": point,
             })
         })
     }

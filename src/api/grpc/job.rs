@@ -13,8 +13,8 @@ use crate::api::convert::jobs::{job_summary, list_request};
 use crate::api::convert::structs::from_struct;
 use crate::api::errors::stream_status;
 use crate::jobs::spec::{EditRequest, JobRequest};
-use crate::service::keys::Caller;
 use crate::service::jobs::LogLines;
+use crate::service::keys::Caller;
 use crate::service::worker::MAX_CHUNK;
 use crate::service::{App, Error, PageRequest, checkpoints, events, jobs};
 use crate::store::JobAction;
@@ -124,6 +124,12 @@ impl JobService for Service {
         let lines = lines.and_then(move |lines| ready(caller.check(clock.now()).map(|()| lines)));
         let output = |LogLines { attempt, text }| v1::JobOutput { attempt, text };
         Ok(Response::new(lines.map_ok(output).map_err(stream_status).boxed()))
+    }
+
+    async fn get_job_result(&self, request: Request<v1::GetJobResultRequest>) -> GrpcResult<v1::GetJobResultResponse> {
+        let caller = caller(request.extensions());
+        let result = jobs::result(&self.0, &caller, &request.into_inner().id).await?.to_string();
+        Ok(Response::new(v1::GetJobResultResponse { result }))
     }
 
     async fn list_checkpoints(&self, request: Request<v1::ListCheckpointsRequest>) -> GrpcResult<v1::ListCheckpointsResponse> {

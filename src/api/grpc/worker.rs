@@ -3,13 +3,15 @@
 use std::pin::Pin;
 use std::sync::Arc;
 
+use bytes::Bytes;
 use futures::Stream;
+use serde::Serialize;
 use tonic::metadata::MetadataMap;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::{GrpcResult, upload};
 use crate::api::errors::stream_status;
-use crate::service::worker::{self, CheckpointUpload, Credentials, SnapshotUpload, UploadHeader};
+use crate::service::worker::{self, CheckpointUpload, Credentials, MAX_CHUNK, SnapshotUpload, UploadHeader};
 use crate::service::{App, Error};
 use crate::store::{Lease, Metric};
 use crate::wire::v1;
@@ -36,17 +38,23 @@ impl Service {
     }
 }
 
+/// A document as JSON text; empty: none.
+fn json_text(document: Option<&impl Serialize>) -> Result<String, Error> {
+    document.map_or_else(|| Ok(String::new()), |document| serde_json::to_string(document).map_err(Error::internal))
+}
+
 #[tonic::async_trait]
 impl WorkerService for Service {
     async fn fetch(&self, request: Request<v1::FetchRequest>) -> GrpcResult<v1::FetchResponse> {
         let lease = self.lease(request.metadata()).await?;
         let task = worker::fetch(&self.0, lease).await?;
         Ok(Response::new(v1::FetchResponse {
-            config: serde_json::to_string(&task.config).map_err(Error::internal)?,
+            config: json_text(task.config.as_ref())?,
+            evaluation: json_text(task.evaluation.as_ref())?,
             threads: task.threads as u32,
             snapshot_step: task.snapshot.map(|snapshot| snapshot.step),
             snapshot_every_ms: task.snapshot_every.as_millis() as u64,
-            stop: task.stop.map_or_else(|| Ok(String::new()), |stop| serde_json::to_string(&stop)).map_err(Error::internal)?,
+            stop: json_text(task.stop.as_ref())?,
             observed: task.observed.into_iter().map(Into::into).collect(),
         }))
     }
@@ -65,6 +73,15 @@ impl WorkerService for Service {
             }
         });
         Ok(Response::new(Box::pin(chunks)))
+    }
+
+    type DownloadPolicyStream = Pin<Box<dyn Stream<Item = Result<v1::Chunk, Status>> + Send>>;
+
+    async fn download_policy(&self, request: Request<v1::DownloadPolicyRequest>) -> GrpcResult<Self::DownloadPolicyStream> {
+        let lease = self.lease(request.metadata()).await?;
+        let bytes = Bytes::from(worker::policy(&self.0, lease, &request.into_inner().policy).await?);
+        let parts = (0..bytes.len()).step_by(MAX_CHUNK).map(move |at| bytes.slice(at..bytes.len().min(at + MAX_CHUNK)));
+        Ok(Response::new(Box::pin(futures::stream::iter(parts.map(|data| Ok(v1::Chunk { data }))))))
     }
 
     async fn report(&self, request: Request<v1::ReportRequest>) -> GrpcResult<v1::ReportResponse> {
@@ -115,7 +132,9 @@ impl WorkerService for Service {
 
     async fn finish(&self, request: Request<v1::FinishRequest>) -> GrpcResult<v1::FinishResponse> {
         let lease = self.lease(request.metadata()).await?;
-        worker::finish(&self.0, lease, request.into_inner().try_into().map_err(Error::from)?).await?;
+        let mut request = request.into_inner();
+        let document = Some(std::mem::take(&mut request.result)).filter(|document| !document.is_empty());
+        worker::finish(&self.0, lease, request.try_into().map_err(Error::from)?, document).await?;
         Ok(Response::new(v1::FinishResponse {}))
     }
 }

@@ -20,8 +20,8 @@ use super::jobs::{JobPath, MetricRow};
 use super::openapi::{BadRequest, Draining, NotFound};
 use crate::api::errors::log_internal;
 use crate::invalid::Invalid;
-use crate::service::keys::Caller;
 use crate::service::jobs::LogLines;
+use crate::service::keys::Caller;
 use crate::service::{App, Error, events, jobs};
 use crate::store::{JobEvent, JobEventKind, JobState};
 

@@ -7,8 +7,8 @@ mod render;
 use std::fs;
 use std::path::Path;
 
-use super::comparison::{Comparison, Pair, PolicyEvaluation};
 use crate::experiment::{difference_cells, metric_cells};
+use crate::learner::{Comparison, Pair, PolicyEvaluation};
 use crate::learner::{Difference, Interval};
 use crate::plot::{self, Bar, Chart, Series, Trajectories};
 use render::{ReportPage, ReportPlot, ReportSection, ReportTable};

@@ -123,6 +123,19 @@ impl Client {
         .await
     }
 
+    pub(super) async fn download_policy(&self, policy: &str) -> Result<Vec<u8>, ClientError> {
+        retry(TRANSFER_TIMEOUT, || async {
+            let request = v1::DownloadPolicyRequest { policy: policy.to_owned() };
+            let mut chunks = self.0.clone().download_policy(request).await?.into_inner();
+            let mut bytes = Vec::new();
+            while let Some(chunk) = chunks.message().await? {
+                bytes.extend_from_slice(&chunk.data);
+            }
+            Ok(bytes)
+        })
+        .await
+    }
+
     pub(super) async fn upload_snapshot(&self, header: &v1::SnapshotHeader, bytes: &bytes::Bytes) -> Result<(), ClientError> {
         use v1::upload_snapshot_request::Part;
         let parts =

@@ -6,6 +6,7 @@
 
 mod client;
 mod early_stop;
+mod evaluation;
 mod report;
 mod training;
 
@@ -20,8 +21,10 @@ use tokio::sync::{mpsc, oneshot};
 
 use self::client::{Client, ClientError};
 use self::early_stop::StopRule;
+use self::evaluation::EvaluationTask;
 use self::training::{ReportQueue, TrainingTask};
 use super::Directive;
+use super::evaluation::EvaluationSpec;
 use crate::store::WorkerResult;
 use crate::wire::v1;
 
@@ -149,8 +152,8 @@ pub async fn run(assignment: Assignment) -> Result<(), Error> {
         std::future::pending::<ClientError>().await
     };
     // Heartbeats stop before `finish` is called: after it, a heartbeat would fail because the attempt has ended.
-    let result = tokio::select! {
-        result = train(&client, Arc::clone(&stop)) => result?,
+    let (result, document) = tokio::select! {
+        result = work(&client, Arc::clone(&stop)) => result?,
         error = send_heartbeats(&client, &stop) => return Err(error.into()),
         error = pause => return Err(error.into()),
     };
@@ -160,7 +163,8 @@ pub async fn run(assignment: Assignment) -> Result<(), Error> {
         WorkerResult::Failed { reason, permanent } => (v1::Outcome::Failed, reason, permanent),
     };
     tracing::info!(?outcome, reason, "training ended");
-    client.finish(v1::FinishRequest { outcome: outcome.into(), reason: reason.clone(), permanent }).await?;
+    let result = document.unwrap_or_default();
+    client.finish(v1::FinishRequest { outcome: outcome.into(), reason: reason.clone(), permanent, result }).await?;
     if outcome == v1::Outcome::Failed { Err(Error::Training(reason)) } else { Ok(()) }
 }
 
@@ -175,41 +179,72 @@ async fn send_heartbeats(client: &Client, stop: &StopSignal) -> ClientError {
     }
 }
 
-async fn train(client: &Client, stop: Arc<StopSignal>) -> Result<WorkerResult, Error> {
-    let task = client.fetch().await?;
-    let config = serde_json::from_str(&task.config).map_err(Error::Configuration)?;
-    let snapshot = match task.snapshot_step {
-        Some(_) => Some(client.download_snapshot().await?),
-        None => None,
-    };
-    tracing::info!(threads = task.threads, from_step = task.snapshot_step, "training");
-    let snapshot_every = Duration::from_millis(task.snapshot_every_ms);
-    let stop_rule = match task.stop.as_str() {
-        "" => None,
-        rule => Some(serde_json::from_str(rule).map_err(Error::Configuration)?),
-    };
-    let observed: Vec<_> = task.observed.iter().map(|metric| (metric.step, metric.value)).collect();
-    let stop_rule = stop_rule.map(|rule| StopRule::new(rule, &observed));
-    let task = TrainingTask { config, threads: task.threads as usize, snapshot, snapshot_every, stop_rule };
+/// What the thread of the worker does.
+enum Work {
+    Train(TrainingTask),
+    Evaluate(EvaluationTask),
+}
 
+impl Work {
+    /// Fetches the task of the attempt and everything that it needs.
+    async fn fetch(client: &Client) -> Result<Self, Error> {
+        let task = client.fetch().await?;
+        let threads = task.threads as usize;
+        if !task.evaluation.is_empty() {
+            let spec: EvaluationSpec = serde_json::from_str(&task.evaluation).map_err(Error::Configuration)?;
+            let mut checkpoints = Vec::new();
+            for name in spec.policies.iter().filter(|name| name.contains(':')) {
+                checkpoints.push((name.clone(), client.download_policy(name).await?));
+            }
+            tracing::info!(threads, policies = spec.policies.len(), "evaluating");
+            return Ok(Self::Evaluate(EvaluationTask { spec, checkpoints, threads }));
+        }
+        let config = serde_json::from_str(&task.config).map_err(Error::Configuration)?;
+        let snapshot = match task.snapshot_step {
+            Some(_) => Some(client.download_snapshot().await?),
+            None => None,
+        };
+        tracing::info!(threads, from_step = task.snapshot_step, "training");
+        let snapshot_every = Duration::from_millis(task.snapshot_every_ms);
+        let stop_rule = match task.stop.as_str() {
+            "" => None,
+            rule => Some(serde_json::from_str(rule).map_err(Error::Configuration)?),
+        };
+        let observed: Vec<_> = task.observed.iter().map(|metric| (metric.step, metric.value)).collect();
+        let stop_rule = stop_rule.map(|rule| StopRule::new(rule, &observed));
+        Ok(Self::Train(TrainingTask { config, threads, snapshot, snapshot_every, stop_rule }))
+    }
+
+    /// Does the work. Returns how it ended, and the result as JSON if it has one.
+    fn run(self, reports: &ReportQueue, stop: &StopSignal) -> (WorkerResult, Option<String>) {
+        match self {
+            Self::Train(task) => (training::train(task, reports, stop), None),
+            Self::Evaluate(task) => evaluation::evaluate(&task, reports, stop),
+        }
+    }
+}
+
+/// Does the work of the attempt on a thread of its own, and reports it.
+async fn work(client: &Client, stop: Arc<StopSignal>) -> Result<(WorkerResult, Option<String>), Error> {
+    let work = Work::fetch(client).await?;
     let (sender, receiver) = mpsc::channel(QUEUE);
     let reports = ReportQueue::new(sender);
     let snapshot_pending = reports.snapshot_pending();
     let (result_sender, result) = oneshot::channel();
-    let train = move || {
-        let result = std::panic::catch_unwind(AssertUnwindSafe(|| training::train(task, &reports, &stop)));
+    let run = move || {
+        let result = std::panic::catch_unwind(AssertUnwindSafe(|| work.run(&reports, &stop)));
         let result = result.unwrap_or_else(|panic| {
             let reason = format!("panic: {}", panic_message(&*panic));
-            WorkerResult::Failed { reason, permanent: false }
+            (WorkerResult::Failed { reason, permanent: false }, None)
         });
         // Closes the queue, so that sending ends after the last report.
         drop(reports);
         // The receiver is dropped when the process is ending.
         let _ = result_sender.send(result);
     };
-    std::thread::Builder::new().name("training".into()).spawn(train)?;
+    std::thread::Builder::new().name("training".into()).spawn(run)?;
     report::send_all(client, receiver, &snapshot_pending).await?;
-    Ok(result.await.expect("the training thread sends its result even if it panics"))
+    Ok(result.await.expect("the thread sends its result even if it panics"))
 }
 
 /// The message of a panic.

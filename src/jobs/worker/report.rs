@@ -35,6 +35,11 @@ pub(super) async fn send_all(
                         flush(client, &mut batch).await?;
                     }
                 }
+                Report::Progress { step } => {
+                    batch.step = step;
+                    client.report(&batch).await?;
+                    batch.metrics.clear();
+                }
                 Report::Snapshot { step, bytes } => {
                     flush(client, &mut batch).await?;
                     let (sha256, bytes) = digest(bytes).await;

@@ -26,6 +26,8 @@ pub(super) type Row = (u64, &'static str, f64);
 pub(super) enum Report {
     /// Metrics, and the current step of training.
     Metrics { step: u64, rows: Vec<Row> },
+    /// The current step of a job that has no metrics.
+    Progress { step: u64 },
     /// Everything needed to resume at `step`.
     Snapshot { step: u64, bytes: Vec<u8> },
     /// A policy.
@@ -58,7 +60,7 @@ impl ReportQueue {
         Arc::clone(&self.snapshot_pending)
     }
 
-    fn push(&self, report: Report) {
+    pub(super) fn push(&self, report: Report) {
         // The receiver is dropped when the process is about to end.
         let _ = self.reports.blocking_send(report);
     }
@@ -102,7 +104,8 @@ fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Re
     let mut last_snapshot = Instant::now();
     while let Some(event) = trainer.next() {
         let rows = curve.rows(&event);
-        let ends = stop_rule.as_mut().is_some_and(|rule| rows.iter().any(|&(step, name, value)| rule.observes(name, step, value)));
+        let ends =
+            stop_rule.as_mut().is_some_and(|rule| rows.iter().any(|&(step, name, value)| rule.observes(name, step, value)));
         if !rows.is_empty() {
             reports.push(Report::Metrics { step: trainer.env_steps(), rows });
         }

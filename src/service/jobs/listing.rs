@@ -188,7 +188,8 @@ mod tests {
     #[test]
     fn tokens_belong_to_their_order() {
         let metric = JobSort::Best("loss".into());
-        for (by, token) in [(&metric, "3ff8000000000000~7"), (&metric, "~7"), (&JobSort::Name, "a.b~7"), (&JobSort::Created, "7")] {
+        for (by, token) in [(&metric, "3ff8000000000000~7"), (&metric, "~7"), (&JobSort::Name, "a.b~7"), (&JobSort::Created, "7")]
+        {
             assert_eq!(parse_cursor(by, token).map(|cursor| cursor.row_id), Some(7), "{token}");
         }
         for (by, token) in [(&metric, "7"), (&metric, "x~7"), (&metric, "7ff8000000000000~7"), (&JobSort::Created, "a~7")] {

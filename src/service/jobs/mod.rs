@@ -1,11 +1,14 @@
 //! The use cases of jobs: submit, get, list, edit, cancel, pause, resume, retry, delete, and read metrics, checkpoints and logs.
 
+mod evaluation;
 mod listing;
 mod logs;
+mod sweep;
 mod view;
 
 use uuid::Uuid;
 
+pub use evaluation::result;
 pub use listing::{ListRequest, list};
 pub use logs::{LogLines, follow_logs, logs};
 pub use view::{JobView, Waiting};
@@ -20,8 +23,8 @@ use crate::jobs::SchedulerConfig;
 use crate::jobs::memory::check as check_memory;
 use crate::jobs::spec::{EditRequest, JobRequest};
 use crate::store::{
-    ActionResult, Checkpoint, Job, JobAction, JobId, JobState, MetricCursor, MetricRow, NewJob, PendingAction, SubmitResult,
-    is_metric_name,
+    ActionResult, Checkpoint, Job, JobAction, JobId, JobKind, JobState, MetricCursor, MetricRow, NewJob, PendingAction,
+    SubmitResult, is_metric_name,
 };
 
 /// Puts a job into the queue. Returns the job, which is in the database, and whether it is new: the same `idempotency_key` with
@@ -62,9 +65,17 @@ async fn submit_job(
     }
     let SchedulerConfig { memory, .. } = app.scheduler.config();
     let notes = request.notes.clone().unwrap_or_default();
-    let spec = request.resolve(app.scheduler.cpu_budget())?;
-    check_memory(&spec.config, spec.threads, *memory)?;
-    if let Some(name) = &spec.name {
+    if request.kind == Some(JobKind::Sweep) {
+        return submitted(app, sweep::submit(app, caller, request, idempotency).await?);
+    }
+    let mut spec = request.resolve(app.scheduler.cpu_budget())?;
+    if let Some(config) = &spec.config {
+        check_memory(config, spec.threads, *memory)?;
+    }
+    if let Some(evaluation) = spec.evaluation.take() {
+        spec.evaluation = Some(evaluation::pin_versions(app, evaluation)?);
+    }
+    if let Some(name) = spec.name.as_ref().filter(|_| spec.kind == JobKind::Train) {
         // Reported now instead of after training.
         policies::check_publishable(name)?;
         policies::check_owner(app, &Publisher::from(caller), name).await?;
@@ -136,7 +147,9 @@ pub async fn show(app: &App, caller: &Caller, id: &str) -> Result<JobView, Error
 pub async fn edit(app: &App, caller: &Caller, id: &str, request: EditRequest) -> Result<JobView, Error> {
     let job = get(app, caller, id).await?;
     let edit = request.resolve(&job)?;
-    if let Some(Some(name)) = edit.name.as_ref().filter(|_| !job.state.ended()) {
+    if let Some(Some(name)) =
+        edit.name.as_ref().filter(|_| !job.state.ended() && job.spec.kind.as_deref() == Some(JobKind::Train.as_str()))
+    {
         policies::check_publishable(name)?;
         policies::check_owner(app, &Publisher::from(caller), name).await?;
     }
@@ -156,7 +169,7 @@ pub async fn change(app: &App, caller: &Caller, id: &str, action: JobAction) -> 
     match app.store.change_job(get(app, caller, id).await?.id, action, app.clock.now()).await? {
         ActionResult::Accepted(job) => {
             tracing::info!(job = %job.id, state = %job.state, ?action, "job changed");
-            app.scheduler.job_changed(job.row_id);
+            app.scheduler.all_jobs_changed();
             view::view(app, *job).await
         }
         ActionResult::NotFound => Err(Error::not_found("job", id)),

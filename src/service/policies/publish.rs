@@ -134,7 +134,8 @@ pub(in crate::service) async fn publish_and_end(app: &App, version: NewVersion, 
     let name = version.name.clone();
     let job = one_at_a_time(app, async move |PolicyStores { store, registry }| {
         let new = version.row(now, None);
-        let ended = EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: Some(new), max_attempts, now };
+        let ended =
+            EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: Some(new), document: None, max_attempts, now };
         let Some((job, published)) = store.end_attempt(ended).await? else { return Ok(None) };
         if let Some(published) = published {
             version.register(&registry, published, None);

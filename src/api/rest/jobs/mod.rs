@@ -38,6 +38,7 @@ pub(super) fn router() -> OpenApiRouter<Arc<App>> {
         .routes(routes!(metrics))
         .routes(routes!(checkpoints))
         .routes(routes!(logs))
+        .routes(routes!(result))
         .routes(routes!(checkpoint))
 }
 
@@ -350,6 +351,21 @@ struct Attempts {
 async fn logs(State(app): AppState, caller: Caller, Path(JobPath { id }): Path<JobPath>) -> Result<axum::Json<Attempts>, Error> {
     let attempts = jobs::logs(&app, &caller, &id).await?.into_iter().map(Into::into).collect();
     Ok(axum::Json(Attempts { attempts }))
+}
+
+/// Get the result of a job: of an evaluation that has succeeded, the report of `qedgix evaluate --json`
+///
+/// Of a sweep, at any time: the states of its jobs, and the means of metrics over the seeds of each combination.
+#[utoipa::path(
+    get, path = "/v1/jobs/{id}/result", operation_id = "getJobResult", tag = "jobs", params(JobPath),
+    responses((status = 200, description = "The result.", body = Object), BadRequest, NotFound, Conflict)
+)]
+async fn result(
+    State(app): AppState,
+    caller: Caller,
+    Path(JobPath { id }): Path<JobPath>,
+) -> Result<axum::Json<serde_json::Value>, Error> {
+    Ok(axum::Json(jobs::result(&app, &caller, &id).await?))
 }
 
 #[derive(Deserialize, IntoParams)]

@@ -13,7 +13,10 @@ use uuid::Uuid;
 use crate::api::rest::config_schemas::{partial_training, schema};
 use crate::api::rest::json;
 use crate::env::EnvConfig;
+use crate::jobs::evaluation::EvaluationRequest;
 use crate::jobs::spec;
+use crate::jobs::sweep::{self, SweepRequest};
+use crate::learner;
 use crate::service::jobs::{self, JobView};
 use crate::store::{self, AttemptOutcome, CheckpointKind, JobId, JobKind, JobState, PendingAction, StoredSpec};
 use crate::train_config::{Algorithm, Preset, Training};
@@ -72,6 +75,10 @@ pub(super) struct JobRequest {
     #[serde(default, deserialize_with = "json::optional_object")]
     #[schema(schema_with = partial_training)]
     training: Option<Map<String, Value>>,
+    /// What a job of the kind `evaluate` does; `environment` has the fields that differ from the default environment.
+    evaluation: Option<Evaluation>,
+    /// What a job of the kind `sweep` varies. The other fields are those of its jobs.
+    sweep: Option<Sweep>,
     /// Seed of the training. Configuration and seed determine every metric and weight. Default: 1.
     #[serde(default, deserialize_with = "json::optional_integer")]
     seed: Option<u64>,
@@ -79,8 +86,11 @@ pub(super) struct JobRequest {
 
 impl From<JobRequest> for spec::JobRequest {
     fn from(request: JobRequest) -> Self {
-        let JobRequest { kind, name, labels, notes, threads, priority, algorithm, preset, environment, training, seed, .. } = request;
-        let JobRequest { max_attempts, timeout, backoff, after, stop, .. } = request;
+        let JobRequest { kind, name, labels, notes, threads, priority, algorithm, preset, environment, training, seed, .. } =
+            request;
+        let JobRequest { max_attempts, timeout, backoff, after, stop, evaluation, sweep, .. } = request;
+        let sweep = sweep.map(Into::into);
+        let evaluation = evaluation.map(Into::into);
         let stop = stop.map(Into::into);
         Self {
             kind,
@@ -98,9 +108,105 @@ impl From<JobRequest> for spec::JobRequest {
             preset,
             environment,
             training,
+            evaluation,
+            sweep,
             seed,
         }
     }
+}
+
+/// Values of fields, over which jobs are made. Exactly one of `grid`, `list` and `random` is required. A field is `algorithm`,
+/// `preset`, `threads`, `environment.FIELD` or `training.FIELD`.
+#[derive(Debug, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields, remote = "Self")]
+pub(super) struct Sweep {
+    /// Values of each field; all combinations are tried.
+    #[serde(default, deserialize_with = "json::optional_object")]
+    #[schema(schema_with = grid)]
+    grid: Option<Map<String, Value>>,
+    /// The combinations themselves.
+    #[schema(value_type = Option<Vec<Object>>, max_items = 500)]
+    list: Option<Vec<Map<String, Value>>>,
+    /// Combinations that are drawn.
+    random: Option<RandomSweep>,
+    /// Number of seeds of each combination, from the seed of the job on; default: 1. A sweep has at most 500 jobs.
+    #[serde(default, deserialize_with = "json::optional_integer")]
+    #[schema(minimum = 1, maximum = 100)]
+    seeds: Option<u64>,
+}
+
+/// Combinations that are drawn from lists of values and from ranges.
+#[derive(Debug, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields, remote = "Self")]
+struct RandomSweep {
+    /// Number of combinations.
+    #[serde(deserialize_with = "json::integer")]
+    #[schema(minimum = 1, maximum = 500)]
+    samples: u64,
+    /// Seed of the draw; default: 1.
+    #[serde(default, deserialize_with = "json::optional_integer")]
+    seed: Option<u64>,
+    /// What each field is drawn from: a list of values, or `{low, high, log, integer}`.
+    #[serde(deserialize_with = "json::object")]
+    #[schema(value_type = Object)]
+    fields: Map<String, Value>,
+}
+
+json::objects_only!(Sweep, RandomSweep);
+
+impl From<Sweep> for SweepRequest {
+    fn from(Sweep { grid, list, random, seeds }: Sweep) -> Self {
+        let random = random.map(|RandomSweep { samples, seed, fields }| sweep::RandomSweep { samples, seed, fields });
+        Self { grid, list, random, seeds }
+    }
+}
+
+fn grid() -> RefOr<Schema> {
+    schema(json!({"type": ["object", "null"], "additionalProperties": {"type": "array", "minItems": 1}}))
+}
+
+/// Policies to compare on a frozen list of layouts, as `qedgix evaluate` does.
+#[derive(Debug, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields, remote = "Self")]
+pub(super) struct Evaluation {
+    /// Baselines, or policies of the server: NAME, NAME@ALIAS or NAME:VERSION. The versions are those of the submission.
+    #[schema(min_items = 1, max_items = 32, example = json!(["qedgix", "sweep"]))]
+    policies: Vec<String>,
+    /// Name of the list of layouts; default: `eval-v1`.
+    #[schema(schema_with = layout_lists)]
+    layouts: Option<String>,
+    /// Number of layouts, from the first; default: 256.
+    #[serde(default, deserialize_with = "json::optional_integer")]
+    #[schema(minimum = 1, maximum = 4096)]
+    episodes: Option<usize>,
+    /// A UAV that is lost; default: none.
+    lose: Option<LostUav>,
+    /// Standard deviation of the error of each observed coordinate, in units of the square's side; default: 0.
+    #[schema(minimum = 0.0, maximum = 1.0)]
+    position_noise: Option<f64>,
+}
+
+/// A UAV that from a slot on does not move, collect or detect, and is not detected. Both are counted from 0.
+#[derive(Debug, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields, remote = "Self")]
+struct LostUav {
+    #[serde(deserialize_with = "json::integer")]
+    uav: usize,
+    #[serde(deserialize_with = "json::integer")]
+    slot: usize,
+}
+
+json::objects_only!(Evaluation, LostUav);
+
+impl From<Evaluation> for EvaluationRequest {
+    fn from(Evaluation { policies, layouts, episodes, lose, position_noise }: Evaluation) -> Self {
+        let lose = lose.map(|LostUav { uav, slot }| learner::LostUav { uav, slot });
+        Self { policies, layouts, episodes, lose, position_noise }
+    }
+}
+
+fn layout_lists() -> RefOr<Schema> {
+    schema(json!({"type": ["string", "null"], "enum": ["eval-v1", "valid-v1", null]}))
 }
 
 /// Ends training as soon as one of its conditions holds. At least one is required.
@@ -173,12 +279,12 @@ fn label_changes() -> RefOr<Schema> {
 
 /// A kind of jobs that this version runs.
 pub(super) fn kind() -> RefOr<Schema> {
-    schema(json!({"type": "string", "enum": [JobKind::Train]}))
+    schema(json!({"type": "string", "enum": [JobKind::Train, JobKind::Evaluate, JobKind::Sweep]}))
 }
 
-/// The only kind of jobs that this version runs.
+/// A kind of jobs that this version runs.
 fn optional_kind() -> RefOr<Schema> {
-    schema(json!({"type": ["string", "null"], "enum": [JobKind::Train, null]}))
+    schema(json!({"type": ["string", "null"], "enum": [JobKind::Train, JobKind::Evaluate, JobKind::Sweep, null]}))
 }
 
 fn labels() -> RefOr<Schema> {
@@ -234,7 +340,7 @@ pub(super) struct JobSummary {
     labels: BTreeMap<String, String>,
     threads: usize,
     priority: i64,
-    /// Null, like `kind`, `preset` and `seed`, only if the specification is unreadable.
+    /// Null, like `preset` and `seed`, if the job does not train, or if the specification is unreadable.
     #[schema(value_type = Option<Algorithm>, required = true)]
     algorithm: Option<String>,
     #[schema(value_type = Option<Preset>, required = true)]
@@ -324,11 +430,20 @@ pub(super) struct Job {
     /// When training ends before all steps are done; null: never.
     #[schema(required = true)]
     stop: Option<EarlyStop>,
-    /// Null, like `training`, only if the specification is unreadable.
+    /// Null, like `training`, if the job does not train, or if the specification is unreadable.
     #[schema(required = true)]
     environment: Option<EnvConfig>,
     #[schema(required = true)]
     training: Option<Training>,
+    /// What a job of the kind `evaluate` compares; null for other kinds.
+    #[schema(value_type = Option<Object>, required = true)]
+    evaluation: Option<Value>,
+    /// The combinations and the number of seeds of a sweep; null for other kinds.
+    #[schema(value_type = Option<Object>, required = true)]
+    sweep: Option<Value>,
+    /// Number of the combination of its sweep that the job has, from 0; null without a sweep.
+    #[schema(required = true)]
+    point: Option<u64>,
 }
 
 impl From<JobView> for JobSummary {
@@ -346,7 +461,9 @@ impl From<JobView> for Job {
             Err(reason) => (None, Some(UnreadableSpec { reason: reason.to_string(), document })),
         };
         let limits = spec.as_ref().map(|spec| spec.limits).unwrap_or_default();
-        let (after, stop, config) = spec.map_or_else(Default::default, |spec| (spec.after, spec.stop, Some(spec.config)));
+        let point = spec.as_ref().and_then(|spec| spec.point);
+        let (after, stop, config, evaluation, sweep) =
+            spec.map_or_else(Default::default, |spec| (spec.after, spec.stop, spec.config, spec.evaluation, spec.sweep));
         let (environment, training) = config.map(|config| (config.environment, config.training)).unzip();
         let summary = JobSummary {
             id: job.id,
@@ -385,6 +502,9 @@ impl From<JobView> for Job {
             stop: stop.map(Into::into),
             environment,
             training,
+            evaluation,
+            sweep,
+            point,
         }
     }
 }

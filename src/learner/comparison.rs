@@ -2,8 +2,9 @@
 
 use serde_json::{Value, json};
 
+use super::{Difference, Disturbance, LayoutList, Summary, TracedEvaluation, difference, summarize};
 use crate::env::EnvConfig;
-use crate::learner::{Difference, Disturbance, LayoutList, Summary, TracedEvaluation, difference, summarize};
+use crate::invalid::Invalid;
 
 /// A policy and its evaluation.
 pub struct PolicyEvaluation {
@@ -22,7 +23,7 @@ impl PolicyEvaluation {
     ///
     /// # Errors
     /// There are no episodes.
-    pub fn new(name: &str, reference: bool, evaluation: TracedEvaluation) -> anyhow::Result<Self> {
+    pub fn new(name: &str, reference: bool, evaluation: TracedEvaluation) -> Result<Self, Invalid> {
         Ok(Self { name: name.to_owned(), reference, summary: summarize(&evaluation.episodes)?, evaluation })
     }
 }
@@ -59,7 +60,7 @@ impl Comparison {
     ///
     /// # Errors
     /// Two policies have different numbers of episodes.
-    pub fn pairs(&self) -> anyhow::Result<Vec<Pair<'_>>> {
+    pub fn pairs(&self) -> Result<Vec<Pair<'_>>, Invalid> {
         let requested: Vec<&PolicyEvaluation> = self.policies.iter().filter(|f| !f.reference).collect();
         let mut pairs = Vec::new();
         for (i, first) in requested.iter().enumerate() {
@@ -74,7 +75,7 @@ impl Comparison {
     ///
     /// # Errors
     /// Two policies have different numbers of episodes.
-    pub fn gaps(&self, name: &str) -> anyhow::Result<Vec<Pair<'_>>> {
+    pub fn gaps(&self, name: &str) -> Result<Vec<Pair<'_>>, Invalid> {
         let Some(reference) = self.policies.iter().find(|policy| policy.name == name) else { return Ok(Vec::new()) };
         let policies = self.best_first().into_iter();
         policies
@@ -109,7 +110,7 @@ impl Comparison {
     ///
     /// # Errors
     /// Two policies have different numbers of episodes.
-    pub fn json(&self) -> anyhow::Result<Value> {
+    pub fn json(&self) -> Result<Value, Invalid> {
         let rows = |reference: bool| -> Vec<Value> {
             let policies = self.policies.iter().filter(|policy| policy.reference == reference);
             policies.map(|policy| json!({"policy": policy.name, "summary": policy.summary})).collect()

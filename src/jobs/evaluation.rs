@@ -1,0 +1,85 @@
+//! Evaluations: jobs that compare policies on frozen layouts, as `qedgix evaluate` does.
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+
+use crate::env::EnvConfig;
+use crate::invalid::{Invalid, in_range};
+use crate::learner::{Comparison, Disturbance, LostUav, layout_list};
+use crate::policy::baselines;
+use crate::train_config::parse_environment;
+
+/// Most policies of an evaluation.
+const MAX_POLICIES: usize = 32;
+
+/// An evaluation as it is submitted; what is absent has a default.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct EvaluationRequest {
+    /// The policies to compare: NAME, NAME@ALIAS, NAME:VERSION, or baselines.
+    pub policies: Vec<String>,
+    /// Name of the list of layouts; default: eval-v1.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub layouts: Option<String>,
+    /// Number of layouts, from the first; default: 256.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub episodes: Option<usize>,
+    /// A UAV that is lost; default: none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lose: Option<LostUav>,
+    /// Standard deviation of the error of each observed coordinate; default: 0.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub position_noise: Option<f64>,
+}
+
+/// An evaluation with all defaults filled in.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EvaluationSpec {
+    /// The policies to compare: baselines, and versions as NAME:VERSION.
+    pub policies: Vec<String>,
+    /// Name of the list of layouts.
+    pub layouts: String,
+    /// Number of layouts, from the first.
+    pub episodes: usize,
+    /// The environment, except for `hover`, which depends on the policy.
+    pub environment: EnvConfig,
+    /// The disturbance.
+    pub disturbance: Disturbance,
+}
+
+impl EvaluationRequest {
+    /// The evaluation in an environment with these fields.
+    ///
+    /// # Errors
+    /// The first field that is not accepted.
+    pub fn resolve(self, environment: &Map<String, Value>) -> Result<EvaluationSpec, Invalid> {
+        let Self { policies, layouts, episodes, lose, position_noise } = self;
+        in_range("evaluation.policies", policies.len(), 1..=MAX_POLICIES)?;
+        let mut environment = parse_environment(Value::Object(environment.clone()))?;
+        // Rewards are not part of an evaluation.
+        environment.reward_scale = None;
+        let list = layout_list(layouts.as_deref().unwrap_or("eval-v1")).map_err(|e| e.with_prefix("evaluation"))?;
+        let episodes = episodes.unwrap_or(256);
+        in_range("evaluation.episodes", episodes as u64, 1..=list.episodes)?;
+        let disturbance = Disturbance { lose, position_noise: position_noise.unwrap_or(0.0) };
+        disturbance.validate(&environment).map_err(|e| e.with_prefix("evaluation"))?;
+        Ok(EvaluationSpec { policies, layouts: list.name.to_owned(), episodes, environment, disturbance })
+    }
+}
+
+impl EvaluationSpec {
+    /// All policies with whether they are references that were not asked for.
+    pub fn all_policies(&self) -> Vec<(&str, bool)> {
+        let references = Comparison::REFERENCES.iter().copied();
+        let references = references
+            .filter(|name| !self.policies.iter().any(|p| p == name))
+            .filter(|name| baselines::by_name(name, (&self.environment).into()).is_some());
+        self.policies.iter().map(|name| (name.as_str(), false)).chain(references.map(|name| (name, true))).collect()
+    }
+
+    /// The amount of work: layouts of all policies.
+    pub fn steps(&self) -> u64 {
+        (self.episodes * self.all_policies().len()) as u64
+    }
+}

@@ -1,0 +1,77 @@
+//! An evaluation within an attempt: runs the policies on the layouts and returns the report. It uses no network.
+
+use std::sync::Arc;
+
+use super::StopSignal;
+use super::training::{Report, ReportQueue};
+use crate::checkpoint::Checkpoint;
+use crate::env::EnvConfig;
+use crate::invalid::Invalid;
+use crate::jobs::evaluation::EvaluationSpec;
+use crate::learner::{Comparison, PolicyEvaluation, TracedEvaluation, Trajectory, evaluate_until, layout_list};
+use crate::policy::{Policy, baselines};
+use crate::store::WorkerResult;
+
+/// An evaluation, and the checkpoints of its policies that are no baselines, by name.
+pub(super) struct EvaluationTask {
+    pub spec: EvaluationSpec,
+    pub checkpoints: Vec<(String, Vec<u8>)>,
+    pub threads: usize,
+}
+
+/// Evaluates all policies, or until `stop` is set. Returns the report as JSON if all are evaluated.
+pub(super) fn evaluate(task: &EvaluationTask, reports: &ReportQueue, stop: &StopSignal) -> (WorkerResult, Option<String>) {
+    match try_evaluate(task, reports, stop) {
+        Ok(Some(report)) => (WorkerResult::Succeeded, Some(report)),
+        Ok(None) => (WorkerResult::Stopped, None),
+        // Another attempt would fail with the same policies and environment.
+        Err(reason) => (WorkerResult::Failed { reason, permanent: true }, None),
+    }
+}
+
+fn try_evaluate(task: &EvaluationTask, reports: &ReportQueue, stop: &StopSignal) -> Result<Option<String>, String> {
+    let EvaluationSpec { layouts, episodes, environment, disturbance, .. } = &task.spec;
+    let list = layout_list(layouts).map_err(|e| e.to_string())?;
+    let seeds = list.seeds(*episodes);
+    let (mut policies, mut done, stop) = (Vec::new(), 0, stop.flag());
+    for (name, reference) in task.spec.all_policies() {
+        let failed = |e: Invalid| format!("policy {name}: {e}");
+        let policy = task.open(name)?;
+        let env = EnvConfig { hover: policy.actions() > EnvConfig::COMPASS, ..environment.clone() };
+        let mut metrics = Vec::with_capacity(seeds.len());
+        for part in seeds.chunks(layouts_per_part(&env)) {
+            let Some(part) = evaluate_until(policy.as_ref(), &env, part, task.threads, disturbance, &stop).map_err(failed)?
+            else {
+                return Ok(None);
+            };
+            metrics.extend(part);
+            done += 1;
+            reports.push(Report::Progress { step: ((policies.len() * seeds.len()) + metrics.len()) as u64 });
+        }
+        let evaluation = TracedEvaluation { episodes: metrics, aoi: Vec::new(), trajectory: Trajectory::default() };
+        policies.push(PolicyEvaluation::new(name, reference, evaluation).map_err(failed)?);
+    }
+    tracing::info!(parts = done, "evaluated");
+    let comparison =
+        Comparison { layouts: list, episodes: seeds.len(), env: environment.clone(), disturbance: *disturbance, policies };
+    Ok(Some(comparison.json().map_err(|e| e.to_string())?.to_string()))
+}
+
+/// Layouts that are evaluated together, so that a part takes seconds at most. Layouts are independent, so this changes no bit.
+fn layouts_per_part(env: &EnvConfig) -> usize {
+    /// Pairs of a UAV and another node, over all slots and layouts of a part.
+    const PAIRS: usize = 1 << 22;
+    (PAIRS / (env.slots * env.uavs * (env.uavs + env.users))).clamp(1, 64)
+}
+
+impl EvaluationTask {
+    fn open(&self, name: &str) -> Result<Arc<dyn Policy>, String> {
+        if let Some(policy) = baselines::by_name(name, (&self.spec.environment).into()) {
+            return Ok(policy);
+        }
+        let found = self.checkpoints.iter().find(|(checkpoint, _)| checkpoint == name);
+        let (_, bytes) = found.ok_or_else(|| format!("policy {name}: no checkpoint"))?;
+        let checkpoint = Checkpoint::from_bytes(bytes).map_err(|e| format!("policy {name}: {e}"))?;
+        Ok(Arc::new(checkpoint.policy()))
+    }
+}

@@ -1,0 +1,104 @@
+//! Sweeps on the server: their jobs, and their results with means over seeds.
+
+use std::collections::BTreeMap;
+
+use rand::RngExt;
+use serde_json::{Value, json};
+use uuid::Uuid;
+
+use super::check_dependency;
+use crate::jobs::memory::check as check_memory;
+use crate::jobs::spec::JobRequest;
+use crate::jobs::sweep;
+use crate::learner::Interval;
+use crate::rng;
+use crate::service::keys::Caller;
+use crate::service::policies::{self, Publisher};
+use crate::service::{App, Error};
+use crate::store::{Job, JobFilter, JobId, JobList, JobOrder, JobSort, JobState, MetricSummary, NewJob, SubmitResult};
+
+/// The metrics of the result of a sweep.
+const METRICS: [&str; 6] =
+    ["eval/mean_aoi", "eval/p95_aoi", "eval/peak_aoi", "eval/coverage", "eval/fairness", "eval-v1/mean_aoi"];
+
+/// Submits a sweep with its jobs.
+pub(super) async fn submit(
+    app: &App,
+    caller: &Caller,
+    request: JobRequest,
+    idempotency: Option<(String, [u8; 32])>,
+) -> Result<SubmitResult, Error> {
+    let notes = request.notes.clone().unwrap_or_default();
+    let sweep = sweep::resolve(request, app.scheduler.cpu_budget())?;
+    let memory = app.scheduler.config().memory;
+    for (i, job) in sweep.jobs.iter().enumerate() {
+        let at = |e: crate::invalid::Invalid| e.with_prefix(&format!("sweep.jobs[{i}]"));
+        if let Some(config) = &job.config {
+            check_memory(config, job.threads, memory).map_err(at)?;
+        }
+        if let Some(name) = &job.name {
+            policies::check_publishable(name)?;
+            policies::check_owner(app, &Publisher::from(caller), name).await?;
+        }
+    }
+    for (i, needed) in sweep.spec.after.iter().enumerate() {
+        check_dependency(app, caller, i, *needed).await?;
+    }
+    app.admit()?;
+    let Publisher { owner, any_name, .. } = caller.into();
+    let parent = JobId(Uuid::now_v7());
+    let job = |id, spec, notes, parent, idempotency| {
+        let owner = owner.clone();
+        NewJob { id, owner, any_name, spec, notes, parent, now: app.clock.now(), idempotency }
+    };
+    let jobs: Vec<NewJob> =
+        sweep.jobs.into_iter().map(|spec| job(JobId(Uuid::now_v7()), spec, String::new(), Some(parent), None)).collect();
+    Ok(app.store.submit_sweep(job(parent, sweep.spec, notes, None, idempotency), &jobs).await?)
+}
+
+/// The result of a sweep at the moment: the states of its jobs, and of each combination the means of metrics over seeds.
+pub(super) async fn result(app: &App, sweep: &Job) -> Result<Value, Error> {
+    let spec = sweep.spec.decode().map_err(Error::internal)?;
+    let points = spec.sweep.as_ref().and_then(|sweep| sweep["points"].as_array()).cloned().unwrap_or_default();
+    let filter = JobFilter { parent: Some(sweep.id), ..JobFilter::default() };
+    let order = JobOrder { by: JobSort::Created, descending: false };
+    let list = JobList { filter, order, after: None, limit: sweep::MAX_JOBS, max_bytes: usize::MAX };
+    let jobs: Vec<Job> = app.store.jobs(&list).await?.0.into_iter().map(|listed| listed.job).collect();
+    let rows: Vec<i64> = jobs.iter().map(|job| job.row_id).collect();
+    let metrics = app.store.metric_summaries(&rows, &METRICS.map(str::to_owned)).await?;
+    let mut states = BTreeMap::<&str, usize>::new();
+    let mut of_points: Vec<Vec<&Job>> = vec![Vec::new(); points.len()];
+    for job in &jobs {
+        *states.entry(job.state.as_str()).or_default() += 1;
+        let point = job.spec.decode().ok().and_then(|spec| spec.point);
+        if let Some(of_point) = point.and_then(|point| of_points.get_mut(point as usize)) {
+            of_point.push(job);
+        }
+    }
+    let points = points.into_iter().zip(of_points).map(|(fields, jobs)| {
+        let means: BTreeMap<&str, Value> =
+            METRICS.iter().filter_map(|name| Some((*name, means(name, &jobs, &metrics)?))).collect();
+        let jobs = jobs.iter().map(|job| json!({"id": job.id, "seed": job.spec.seed, "state": job.state, "reason": job.reason}));
+        json!({"fields": fields, "jobs": jobs.collect::<Vec<_>>(), "metrics": means})
+    });
+    Ok(json!({"jobs": jobs.len(), "states": states, "points": points.collect::<Vec<_>>()}))
+}
+
+/// The best and the last value of a metric, as means with 95 % bootstrap intervals over the jobs that have succeeded.
+fn means(name: &str, jobs: &[&Job], metrics: &BTreeMap<i64, Vec<(String, MetricSummary)>>) -> Option<Value> {
+    let done = jobs.iter().filter(|job| job.state == JobState::Succeeded);
+    let summaries: Vec<MetricSummary> = done
+        .filter_map(|job| metrics.get(&job.row_id)?.iter().find(|(metric, _)| metric == name).map(|(_, summary)| *summary))
+        .collect();
+    let interval = |values: Vec<f64>| (!values.is_empty()).then(|| interval(&values));
+    let best = interval(summaries.iter().filter_map(|summary| summary.best).collect());
+    let last = interval(summaries.iter().filter_map(|summary| summary.last).collect());
+    (best.is_some() || last.is_some()).then(|| json!({"seeds": summaries.len(), "best": best, "last": last}))
+}
+
+fn interval(values: &[f64]) -> Interval {
+    let n = values.len();
+    let mean = values.iter().sum::<f64>() / n as f64;
+    let mut draw = rng::stream(0, "bootstrap", 0);
+    Interval::of_resamples(mean, || (0..n).map(|_| values[draw.random_range(0..n)]).sum::<f64>() / n as f64)
+}
