@@ -11,6 +11,7 @@ pub mod memory;
 mod scheduler;
 pub mod spec;
 pub mod sweep;
+pub mod sweep_jobs;
 pub mod worker;
 
 use std::collections::HashMap;

@@ -4,41 +4,14 @@
 //! limited.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use futures::{Stream, TryStreamExt};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
+use tokio::sync::{OwnedSemaphorePermit, watch};
 
 use super::keys::Caller;
 use super::{App, Error, jobs};
 use crate::invalid::in_range;
 use crate::store::{Job, JobEvent, JobEventKind};
-
-/// The limit of open watches, and their heartbeat.
-#[derive(Debug)]
-pub struct WatchLimit {
-    permits: Arc<Semaphore>,
-    max: usize,
-    heartbeat: Duration,
-}
-
-impl WatchLimit {
-    /// At most `max` watches at a time. A watch without events sends a heartbeat every `heartbeat` on transports that have
-    /// none of their own.
-    pub fn new(max: usize, heartbeat: Duration) -> Self {
-        Self { permits: Arc::new(Semaphore::new(max)), max, heartbeat }
-    }
-
-    /// Number of open watches.
-    pub fn open(&self) -> usize {
-        self.max - self.permits.available_permits()
-    }
-
-    /// Time without events after which a watch sends a heartbeat.
-    pub fn heartbeat(&self) -> Duration {
-        self.heartbeat
-    }
-}
 
 /// A watch of a job.
 pub struct Watch {
@@ -52,26 +25,13 @@ pub struct Watch {
     _permit: OwnedSemaphorePermit,
 }
 
-/// The permit of one more watch.
-///
-/// # Errors
-/// [`Error::Busy`] when too many watches are open, [`Error::Draining`].
-pub(super) fn permit(app: &App) -> Result<OwnedSemaphorePermit, Error> {
-    app.admit()?;
-    let WatchLimit { permits, max, .. } = &app.watchers;
-    permits.clone().try_acquire_owned().map_err(|_| Error::Busy {
-        message: format!("{max} watches are open, which is the limit"),
-        retry_after: Duration::from_secs(5),
-    })
-}
-
 /// Watches job `id` from the event after `after`; 0 is from the beginning.
 ///
 /// # Errors
 /// [`Error::NotFound`], [`Error::Invalid`] when the job has no event `after` yet, [`Error::Busy`] when too many watches are
 /// open, [`Error::Draining`].
 pub async fn watch(app: &Arc<App>, caller: &Caller, id: &str, after: u64) -> Result<Watch, Error> {
-    let permit = permit(app)?;
+    let permit = app.watchers.acquire(app)?;
     let Job { row_id: job, state, last_event, .. } = jobs::get(app, caller, id).await?;
     in_range("after", after, 0..=last_event)?;
     let ended = state.ended() && after == last_event;

@@ -12,13 +12,14 @@ pub mod operations;
 mod paging;
 pub mod policies;
 pub mod sessions;
+mod watch_limit;
 pub mod worker;
 
 use std::sync::Arc;
 
 pub use error::Error;
-pub use events::WatchLimit;
 pub use paging::{Page, PageRequest};
+pub use watch_limit::WatchLimit;
 
 use crate::clock::Clock;
 use crate::draining::Draining;

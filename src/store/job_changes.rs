@@ -10,7 +10,7 @@ use super::submission::set_labels;
 use super::sweeps::{change_jobs, is_sweep};
 use super::transitions::{Transition, release_dependents, transition};
 use super::writes::WriteTransaction;
-use super::{Job, JobId, JobState, PendingAction, Result, Store, corrupt};
+use super::{Job, JobAction, JobId, JobState, PendingAction, Result, Store, corrupt};
 
 /// What a caller changes of a job; what is absent stays.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -23,21 +23,6 @@ pub struct JobEdit {
     pub priority: Option<i64>,
     /// The notes.
     pub notes: Option<String>,
-}
-
-/// An action of a caller on a job.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum JobAction {
-    /// End the job.
-    Cancel,
-    /// Stop the job's worker until the job is resumed.
-    Pause,
-    /// Queue a paused job again.
-    Resume,
-    /// Queue a failed job again.
-    Retry,
-    /// Delete the record of a job that has ended.
-    Delete,
 }
 
 /// The result of a [`JobAction`].

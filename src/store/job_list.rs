@@ -176,7 +176,8 @@ impl JobList {
     fn statement(&self, part: Part, limit: usize) -> QueryBuilder<Sqlite> {
         let JobOrder { by, descending } = &self.order;
         let direction = if *descending { " DESC" } else { "" };
-        let mut sql = QueryBuilder::new("SELECT j.number, ");
+        let mut sql = QueryBuilder::new("SELECT");
+        sql.push(" j.number, ");
         match (part, by) {
             (Part::WithKey, JobSort::Name) => {
                 sql.push("j.name, NULL FROM jobs j INDEXED BY jobs_by_name WHERE j.name IS NOT NULL");

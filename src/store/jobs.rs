@@ -1,35 +1,13 @@
 //! Jobs: their records, their states, and how a state changes.
 
-use std::fmt;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use serde::{Deserialize, Serialize};
 use sqlx::SqliteConnection;
-use uuid::Uuid;
 
 use super::named_enum::named_enum;
 use super::specs::StoredSpec;
-use super::{Error, Result, Store, corrupt, timestamp};
-
-/// Identifies a job.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(transparent)]
-pub struct JobId(pub Uuid);
-
-impl JobId {
-    /// Parses an id in its canonical form: lower case, with hyphens.
-    pub fn parse(text: &str) -> Option<Self> {
-        let id = Uuid::try_parse(text).ok()?;
-        (id.to_string() == text).then_some(Self(id))
-    }
-}
-
-impl fmt::Display for JobId {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.fmt(f)
-    }
-}
+use super::{Error, JobId, Result, Store, corrupt, timestamp};
 
 named_enum! {
     /// The state of a job.
@@ -64,6 +42,21 @@ named_enum! {
         /// Stop the worker and keep its snapshot.
         Pause = "pause",
     }
+}
+
+/// An action of a caller on a job.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum JobAction {
+    /// End the job.
+    Cancel,
+    /// Stop the job's worker until the job is resumed.
+    Pause,
+    /// Queue a paused job again.
+    Resume,
+    /// Queue a failed job again.
+    Retry,
+    /// Delete the record of a job that has ended.
+    Delete,
 }
 
 /// The current record of a job.

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use sqlx::SqliteConnection;
 
-use super::{Metric, Result, Store};
+use super::{Result, Store};
 
 /// The best and the last value of a metric of a job.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -27,8 +27,8 @@ pub fn larger_is_better(name: &str) -> bool {
 
 impl MetricSummary {
     /// The summary of one value.
-    fn of(metric: &Metric) -> Self {
-        let (value, step) = (metric.value.is_finite().then_some(metric.value), metric.step);
+    fn of(step: u64, value: f64) -> Self {
+        let value = value.is_finite().then_some(value);
         Self { best: value, best_step: value.map(|_| step), last: value, last_step: step }
     }
 
@@ -54,13 +54,17 @@ impl MetricSummary {
     }
 }
 
-/// Adds reported metrics to the summaries of a job. A value that is reported again after a crash is equal to the first, except for
+/// Adds reported metrics (name, step, value) to the summaries of a job. A value that is reported again after a crash is equal to the first, except for
 /// measured speeds, whose best value remains.
-pub(super) async fn summarize(db: &mut SqliteConnection, job: i64, metrics: &[Metric]) -> Result<()> {
+pub(super) async fn summarize<'a>(
+    db: &mut SqliteConnection,
+    job: i64,
+    metrics: impl Iterator<Item = (&'a str, u64, f64)>,
+) -> Result<()> {
     let mut summaries: BTreeMap<&str, MetricSummary> = BTreeMap::new();
-    for metric in metrics {
-        let next = MetricSummary::of(metric);
-        summaries.entry(&metric.name).and_modify(|summary| summary.add(&metric.name, &next)).or_insert(next);
+    for (name, step, value) in metrics {
+        let next = MetricSummary::of(step, value);
+        summaries.entry(name).and_modify(|summary| summary.add(name, &next)).or_insert(next);
     }
     for (name, mut summary) in summaries {
         let sql = "SELECT best, best_step, last, last_step FROM metric_summaries WHERE job = ? AND name = ?";
@@ -124,7 +128,7 @@ mod tests {
     use super::*;
 
     fn summary(name: &str, values: &[(u64, f64)]) -> MetricSummary {
-        let metric = |&(step, value): &(u64, f64)| MetricSummary::of(&Metric { name: name.into(), step, value });
+        let metric = |&(step, value): &(u64, f64)| MetricSummary::of(step, value);
         let mut all = metric(&values[0]);
         values[1..].iter().for_each(|value| all.add(name, &metric(value)));
         all

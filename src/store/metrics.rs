@@ -74,7 +74,8 @@ impl Store {
                 .execute(&mut *tx)
                 .await?;
         }
-        summarize(&mut tx, lease.job_row, metrics).await?;
+        let rows = metrics.iter().map(|metric| (metric.name.as_str(), metric.step, metric.value));
+        summarize(&mut tx, lease.job_row, rows).await?;
         tx.commit().await?;
         self.notify(lease.job_row);
         Ok(true)

@@ -8,7 +8,7 @@ use tokio::sync::{OwnedSemaphorePermit, watch};
 use super::get;
 use crate::jobs::LogTail;
 use crate::service::keys::Caller;
-use crate::service::{App, Error, events};
+use crate::service::{App, Error};
 use crate::store::{Attempt, Job};
 
 /// The newest attempts of a job with the last output of their workers, oldest first.
@@ -45,7 +45,7 @@ pub async fn follow_logs(
     caller: &Caller,
     id: &str,
 ) -> Result<impl Stream<Item = Result<LogLines, Error>> + Send + use<>, Error> {
-    let permit = events::permit(app)?;
+    let permit = app.watchers.acquire(app)?;
     let job = get(app, caller, id).await?;
     let follower = Follower {
         changes: app.store.changes(job.row_id),

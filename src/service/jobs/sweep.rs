@@ -9,7 +9,7 @@ use uuid::Uuid;
 use super::check_dependency;
 use crate::jobs::memory::check as check_memory;
 use crate::jobs::spec::JobRequest;
-use crate::jobs::sweep;
+use crate::jobs::{sweep, sweep_jobs};
 use crate::learner::Interval;
 use crate::rng;
 use crate::service::keys::Caller;
@@ -29,7 +29,7 @@ pub(super) async fn submit(
     idempotency: Option<(String, [u8; 32])>,
 ) -> Result<SubmitResult, Error> {
     let notes = request.notes.clone().unwrap_or_default();
-    let sweep = sweep::resolve(request, app.scheduler.cpu_budget())?;
+    let sweep = sweep_jobs::resolve(request, app.scheduler.cpu_budget())?;
     let memory = app.scheduler.config().memory;
     for (i, job) in sweep.jobs.iter().enumerate() {
         let at = |e: crate::invalid::Invalid| e.with_prefix(&format!("sweep.jobs[{i}]"));
