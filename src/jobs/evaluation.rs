@@ -63,6 +63,10 @@ impl EvaluationRequest {
         let episodes = episodes.unwrap_or(256);
         in_range("evaluation.episodes", episodes as u64, 1..=list.episodes)?;
         let disturbance = Disturbance { lose, position_noise: position_noise.unwrap_or(0.0) };
+        if list.mixed && disturbance != Disturbance::default() {
+            let expected = "a list that is not mixed, because disturbances belong to one fleet";
+            return Err(Invalid::new("evaluation.layouts", list.name, expected));
+        }
         disturbance.validate(&environment).map_err(|e| e.with_prefix("evaluation"))?;
         Ok(EvaluationSpec { policies, layouts: list.name.to_owned(), episodes, environment, disturbance })
     }

@@ -30,30 +30,28 @@ pub(super) fn evaluate(task: &EvaluationTask, reports: &ReportQueue, stop: &Stop
 }
 
 fn try_evaluate(task: &EvaluationTask, reports: &ReportQueue, stop: &StopSignal) -> Result<Option<String>, String> {
-    let EvaluationSpec { layouts, episodes, environment, disturbance, .. } = &task.spec;
-    let list = layout_list(layouts).map_err(|e| e.to_string())?;
-    let seeds = list.seeds(*episodes);
-    let (mut policies, mut done, stop) = (Vec::new(), 0, stop.flag());
+    let EvaluationSpec { layouts: list, episodes, environment, disturbance, .. } = &task.spec;
+    let list = layout_list(list).map_err(|e| e.to_string())?;
+    let layouts = list.seeds(*episodes).len();
+    let (mut policies, stop) = (Vec::new(), stop.flag());
     for (name, reference) in task.spec.all_policies() {
         let failed = |e: Invalid| format!("policy {name}: {e}");
         let policy = task.open(name)?;
         let env = EnvConfig { hover: policy.actions() > EnvConfig::COMPASS, ..environment.clone() };
-        let mut metrics = Vec::with_capacity(seeds.len());
-        for part in seeds.chunks(layouts_per_part(&env)) {
-            let Some(part) = evaluate_until(policy.as_ref(), &env, part, task.threads, disturbance, &stop).map_err(failed)?
-            else {
-                return Ok(None);
-            };
-            metrics.extend(part);
-            done += 1;
-            reports.push(Report::Progress { step: ((policies.len() * seeds.len()) + metrics.len()) as u64 });
+        let mut metrics = Vec::with_capacity(layouts);
+        for (env, seeds) in list.environments(&env, *episodes) {
+            for part in seeds.chunks(layouts_per_part(&env)) {
+                let part = evaluate_until(policy.as_ref(), &env, part, task.threads, disturbance, &stop).map_err(failed)?;
+                let Some(part) = part else { return Ok(None) };
+                metrics.extend(part);
+                reports.push(Report::Progress { step: (policies.len() * layouts + metrics.len()) as u64 });
+            }
         }
         let evaluation = TracedEvaluation { episodes: metrics, aoi: Vec::new(), trajectory: Trajectory::default() };
         policies.push(PolicyEvaluation::new(name, reference, evaluation).map_err(failed)?);
     }
-    tracing::info!(parts = done, "evaluated");
     let comparison =
-        Comparison { layouts: list, episodes: seeds.len(), env: environment.clone(), disturbance: *disturbance, policies };
+        Comparison { layouts: list, episodes: layouts, env: environment.clone(), disturbance: *disturbance, policies };
     Ok(Some(comparison.json().map_err(|e| e.to_string())?.to_string()))
 }
 

@@ -206,7 +206,8 @@ impl From<Evaluation> for EvaluationRequest {
 }
 
 fn layout_lists() -> RefOr<Schema> {
-    schema(json!({"type": ["string", "null"], "enum": ["eval-v1", "valid-v1", null]}))
+    let names = learner::LAYOUT_LISTS.iter().map(|list| json!(list.name)).chain([Value::Null]);
+    schema(json!({"type": ["string", "null"], "enum": names.collect::<Vec<_>>()}))
 }
 
 /// Ends training as soon as one of its conditions holds. At least one is required.
