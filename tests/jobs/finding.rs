@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use jiff::Timestamp;
 use qedgix::api::convert::structs::to_struct;
-use qedgix::store::{JobFilter, JobId, JobKind, JobList, JobOrder, JobSort, JobSpec, NewJob, Store};
+use qedgix::store::{JobFilter, JobId, JobList, JobOrder, JobSort, JobSpec, NewJob, Store};
 use qedgix::train_config::{Algorithm, Preset, TrainConfig};
 use qedgix::wire::v1;
 use reqwest::{Method, StatusCode};
@@ -160,7 +160,8 @@ async fn jobs_are_edited_in_any_state() {
     let worker = server.worker().await;
     let low = server.submit(&named("low")).await;
     let high = server.submit(&named("high")).await;
-    let patch = |id: &str, body: Value| server.request(Method::PATCH, &format!("/v1/jobs/{id}")).json(&body);
+    let rest = server.rest.clone();
+    let patch = |id: &str, body: Value| rest.request(Method::PATCH, &format!("/v1/jobs/{id}")).json(&body);
     let job = server.get(&format!("/v1/jobs/{running}")).await;
     assert_eq!((&job["notes"], &job["parent"]), (&json!("first"), &json!(null)));
 
@@ -256,7 +257,7 @@ async fn many_jobs_are_listed() {
     store.close().await;
     let begin = Instant::now();
     let server = Server::start(dir.path(), 1).await;
-    server.get("/readyz").await;
+    server.get("/v1/jobs?page_size=1").await;
     println!("start: {:?}", begin.elapsed());
     for query in ["", "&sort=name&labels=group%3D7", "&state=queued&sort=-best:eval/mean_aoi&metrics=loss", "&algorithm=vdn"] {
         let begin = Instant::now();

@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use futures::StreamExt;
 use qedgix::jobs::LocalProcess;
 use qedgix::wire::v1;
 use reqwest::{Method, StatusCode};
@@ -137,7 +136,7 @@ async fn output_is_followed_over_all_attempts_until_the_job_has_ended() {
     let id = server.submit(&tiny()).await;
     let first = server.worker().await;
     first.launch.log.push(b"one\n");
-    let mut rest = server.request(Method::GET, &format!("/v1/jobs/{id}/logs/events")).send().await.unwrap().bytes_stream();
+    let mut rest = server.request(Method::GET, &format!("/v1/jobs/{id}/logs/events")).send().await.unwrap();
     let mut grpc = server.jobs().await;
     let mut lines = grpc.watch_job_logs(v1::WatchJobLogsRequest { id: id.clone() }).await.unwrap().into_inner();
     let mut next = async || within(lines.message()).await.unwrap().map(|output| (output.attempt, output.text));
@@ -153,8 +152,8 @@ async fn output_is_followed_over_all_attempts_until_the_job_has_ended() {
     finish(&server, second, v1::Outcome::Succeeded).await;
     assert_eq!(next().await, None);
     let mut text = String::new();
-    while let Some(part) = within(rest.next()).await {
-        text += std::str::from_utf8(&part.unwrap()).unwrap();
+    while let Some(part) = within(rest.chunk()).await.unwrap() {
+        text += std::str::from_utf8(&part).unwrap();
     }
     let data: Vec<Value> =
         text.lines().filter_map(|line| line.strip_prefix("data: ")).map(|data| serde_json::from_str(data).unwrap()).collect();

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use jiff::Timestamp;
 use qedgix::store::{
-    CheckpointKind, EndedAttempt, FILE, JobAction, JobId, JobKind, JobSpec, Lease, NewCheckpoint, NewJob, Store, SubmitResult,
+    CheckpointKind, EndedAttempt, FILE, JobAction, JobId, JobSpec, Lease, NewCheckpoint, NewJob, Store, SubmitResult,
     WorkerResult,
 };
 use qedgix::train_config::{Algorithm, Preset, TrainConfig};
