@@ -10,7 +10,7 @@ use super::output::outln;
 /// Flags of `server`.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  qedgix server budget           # threads that jobs may use, and those that they use
+  qedgix server budget           # the CPU budget, and what running jobs occupy of it
   qedgix server budget 4         # from now on, until the server stops
   qedgix server budget --server 192.0.2.7:8080 --json")]
 pub struct ServerArgs {
