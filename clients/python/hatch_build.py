@@ -1,6 +1,6 @@
-"""Puts the server into the wheel: with QEDGIX_SERVER=PATH, the wheel has this program as the command `qedgix`.
+"""Puts the server into the wheel: with QEDGIX_WHEEL_SERVER=PATH, the wheel has this program as the command `qedgix`.
 
-QEDGIX_SERVER=target/release/qedgix pip wheel --no-deps ./clients/python
+QEDGIX_WHEEL_SERVER=target/release/qedgix pip wheel --no-deps ./clients/python
 """
 
 import os
@@ -15,12 +15,12 @@ class ServerHook(BuildHookInterface[Any]):
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Called by hatchling before it builds a wheel."""
-        server = os.environ.get("QEDGIX_SERVER")
+        server = os.environ.get("QEDGIX_WHEEL_SERVER")
         if not server:
             return
         path = Path(server).resolve()
         if not os.access(path, os.X_OK):
-            raise FileNotFoundError(f"QEDGIX_SERVER: {server} is no program")
+            raise FileNotFoundError(f"QEDGIX_WHEEL_SERVER: {server} is no program")
         build_data["shared_scripts"][str(path)] = path.name
         build_data["pure_python"] = False
         # The program needs no Python of a certain version, only the platform.

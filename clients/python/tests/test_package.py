@@ -29,7 +29,7 @@ def test_types():
 def test_a_wheel_can_carry_the_server(tmp_path):
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
     build = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(tmp_path), str(HERE)]
-    subprocess.run(pip + build, env={**os.environ, "QEDGIX_SERVER": str(BINARY)}, check=True)
+    subprocess.run(pip + build, env={**os.environ, "QEDGIX_WHEEL_SERVER": str(BINARY)}, check=True)
     [wheel] = tmp_path.glob("*.whl")
     assert wheel.name.startswith("qedgix-") and "-py3-none-" in wheel.name and not wheel.name.endswith("-any.whl")
     prefix = tmp_path / "prefix"
@@ -40,7 +40,7 @@ def test_a_wheel_can_carry_the_server(tmp_path):
     told = subprocess.run([command, "--version"], check=True, capture_output=True, text=True).stdout
     assert told.startswith("qedgix ")
     assert list(prefix.rglob("qedgix/py.typed"))
-    missing = subprocess.run(pip + build, env={**os.environ, "QEDGIX_SERVER": "nowhere"}, capture_output=True, check=False)
+    missing = subprocess.run(pip + build, env={**os.environ, "QEDGIX_WHEEL_SERVER": "nowhere"}, capture_output=True, check=False)
     assert missing.returncode != 0
 
 
