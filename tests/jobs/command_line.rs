@@ -158,9 +158,10 @@ async fn jobs_are_listed_paused_resumed_and_cancelled() {
     let Printed { code, err, .. } = bed.run(&["jobs", "show", "0"]).await;
     assert!(code == Some(1) && err.contains(&first) && err.contains(&second), "both jobs begin like this: {err}");
 
-    let listed = bed.json(&["jobs", "list", "--state", "queued"]).await;
+    let listed = bed.json(&["jobs", "list", "--state", "queued", "--label", "set=b", "--kind", "train"]).await;
     assert_eq!(listed["jobs"].as_array().unwrap().iter().map(|job| &job["id"]).collect::<Vec<_>>(), [&json!(second)]);
-    let table = bed.ok(&["jobs", "list"]).await;
+    let table = bed.ok(&["jobs", "list", "--since", "1d", "--sort", "last:loss"]).await;
+    assert!(!bed.ok(&["jobs", "list", "--until", "1d"]).await.contains("running"));
     assert!(table.contains("running") && table.contains("queued") && table.contains("train vdn"), "{table}");
 
     assert!(bed.ok(&["jobs", "pause", &second]).await.contains("paused"));

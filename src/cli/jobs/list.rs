@@ -51,8 +51,8 @@ pub struct ListArgs {
     /// Order: created, name, best:METRIC or last:METRIC; with - before it in descending order [default: -created]
     #[arg(long, allow_hyphen_values = true)]
     sort: Option<String>,
-    /// Metric to show, best value and last value; may be repeated [default: none]
-    #[arg(long)]
+    /// Metric to show, best value and last value; may be repeated
+    #[arg(long, default_value = "eval/mean_aoi")]
     metric: Vec<String>,
     /// Maximum number of jobs
     #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
