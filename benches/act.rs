@@ -25,7 +25,15 @@ fn act(c: &mut Criterion) {
             b.iter(|| {
                 graph.set_scene(&own, &all, &aoi, 0.28);
                 let (memory, headings) = (&mut memory[..], &mut headings[..]);
-                policy.act(&mut [FleetStep { env: policy.env(), graph: &graph, step: 0, memory, headings, q_values: None }]);
+                policy.act(&mut [FleetStep {
+                    env: policy.env(),
+                    graph: &graph,
+                    profile: None,
+                    step: 0,
+                    memory,
+                    headings,
+                    q_values: None,
+                }]);
             });
         });
     }

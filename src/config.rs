@@ -36,6 +36,8 @@ pub struct Config {
     pub max_sessions: usize,
     /// Memory of all sessions together, in bytes.
     pub session_memory: usize,
+    /// Slots after which UAVs and users that are missing from the requests of a fleet are forgotten.
+    pub absent_after: u64,
     /// Idle time after which a hosted environment expires.
     pub environment_ttl: Duration,
     /// Maximum hosted environments.
@@ -114,6 +116,7 @@ impl Config {
             session_ttl: Duration::from_secs(600),
             max_sessions: 100_000,
             session_memory: 512 << 20,
+            absent_after: 100,
             environment_ttl: Duration::from_secs(600),
             max_environments: 1024,
             environment_memory: 1 << 30,
@@ -154,6 +157,7 @@ impl Config {
         in_seconds("--session-ttl", self.session_ttl, 0.001..=1e9)?;
         in_range("--max-sessions", self.max_sessions, 1..=100_000_000)?;
         in_range("--session-memory", self.session_memory, 1 << 20..=1 << 40)?;
+        in_range("--absent-after", self.absent_after, 0..=1_000_000)?;
         in_seconds("--environment-ttl", self.environment_ttl, 0.001..=1e9)?;
         in_range("--max-environments", self.max_environments, 1..=100_000_000)?;
         in_range("--environment-memory", self.environment_memory, 1 << 20..=1 << 40)?;

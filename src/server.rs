@@ -247,6 +247,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         loads: Loads::default(),
         retention: config.retention,
         sessions: Sessions::new(sessions, clock.clone()),
+        absent_after: config.absent_after,
         environments: Environments::new(environments, clock.clone()),
         engine: Engine::start(config.engine).map_err(Error::Engine)?,
         watchers: WatchLimit::new(config.max_watchers, config.event_heartbeat),

@@ -66,7 +66,15 @@ fn tour_plans_once_and_again_after_users_have_moved() {
     let mut memory = vec![0.0; policy.memory_len(3, 5)];
     let fly = |graph: &FleetGraph, step, memory: &mut Vec<f32>| {
         let mut headings = [99; 3];
-        policy.act(&mut [FleetStep { env: policy.env(), graph, step, memory, headings: &mut headings, q_values: None }]);
+        policy.act(&mut [FleetStep {
+            env: policy.env(),
+            graph,
+            profile: None,
+            step,
+            memory,
+            headings: &mut headings,
+            q_values: None,
+        }]);
         headings
     };
     fly(&scene(&users), 0, &mut memory);
@@ -132,6 +140,7 @@ impl Fleet {
         FleetStep {
             env: EnvParams::default(),
             graph: &self.graph,
+            profile: None,
             step,
             memory: &mut self.memory,
             headings: &mut self.headings,

@@ -255,6 +255,7 @@ fn run_policy(checkpoint: &Checkpoint, seed: u64) {
             policy.act(&mut [FleetStep {
                 env: policy.env(),
                 graph: &graph,
+                profile: None,
                 step,
                 memory: &mut memory,
                 headings: &mut headings,

@@ -2,9 +2,9 @@
 
 use std::sync::Mutex;
 
-use qedgix::env::{EnvConfig, EpisodeMetrics};
+use qedgix::env::{EnvConfig, EpisodeMetrics, LostUav};
 use qedgix::invalid::Invalid;
-use qedgix::learner::{Disturbance, LostUav, TracedEvaluation, evaluate, evaluate_traced, layout_list};
+use qedgix::learner::{Disturbance, TracedEvaluation, evaluate, evaluate_traced, layout_list};
 use qedgix::policy::EnvParams;
 use qedgix::policy::baselines;
 use qedgix::policy::{FleetStep, Policy, RequiredInput};

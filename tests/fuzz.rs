@@ -128,19 +128,20 @@ fn spoil(rng: &mut ChaCha8Rng, valid: &[u8], other: &[u8]) -> Vec<u8> {
 }
 
 fn scene(users: usize) -> v1::Scene {
-    let uav = |i| v1::SceneUav { id: format!("uav-{i}"), x: 0.2 * f64::from(i), y: 0.3 };
-    let user = |j: usize| v1::SceneUser { id: format!("user-{j}"), x: 0.15 * j as f64, y: 0.4, aoi: j as f64 };
+    let uav = |i| v1::SceneUav { id: format!("uav-{i}"), x: 0.2 * f64::from(i), y: 0.3, ..Default::default() };
+    let user = |j: usize| v1::SceneUser { id: format!("user-{j}"), x: 0.15 * j as f64, y: 0.4, aoi: j as f64, z: None };
     v1::Scene { uavs: (0..3).map(uav).collect(), users: (0..users).map(user).collect() }
 }
 
 fn graph() -> v1::Graph {
-    let sees = |id: &str, aoi| v1::Detection { target_id: id.into(), rel_x: 0.05, rel_y: -0.02, aoi };
+    let sees = |id: &str, aoi| v1::Detection { target_id: id.into(), rel_x: 0.05, rel_y: -0.02, aoi, rel_z: None };
     let node = |id: &str, kind: v1::NodeKind, detections| v1::Node {
         id: id.into(),
         kind: kind.into(),
         detections,
-        position: (kind == v1::NodeKind::Uav).then_some(v1::Position { x: 0.5, y: 0.5 }),
+        position: (kind == v1::NodeKind::Uav).then_some(v1::Position { x: 0.5, y: 0.5, z: None }),
         aoi: (kind == v1::NodeKind::User).then_some(4.0),
+        ..Default::default()
     };
     v1::Graph {
         nodes: vec![
@@ -173,7 +174,13 @@ fn messages() -> Vec<(&'static str, Vec<u8>)> {
             prost_types::Value { kind: Some(prost_types::value::Kind::NumberValue(4.0)) },
         )]),
     });
-    let open = v1::OpenSessionRequest { policy: "sweep".into(), session_id: "s".into(), run_id: None, seed: Some(3) };
+    let open = v1::OpenSessionRequest {
+        policy: "sweep".into(),
+        session_id: "s".into(),
+        run_id: None,
+        seed: Some(3),
+        ..Default::default()
+    };
     let environment = v1::CreateEnvironmentRequest { environment_id: "e".into(), environment: config, ..Default::default() };
     let step = v1::StepRequest { environment_id: "e".into(), ..Default::default() };
     vec![
@@ -388,6 +395,7 @@ impl Subject {
         policy.act(&mut [FleetStep {
             env: policy.env(),
             graph: &self.graph,
+            profile: None,
             step: 0,
             memory: &mut memory,
             headings: &mut headings,

@@ -16,8 +16,15 @@ use qedgix::rng;
 use rand::RngExt;
 use sample::{AGENT, episodes};
 
-const ENV: EnvParams =
-    EnvParams { speed: 0.04, transmission_range: 0.12, detection_range: 0.28, communication_range: 0.28, actions: 8, slots: 80 };
+const ENV: EnvParams = EnvParams {
+    speed: 0.04,
+    transmission_range: 0.12,
+    detection_range: 0.28,
+    communication_range: 0.28,
+    actions: 8,
+    slots: 80,
+    extent: [1.0; 2],
+};
 const DIMS: Dims = Dims { uavs: 3, users: 5, env: ENV };
 const SET: AgentConfig =
     AgentConfig { observation: ObservationKind::Set, identity: Identity::Phase, self_position: true, ..AGENT };
@@ -57,7 +64,7 @@ impl Fleet {
 
     fn turn(&mut self) -> FleetStep<'_> {
         let Self { graph, memory, headings, q } = self;
-        FleetStep { env: ENV, graph, step: 0, memory, headings, q_values: Some(q) }
+        FleetStep { env: ENV, graph, profile: None, step: 0, memory, headings, q_values: Some(q) }
     }
 
     fn bits(&self) -> (Vec<u32>, Vec<u8>, Vec<u32>) {
@@ -188,6 +195,7 @@ fn batched_agent_policy_and_update_compute_the_same_values() {
                 let turn = FleetStep {
                     env: dims.env,
                     graph: &graph,
+                    profile: None,
                     step: t as u64,
                     memory: &mut memory,
                     headings: &mut headings,
@@ -223,6 +231,7 @@ fn uavs_separate_only_with_an_identity() {
             policy.act(&mut [FleetStep {
                 env: policy.env(),
                 graph: &graph,
+                profile: None,
                 step,
                 memory: &mut memory,
                 headings: &mut headings,
@@ -256,6 +265,7 @@ fn values(policy: &LearnedPolicy, uavs: &[Point], users: &[(Point, f32)]) -> Vec
     policy.act(&mut [FleetStep {
         env: policy.env(),
         graph: &graph,
+        profile: None,
         step: 0,
         memory: &mut memory,
         headings: &mut headings,

@@ -79,17 +79,21 @@ async fn run_episode(server: &mut PolicyClient, policy: &str, env: &EnvConfig, s
         };
         let response = server.act(request).await?.into_inner();
         ensure!(response.step == step, "sent step {step}, received the response for step {}", response.step);
-        let headings: Vec<u8> = response.actions.iter().map(|a| a.heading_index as u8).collect();
+        let mut actions = response.actions.iter().map(|a| a.heading_index as u8);
+        let flies = |i: usize| env.flies(i, episode.slot());
+        let headings: Vec<u8> = (0..env.uavs).map(|i| if flies(i) { actions.next().unwrap_or(0) } else { 0 }).collect();
         episode.step(&headings)?;
     }
     server.close_session(v1::CloseSessionRequest { session_id }).await?;
     Ok(episode.metrics())
 }
 
-/// The scene of the current slot as a message.
+/// The scene of the current slot as a message: the UAVs that fly and the users that are there.
 fn scene(episode: &Episode) -> v1::Scene {
-    let uavs = episode.uavs().into_iter().enumerate().map(|(i, [x, y])| v1::SceneUav { id: format!("uav-{i}"), x, y });
-    let users = episode.users().into_iter().zip(episode.aoi()).enumerate();
-    let users = users.map(|(i, ([x, y], aoi))| v1::SceneUser { id: format!("user-{i}"), x, y, aoi: f64::from(*aoi) });
+    let (env, slot) = (episode.config(), episode.slot());
+    let uavs = episode.uavs().into_iter().enumerate().filter(|(i, _)| env.flies(*i, slot));
+    let uavs = uavs.map(|(i, [x, y])| v1::SceneUav { id: format!("uav-{i}"), x, y, ..Default::default() });
+    let users = episode.users().into_iter().zip(episode.aoi()).enumerate().filter(|(j, _)| env.is_there(*j, slot));
+    let users = users.map(|(j, ([x, y], aoi))| v1::SceneUser { id: format!("user-{j}"), x, y, aoi: f64::from(*aoi), z: None });
     v1::Scene { uavs: uavs.collect(), users: users.collect() }
 }

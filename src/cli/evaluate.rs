@@ -10,10 +10,9 @@ use super::connect::ConnectArgs;
 use super::output::outln;
 use super::{act_client, ports, progress, report, run_args::all_cores, table};
 use crate::checkpoint::Checkpoint;
-use crate::env::EnvConfig;
+use crate::env::{EnvConfig, LostUav, UserSlots};
 use crate::learner::{
-    Comparison, Disturbance, LayoutList, LostUav, PolicyEvaluation, TracedEvaluation, Trajectory, evaluate_list, evaluate_traced,
-    layout_list,
+    Comparison, Disturbance, LayoutList, PolicyEvaluation, TracedEvaluation, Trajectory, evaluate_list, evaluate_traced, layout_list,
 };
 use crate::policy::{Policy, baselines};
 use crate::serving::bundled;
@@ -31,6 +30,7 @@ Conditions that differ from training:
   qedgix evaluate --policy qedgix --policy sweep-shared --communication-range 1.5   # everywhere
   qedgix evaluate --policy qedgix --policy sweep-shared --layouts eval-mixed-v2     # drawn sizes, ranges and horizons
   qedgix evaluate --policy qedgix --policy sweep --lose-uav 1@20      # UAV 1 of 0, 1, 2 is lost from slot 20 on
+  qedgix evaluate --policy qedgix --policy sweep --user-slots 0@25 --user-slots 3@0..60   # a user that appears, one that leaves
   qedgix evaluate --policy qedgix --policy sweep --position-noise 0.02")]
 pub struct EvaluateArgs {
     /// A checkpoint file, a bundled policy or a baseline; with --server, a policy of the server. May be repeated
@@ -66,6 +66,9 @@ pub struct EvaluateArgs {
     /// Index of a UAV (from 0) that is lost from a slot on: it does not move, collect or detect, and is not detected
     #[arg(long, env = "QEDGIX_LOSE_UAV", value_name = "UAV@SLOT", value_parser = lost_uav)]
     lose_uav: Option<LostUav>,
+    /// Slots of a user (index from 0) that comes or goes: from a slot on, or from a slot until another; may be repeated
+    #[arg(long, env = "QEDGIX_USER_SLOTS", value_name = "USER@FROM[..UNTIL]", value_parser = user_slots, value_delimiter = ',')]
+    user_slots: Vec<UserSlots>,
     /// Standard deviation of the error of each observed coordinate, in units of the square's side
     #[arg(long, env = "QEDGIX_POSITION_NOISE", value_name = "SIGMA", default_value_t = 0.0)]
     position_noise: f64,
@@ -167,6 +170,9 @@ fn check(args: &EvaluateArgs) -> anyhow::Result<(LayoutList, Vec<u64>, EnvConfig
         communication_range: args.communication_range,
         transmission_range: args.transmission_range,
         user_speed: args.user_speed,
+        // A server is not told who is lost; it sees who is listed.
+        lose_uav: args.lose_uav.filter(|_| args.server.is_some()),
+        user_slots: args.user_slots.clone(),
         ..EnvConfig::default()
     };
     env.validate()?;
@@ -183,7 +189,7 @@ fn check(args: &EvaluateArgs) -> anyhow::Result<(LayoutList, Vec<u64>, EnvConfig
     let local_only = args.report.is_some() || args.disturbance() != Disturbance::default();
     ensure!(
         args.server.is_none() || !local_only,
-        "--report, --lose-uav and --position-noise work for files, bundled policies and baselines only; leave out --server"
+        "--report and --position-noise work for files, bundled policies and baselines only; leave out --server"
     );
     ensure!(
         !list.mixed || (args.server.is_none() && !local_only),
@@ -195,7 +201,7 @@ fn check(args: &EvaluateArgs) -> anyhow::Result<(LayoutList, Vec<u64>, EnvConfig
 
 impl EvaluateArgs {
     fn disturbance(&self) -> Disturbance {
-        Disturbance { lose: self.lose_uav, position_noise: self.position_noise }
+        Disturbance { lose: self.lose_uav.filter(|_| self.server.is_none()), position_noise: self.position_noise }
     }
 
     /// The command that repeats this evaluation, including values from environment variables.
@@ -231,6 +237,10 @@ impl EvaluateArgs {
         if let Some(LostUav { uav, slot }) = self.lose_uav {
             add("lose-uav", format!("{uav}@{slot}"));
         }
+        for UserSlots { user, from, until } in &self.user_slots {
+            let until = until.map_or_else(String::new, |until| format!("..{until}"));
+            add("user-slots", format!("{user}@{from}{until}"));
+        }
         if self.report_layout > 0 {
             add("report-layout", self.report_layout.to_string());
         }
@@ -246,6 +256,17 @@ fn lost_uav(text: &str) -> Result<LostUav, String> {
     let parts = text.split_once('@').and_then(|(uav, slot)| Some((uav.parse().ok()?, slot.parse().ok()?)));
     let (uav, slot) = parts.ok_or("expected UAV@SLOT, two whole numbers counted from 0, as in 1@20")?;
     Ok(LostUav { uav, slot })
+}
+
+/// `USER@FROM` or `USER@FROM..UNTIL`, counted from 0.
+fn user_slots(text: &str) -> Result<UserSlots, String> {
+    let parse = || {
+        let (user, slots) = text.split_once('@')?;
+        let (from, until) = slots.split_once("..").map_or((slots, None), |(from, until)| (from, Some(until)));
+        let until = until.map(str::parse).transpose().ok()?;
+        Some(UserSlots { user: user.parse().ok()?, from: from.parse().ok()?, until })
+    };
+    parse().ok_or_else(|| "expected USER@FROM or USER@FROM..UNTIL, whole numbers counted from 0, as in 3@10..60".to_owned())
 }
 
 /// `word` quoted for a shell.
@@ -303,7 +324,10 @@ mod tests {
             (vec!["--transmission-range", "0.5"], "detection_range"),
             (vec!["--report-layout", "256"], "from 0 to 255"),
             (vec!["--report", "r", "--server", "localhost:1"], "leave out --server"),
-            (vec!["--lose-uav", "0@1", "--server", "localhost:1"], "leave out --server"),
+            (vec!["--position-noise", "0.1", "--server", "localhost:1"], "leave out --server"),
+            (vec!["--user-slots", "5@0"], "user_slots[0].user"),
+            (vec!["--user-slots", "1@9..3"], "user_slots[0].until"),
+            (vec!["--user-slots", "1@x"], "USER@FROM"),
         ] {
             let refused = parse(&words).and_then(|args| check(&args).map(|_| ()).map_err(|e| format!("{e:#}")));
             let error = refused.expect_err("must be refused");

@@ -61,6 +61,9 @@ pub struct ServeArgs {
     /// Maximum memory of all sessions together, in bytes
     #[arg(long, env = "QEDGIX_SESSION_MEMORY", default_value_t = 512 << 20, value_name = "BYTES")]
     session_memory: usize,
+    /// Slots after which a UAV or user that is missing from the requests of its fleet is forgotten; until then it keeps its memory
+    #[arg(long, env = "QEDGIX_ABSENT_AFTER", default_value_t = 100, value_name = "SLOTS")]
+    absent_after: u64,
     /// Idle time after which a hosted environment expires
     #[arg(long, env = "QEDGIX_ENVIRONMENT_TTL", default_value = "10m", value_parser = duration, value_name = "TIME")]
     environment_ttl: Duration,
@@ -270,6 +273,7 @@ impl ServeArgs {
             session_ttl: self.session_ttl,
             max_sessions: self.max_sessions,
             session_memory: self.session_memory,
+            absent_after: self.absent_after,
             environment_ttl: self.environment_ttl,
             max_environments: self.max_environments,
             environment_memory: self.environment_memory,

@@ -37,6 +37,8 @@ pub struct BatchEnv {
     weights: Vec<f64>,
     /// (M) whether the UAV is lost: it neither moves nor collects.
     lost: Vec<bool>,
+    /// (N) whether the user is there in the current slot.
+    there: Vec<bool>,
     uav_xy: Vec<f32>,
     user_xy: Vec<f32>,
     aoi: Vec<f32>,
@@ -62,6 +64,7 @@ impl BatchEnv {
             moves: DIRECTIONS[..config.actions()].iter().map(|d| [d[0] * config.speed, d[1] * config.speed]).collect(),
             weights: config.user_weights(),
             lost: vec![false; m],
+            there: vec![true; n],
             uav_xy: vec![0.0; copies * m * 2],
             user_xy: vec![0.0; copies * n * 2],
             aoi: vec![0.0; copies * n],
@@ -84,6 +87,9 @@ impl BatchEnv {
         let (m, n) = (self.config.uavs, self.config.users);
         self.slot = 0;
         self.lost.fill(false);
+        self.there.fill(true);
+        self.lose_uavs(0);
+        self.update_users(0);
         self.aoi.fill(0.0);
         self.reward.fill(0.0);
         self.counter.clear();
@@ -129,8 +135,10 @@ impl BatchEnv {
         for (walk, users) in self.walks.iter_mut().zip(self.user_xy.chunks_exact_mut(n * 2)) {
             walk.step(users);
         }
-        self.collect();
+        let before = self.update_users(self.slot + 1);
+        self.collect(&before);
         self.slot += 1;
+        self.lose_uavs(self.slot);
         &self.reward
     }
 
@@ -155,8 +163,25 @@ impl BatchEnv {
         Ok(self.step(actions))
     }
 
-    /// Collects data at the current positions and computes AoI, metrics and rewards.
-    fn collect(&mut self) {
+    fn lose_uavs(&mut self, slot: usize) {
+        if let Some(lost) = self.config.lose_uav {
+            self.lost[lost.uav] |= lost.slot <= slot;
+        }
+    }
+
+    /// Determines the users that are there in `slot`. Returns those that were there before; empty if users do not come and go.
+    fn update_users(&mut self, slot: usize) -> Vec<bool> {
+        let Self { config, there, .. } = self;
+        if config.user_slots.is_empty() {
+            return Vec::new();
+        }
+        let before = there.clone();
+        config.user_slots.iter().for_each(|user| there[user.user] = user.contains(slot));
+        before
+    }
+
+    /// Collects data at the current positions and computes AoI, metrics and rewards. `before`: see [`BatchEnv::update_users`].
+    fn collect(&mut self, before: &[bool]) {
         let (m, n) = (self.config.uavs, self.config.users);
         let range = self.config.transmission_range * self.config.transmission_range;
         let factor = self.config.effective_reward_scale();
@@ -164,18 +189,31 @@ impl BatchEnv {
             let uavs = &self.uav_xy[b * m * 2..(b + 1) * m * 2];
             let users = &self.user_xy[b * n * 2..(b + 1) * n * 2];
             let aoi = &mut self.aoi[b * n..(b + 1) * n];
-            let mut sum = 0.0;
-            for ((user, age), weight) in users.chunks_exact(2).zip(aoi.iter_mut()).zip(&self.weights) {
+            let (mut sum, mut total) = (0.0, n as f64);
+            for (j, ((user, age), weight)) in users.chunks_exact(2).zip(aoi.iter_mut()).zip(&self.weights).enumerate() {
                 let (x, y) = (f64::from(user[0]), f64::from(user[1]));
                 let collected = uavs.chunks_exact(2).zip(&self.lost).any(|(uav, lost)| {
                     let (dx, dy) = (f64::from(uav[0]) - x, f64::from(uav[1]) - y);
                     dx * dx + dy * dy <= range && !lost
                 });
-                *age = if collected { 0.0 } else { *age + 1.0 };
+                let came = before.get(j) == Some(&false);
+                *age = if collected || came || !self.there[j] { 0.0 } else { *age + 1.0 };
                 sum += weight * f64::from(*age);
             }
-            self.counter.add(b, aoi);
-            self.reward[b] = (-factor * sum / n as f64) as f32;
+            if before.is_empty() {
+                self.counter.add(b, aoi);
+            } else {
+                self.counter.add_present(b, aoi, &self.there);
+                total = self
+                    .weights
+                    .iter()
+                    .zip(&self.there)
+                    .filter(|(_, there)| **there)
+                    .map(|(weight, _)| weight)
+                    .sum::<f64>()
+                    .max(1e-9);
+            }
+            self.reward[b] = (-factor * sum / total) as f32;
         }
     }
 
@@ -194,7 +232,10 @@ impl BatchEnv {
     pub fn mean_aoi(&self, b: usize) -> f64 {
         let n = self.config.users;
         let aoi = &self.aoi[b * n..(b + 1) * n];
-        aoi.iter().zip(&self.weights).map(|(&a, w)| w * f64::from(a)).sum::<f64>() / n as f64
+        let there = |j: usize| if self.there[j] { self.weights[j] } else { 0.0 };
+        // Users that are not there have AoI 0.
+        let total = if self.config.user_slots.is_empty() { n as f64 } else { (0..n).map(there).sum::<f64>().max(1e-9) };
+        aoi.iter().zip(&self.weights).map(|(&a, w)| w * f64::from(a)).sum::<f64>() / total
     }
 
     /// Metrics of copy `b` over the slots so far.

@@ -69,6 +69,36 @@ impl Ranges {
     }
 }
 
+/// A UAV that is lost: from `slot` on, it does not move, collect or detect, and is not detected; its actions have no effect.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LostUav {
+    /// Index of the UAV, from 0.
+    pub uav: usize,
+    /// The first slot in which it is lost.
+    pub slot: usize,
+}
+
+/// The slots in which a user is there. Before, and from `until` on, it is not detected and its AoI does not count; its AoI begins at 0.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct UserSlots {
+    /// Index of the user, from 0.
+    pub user: usize,
+    /// The first slot.
+    #[serde(default)]
+    pub from: usize,
+    /// The first slot after; absent: it stays to the end.
+    #[serde(default)]
+    pub until: Option<usize>,
+}
+
+impl UserSlots {
+    pub(super) fn contains(&self, slot: usize) -> bool {
+        self.from <= slot && self.until.is_none_or(|until| slot < until)
+    }
+}
+
 /// Everything that determines an environment except the episode's seed. Lengths are in units of the square's side.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -101,6 +131,10 @@ pub struct EnvConfig {
     pub weights: Option<Vec<f64>>,
     /// Distance that a user moves per slot, in a direction that changes slightly in each slot. 0: users do not move.
     pub user_speed: f64,
+    /// A UAV that is lost during the episode. Not for training.
+    pub lose_uav: Option<LostUav>,
+    /// The slots of users that come and go, at most one entry per user; all others are always there. Not for training.
+    pub user_slots: Vec<UserSlots>,
 }
 
 impl Default for EnvConfig {
@@ -120,6 +154,8 @@ impl Default for EnvConfig {
             layout: Layout::Random,
             weights: None,
             user_speed: 0.0,
+            lose_uav: None,
+            user_slots: Vec::new(),
         }
     }
 }
@@ -147,6 +183,21 @@ impl EnvConfig {
     /// `reward_scale`, or its default 1/K.
     pub fn effective_reward_scale(&self) -> f64 {
         self.reward_scale.unwrap_or(1.0 / self.slots as f64)
+    }
+
+    /// Whether UAV `i` flies in `slot`.
+    pub fn flies(&self, i: usize, slot: usize) -> bool {
+        self.lose_uav.is_none_or(|lost| lost.uav != i || slot < lost.slot)
+    }
+
+    /// Whether user `j` is there in `slot`.
+    pub fn is_there(&self, j: usize, slot: usize) -> bool {
+        self.user_slots.iter().find(|user| user.user == j).is_none_or(|user| user.contains(slot))
+    }
+
+    /// Whether UAVs or users change during an episode.
+    pub fn changes(&self) -> bool {
+        self.lose_uav.is_some() || !self.user_slots.is_empty()
     }
 
     /// The weight of each user, scaled to mean 1.
@@ -184,6 +235,7 @@ impl EnvConfig {
         if let Layout::Given(points) = &self.layout {
             check_points("layout.given", points, self.users, "user")?;
         }
+        self.validate_changes()?;
         let Some(weights) = &self.weights else { return Ok(()) };
         if weights.len() != self.users {
             return Err(Invalid::new(
@@ -197,6 +249,30 @@ impl EnvConfig {
         }
         if weights.iter().sum::<f64>() <= 0.0 {
             return Err(Invalid::new("weights", "only zeros", "at least one positive weight"));
+        }
+        Ok(())
+    }
+
+    fn validate_changes(&self) -> Result<(), Invalid> {
+        if let Some(lost) = self.lose_uav {
+            in_range("lose_uav.uav", lost.uav, 0..=self.uavs - 1)?;
+            in_range("lose_uav.slot", lost.slot, 0..=self.slots - 1)?;
+        }
+        if self.user_slots.len() > self.users {
+            let expected = format!("at most {} entries, one per user", self.users);
+            return Err(Invalid::new("user_slots", format!("{} entries", self.user_slots.len()), expected));
+        }
+        let mut listed = vec![false; self.users];
+        for (i, &UserSlots { user, from, until }) in self.user_slots.iter().enumerate() {
+            let field = |name: &str| format!("user_slots[{i}].{name}");
+            in_range(&field("user"), user, 0..=self.users - 1)?;
+            in_range(&field("from"), from, 0..=self.slots)?;
+            if let Some(until) = until {
+                in_range(&field("until"), until, from..=self.slots)?;
+            }
+            if std::mem::replace(&mut listed[user], true) {
+                return Err(Invalid::new(field("user"), user, "a user without another entry"));
+            }
         }
         Ok(())
     }

@@ -44,6 +44,8 @@ pub(super) struct MetricsCounter {
     sums: Vec<u64>,
     /// (B, N) whether the user's data was collected.
     visited: Vec<bool>,
+    /// (B, N) slots in which the user was there; empty if users do not come and go.
+    present: Vec<u32>,
 }
 
 impl MetricsCounter {
@@ -55,6 +57,7 @@ impl MetricsCounter {
             counts: vec![0; copies * values],
             sums: vec![0; copies * users],
             visited: vec![false; copies * users],
+            present: Vec::new(),
         }
     }
 
@@ -62,6 +65,7 @@ impl MetricsCounter {
         self.counts.fill(0);
         self.sums.fill(0);
         self.visited.fill(false);
+        self.present.fill(0);
     }
 
     /// Counts one slot of copy `b`.
@@ -72,6 +76,20 @@ impl MetricsCounter {
             counts[age as usize] += 1;
             self.sums[first + i] += age as u64;
             self.visited[first + i] |= age == 0.0;
+        }
+    }
+
+    /// As [`MetricsCounter::add`], where only the users `there` count.
+    pub(super) fn add_present(&mut self, b: usize, aoi: &[f32], there: &[bool]) {
+        self.present.resize(self.visited.len(), 0);
+        let counts = &mut self.counts[b * self.values..(b + 1) * self.values];
+        let first = b * self.users;
+        for (i, (&age, _)) in aoi.iter().zip(there).enumerate().filter(|(_, (_, there))| **there) {
+            counts[age as usize] += 1;
+            self.sums[first + i] += age as u64;
+            // An AoI of 0 in its first slot is no collection.
+            self.visited[first + i] |= age == 0.0 && self.present[first + i] > 0;
+            self.present[first + i] += 1;
         }
     }
 
@@ -91,12 +109,36 @@ impl MetricsCounter {
         });
         let sum: f64 = sums.iter().map(|&s| s as f64).sum();
         let squares: f64 = sums.iter().map(|&s| s as f64 * s as f64).sum();
+        let weighted = sums.iter().zip(weights).map(|(&s, w)| w * s as f64).sum::<f64>();
+        if let Some(present) = self.present.get(b * self.users..(b + 1) * self.users) {
+            return present_metrics((sums, present, visited), weights, (weighted, counts, p95.unwrap_or(0)));
+        }
         EpisodeMetrics {
-            mean_aoi: sums.iter().zip(weights).map(|(&s, w)| w * s as f64).sum::<f64>() / (n * slots),
+            mean_aoi: weighted / (n * slots),
             peak_aoi: counts.iter().rposition(|&c| c > 0).unwrap_or(0) as f64,
             p95_aoi: p95.unwrap_or(0) as f64,
             coverage: visited.iter().filter(|&&v| v).count() as f64 / n,
             fairness: if squares > 0.0 { sum * sum / (n * squares) } else { 1.0 },
         }
+    }
+}
+
+/// Metrics where users come and go: means over the slots in which each user was there, and over the users that were there at all.
+fn present_metrics(
+    (sums, present, visited): (&[u64], &[u32], &[bool]),
+    weights: &[f64],
+    (weighted, counts, p95): (f64, &[u32], usize),
+) -> EpisodeMetrics {
+    let slots: f64 = present.iter().zip(weights).map(|(&slots, w)| w * f64::from(slots)).sum();
+    let means: Vec<f64> =
+        sums.iter().zip(present).filter(|(_, slots)| **slots > 0).map(|(&s, &p)| s as f64 / f64::from(p)).collect();
+    let (n, sum) = (means.len().max(1) as f64, means.iter().sum::<f64>());
+    let squares: f64 = means.iter().map(|mean| mean * mean).sum();
+    EpisodeMetrics {
+        mean_aoi: weighted / slots.max(1e-9),
+        peak_aoi: counts.iter().rposition(|&c| c > 0).unwrap_or(0) as f64,
+        p95_aoi: p95 as f64,
+        coverage: visited.iter().filter(|&&v| v).count() as f64 / n,
+        fairness: if squares > 0.0 { sum * sum / (n * squares) } else { 1.0 },
     }
 }

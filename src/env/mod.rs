@@ -9,7 +9,7 @@ mod point;
 mod walk;
 
 pub use batch::{BatchEnv, StepError};
-pub use config::{Boundary, EnvConfig, Layout, Ranges, Start};
+pub use config::{Boundary, EnvConfig, Layout, LostUav, Ranges, Start, UserSlots};
 pub use episode::Episode;
 pub use metrics::EpisodeMetrics;
 pub use point::{Point, points};

@@ -4,28 +4,18 @@
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use crate::env::{EnvConfig, Point};
+use crate::env::{EnvConfig, LostUav, Point};
 use crate::invalid::{Invalid, in_range};
 use crate::rng;
 
 /// The disturbances of an evaluation; none by default.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Disturbance {
-    /// The UAV that is lost during each episode.
+    /// The UAV that is lost during each episode. It remains in the fleet, and its headings are ignored.
     pub lose: Option<LostUav>,
     /// Standard deviation of the Gaussian error of each observed coordinate, drawn in every slot; in units of the square's side.
     /// Moves and collection use the true positions.
     pub position_noise: f64,
-}
-
-/// A UAV that is lost: from `slot` on, it does not move, collect or detect, and is not detected. It remains in the fleet; its
-/// headings are ignored.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct LostUav {
-    /// Index of the UAV, from 0.
-    pub uav: usize,
-    /// The first slot in which it is lost.
-    pub slot: usize,
 }
 
 impl Disturbance {
@@ -41,22 +31,35 @@ impl Disturbance {
     }
 
     /// Index of the UAV that is lost in `slot`.
-    pub(super) fn lost(&self, slot: usize) -> Option<usize> {
-        self.lose.filter(|lost| lost.slot <= slot).map(|lost| lost.uav)
+    pub(super) fn lost(&self, env: &EnvConfig, slot: usize) -> Option<usize> {
+        self.lose.or(env.lose_uav).filter(|lost| lost.slot <= slot).map(|lost| lost.uav)
     }
 
-    /// Replaces the true positions in `slot` of the episode with this seed by the observed positions.
-    pub(super) fn distort(&self, env: &EnvConfig, seed: u64, slot: usize, uavs: &mut [Point], users: &mut [Point]) {
+    /// Replaces the true positions in `slot` of the episode with this seed by the observed positions. `hide`: whether users that are not
+    /// there are out of sight; policies that know all positions know where users will appear.
+    pub(super) fn distort(
+        &self,
+        env: &EnvConfig,
+        (seed, slot): (u64, usize),
+        uavs: &mut [Point],
+        users: &mut [Point],
+        hide: bool,
+    ) {
         if self.position_noise > 0.0 {
             let mut rng = rng::stream(seed, "position-noise", slot as u64);
-            for x in uavs.iter_mut().chain(users).flatten() {
+            for x in uavs.iter_mut().chain(users.iter_mut()).flatten() {
                 let error: f64 = StandardNormal.sample(&mut rng);
                 // As in the environment, positions are f32, and range tests start from them.
                 *x = f64::from((*x + self.position_noise * error) as f32);
             }
         }
-        if let Some(uav) = self.lost(slot) {
+        if let Some(uav) = self.lost(env, slot) {
             uavs[uav] = [undetectable(env, self.position_noise); 2];
+        }
+        if hide {
+            for absent in env.user_slots.iter().filter(|user| !env.is_there(user.user, slot)) {
+                users[absent.user] = [1.0 - undetectable(env, self.position_noise); 2];
+            }
         }
     }
 }

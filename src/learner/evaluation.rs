@@ -10,7 +10,7 @@ use super::disturbance::Disturbance;
 use super::layouts::LayoutList;
 use crate::env::{BatchEnv, EnvConfig, EpisodeMetrics, Point, points};
 use crate::invalid::{Invalid, in_range};
-use crate::policy::{EnvParams, FleetGraph, FleetStep, Policy};
+use crate::policy::{EnvParams, FleetGraph, FleetStep, Policy, RequiredInput};
 
 /// Runs `policy` on the episodes with these seeds, split among `threads`. Returns the metrics in the order of `seeds`. A policy
 /// with fewer actions than the environment uses the first ones.
@@ -214,6 +214,7 @@ fn run(
     let (m, n, params) = (config.uavs, config.users, EnvParams::from(config));
     let mut env = BatchEnv::new(config, seeds.len())?;
     env.reset(seeds);
+    let hide = policy.needs() != RequiredInput::FullScene;
     let width = policy.memory_len(m, n);
     let mut memory = vec![0.0; width * seeds.len()];
     let mut memories = split(&mut memory, width, seeds.len());
@@ -226,7 +227,7 @@ fn run(
     let mut flow = observer.observe(&env);
     while flow.is_continue() && !env.done() {
         let step = env.slot();
-        if let Some(uav) = disturbance.lost(step) {
+        if let Some(uav) = disturbance.lost(config, step) {
             env.lose_uav(uav);
         }
         for ((b, graph), &seed) in graphs.iter_mut().enumerate().zip(seeds) {
@@ -234,7 +235,7 @@ fn run(
             uavs.extend(points(&env.uav_xy()[b * m * 2..][..m * 2]));
             users.clear();
             users.extend(points(&env.user_xy()[b * n * 2..][..n * 2]));
-            disturbance.distort(config, seed, step, &mut uavs, &mut users);
+            disturbance.distort(config, (seed, step), &mut uavs, &mut users, hide);
             graph.set_scene(&uavs, &users, &env.aoi()[b * n..(b + 1) * n], params.ranges());
         }
         let mut steps: Vec<FleetStep<'_>> = graphs
@@ -244,6 +245,7 @@ fn run(
             .map(|((graph, memory), headings)| FleetStep {
                 env: params,
                 graph,
+                profile: None,
                 step: step as u64,
                 memory,
                 headings,

@@ -342,7 +342,7 @@ impl<T: Real> Workspace<T> {
                     let memory = &mut self.memory[(e - range.start) * memory_len..][..memory_len];
                     let sight = self.geometry.last_sight(aoi);
                     agent.remember(env, &sight, t as u64, memory, &mut self.received);
-                    self.goals.push_fleet(env, &sight, t as u64, memories(memory, n), &self.last[self.last.len() - m..]);
+                    self.goals.push_fleet(env, &sight, t as u64, memories(memory, n), (&self.last[self.last.len() - m..], None));
                 }
                 self.identity_token.extend_from_slice(&ep.identity_token[e * m * TOKEN..][..m * TOKEN]);
                 self.position.extend_from_slice(uav_xy);

@@ -17,8 +17,9 @@ mod teacher;
 mod trainer;
 mod update;
 
+pub use crate::env::LostUav;
 pub use comparison::{Comparison, Pair, PolicyEvaluation};
-pub use disturbance::{Disturbance, LostUav};
+pub use disturbance::Disturbance;
 pub use episodes::{Episodes, Symmetry};
 pub use evaluation::{TracedEvaluation, Trajectory, evaluate, evaluate_list, evaluate_traced, evaluate_until};
 pub use event::{Evaluation, Event, Iteration};

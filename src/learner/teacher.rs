@@ -87,7 +87,8 @@ impl Teacher {
             users.extend(points(&env.user_xy()[b * n * 2..][..n * 2]));
             graph.set_scene(uavs, users, &env.aoi()[b * n..][..n], self.env.ranges());
             let (memory, headings) = (&mut self.memories[b], &mut self.headings[b * m..][..m]);
-            let step = FleetStep { env: self.env, graph, step: env.slot() as u64, memory, headings, q_values: None };
+            let step =
+                FleetStep { env: self.env, graph, profile: None, step: env.slot() as u64, memory, headings, q_values: None };
             self.rule.act(&mut [step]);
         }
     }

@@ -94,7 +94,7 @@ impl BatchedAgent {
                 let (memory, last) = (&mut self.memory[f * len..][..len], &self.last[f * m..][..m]);
                 let sight = self.geometry.last_sight(aoi);
                 agent.remember(env, &sight, self.slot, memory, &mut self.received);
-                self.goals.push_fleet(env, &sight, self.slot, memories(memory, n), last);
+                self.goals.push_fleet(env, &sight, self.slot, memories(memory, n), (last, None));
             }
         }
         self.geometry.finish(&config);

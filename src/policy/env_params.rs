@@ -1,6 +1,6 @@
 //! The parameters of the environment that a policy may know.
 
-use crate::env::{EnvConfig, Ranges};
+use crate::env::{EnvConfig, Point, Ranges};
 
 /// The parameters of the environment that a policy flies in. Lengths are in units of the square's side.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -17,6 +17,8 @@ pub struct EnvParams {
     pub actions: usize,
     /// K, slots per episode: how far policies that plan look ahead.
     pub slots: usize,
+    /// Width and height of the area, in the middle of the unit square: [1, 1] if it is the square.
+    pub extent: [f64; 2],
 }
 
 impl From<&EnvConfig> for EnvParams {
@@ -28,11 +30,17 @@ impl From<&EnvConfig> for EnvParams {
             communication_range: env.ranges().communication,
             actions: env.actions(),
             slots: env.slots,
+            extent: [1.0; 2],
         }
     }
 }
 
 impl EnvParams {
+    /// Whether `p` is in the area.
+    pub fn contains(&self, p: Point) -> bool {
+        p.iter().zip(self.extent).all(|(x, extent)| ((1.0 - extent) / 2.0..=f64::midpoint(1.0, extent)).contains(x))
+    }
+
     /// Ranges within which nodes detect each other.
     pub fn ranges(&self) -> Ranges {
         Ranges { detection: self.detection_range, communication: self.communication_range }

@@ -143,6 +143,17 @@ impl FleetGraph {
         complete
     }
 
+    /// Adds users that no node detects, until there are `users`.
+    pub fn add_undetected_users(&mut self, users: usize) {
+        if users > self.users {
+            self.users = users;
+            self.aoi.resize(users, 0.0);
+            self.offsets.resize(self.uavs + users + 1, self.detections.len() as u32);
+            // Their positions are not known.
+            self.user_positions = None;
+        }
+    }
+
     /// M.
     pub fn uavs(&self) -> usize {
         self.uavs

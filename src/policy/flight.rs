@@ -12,19 +12,14 @@ pub(in crate::policy) fn next_position(env: &EnvParams, from: Point, h: usize) -
     [from[0] + env.speed * DIRECTIONS[h][0], from[1] + env.speed * DIRECTIONS[h][1]]
 }
 
-/// Whether `p` is in the unit square.
-pub(in crate::policy) fn in_square(p: Point) -> bool {
-    p.iter().all(|x| (0.0..=1.0).contains(x))
-}
-
-/// The heading that ends nearest to `to`; headings that leave the square only if all do. Of equal headings, the lowest.
+/// The heading that ends nearest to `to`; headings that leave the area only if all do. Of equal headings, the lowest.
 pub(in crate::policy) fn heading_toward(env: &EnvParams, from: Point, to: Point) -> u8 {
     let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
     // All moves have the same length, so the move that ends nearest points most towards the target.
     let mut best = (false, f64::NEG_INFINITY, 0);
     for (h, direction) in DIRECTIONS.iter().enumerate().take(EnvConfig::COMPASS) {
         let progress = dx * direction[0] + dy * direction[1];
-        let inside = in_square(next_position(env, from, h));
+        let inside = env.contains(next_position(env, from, h));
         if (inside, progress) > (best.0, best.1) {
             best = (inside, progress, h);
         }

@@ -4,10 +4,10 @@
 //! Networks compute *rows*: first all UAVs in the order given, then the users within L links of a UAV, ordered by the number
 //! of links to the nearest UAV, for L graph layers. Other users have no row and are never computed.
 
-use super::Sight;
 use super::fleet_graph::FleetGraph;
 use super::hop_search::HopSearch;
 use super::neighbor_search::{Detection, NeighborSearch};
+use super::{Place, Sight};
 use crate::env::{Point, Ranges, points};
 use crate::nn::Graph;
 
@@ -29,6 +29,8 @@ pub struct FleetSpan {
     first_node: usize,
     /// Index of the first user among all users.
     first_user: usize,
+    /// Index of the place of the first UAV, if places are not those of slot 0.
+    first_place: Option<usize>,
 }
 
 /// The node that a row stands for.
@@ -61,6 +63,8 @@ pub struct Geometry {
     detections: Vec<Detection>,
     /// AoI / K of all users.
     aoi_scaled: Vec<f32>,
+    /// Places of the UAVs of fleets that have changed.
+    places: Vec<Place>,
     rows: Vec<Row>,
     row_of: Vec<u32>,
     graph: Graph,
@@ -99,13 +103,15 @@ impl Geometry {
         self.offsets.push(0);
         self.detections.clear();
         self.aoi_scaled.clear();
+        self.places.clear();
         self.row_of.clear();
     }
 
     fn add_fleet(&mut self, config: &GeometryConfig, uavs: usize, users: usize) {
         let first_uav = self.fleets.last().map_or(0, |f| f.first_uav + f.uavs);
         let (first_node, first_user) = (self.row_of.len(), self.aoi_scaled.len());
-        self.fleets.push(FleetSpan { uavs, users, scale: 1.0 / config.ranges.detection, first_uav, first_node, first_user });
+        let scale = 1.0 / config.ranges.detection;
+        self.fleets.push(FleetSpan { uavs, users, scale, first_uav, first_node, first_user, first_place: None });
         self.row_of.resize(self.row_of.len() + uavs + users, NO_ROW);
     }
 
@@ -139,6 +145,19 @@ impl Geometry {
         }
         self.offsets.resize(self.row_of.len() + 1, self.detections.len() as u32);
         self.aoi_scaled.extend(graph.aoi().iter().map(|a| a / config.episode_slots as f32));
+    }
+
+    /// Sets the places of the UAVs of the last fleet, one per UAV; none: those of UAVs that fly together from slot 0.
+    pub fn set_places(&mut self, places: &[Place]) {
+        if let Some(fleet) = self.fleets.last_mut().filter(|fleet| fleet.uavs == places.len()) {
+            fleet.first_place = Some(self.places.len());
+            self.places.extend_from_slice(places);
+        }
+    }
+
+    /// The place of UAV `uav` of `fleet`.
+    pub fn place(&self, fleet: &FleetSpan, uav: usize) -> Place {
+        fleet.first_place.map_or_else(|| Place::of(uav, fleet.uavs), |first| self.places[first + uav])
     }
 
     /// Orders the rows and builds the graph; call it after the last fleet.

@@ -3,6 +3,7 @@
 //! or the horizon, except through the quantities that matter: flight times, ages, and numbers of users.
 
 use super::env_params::EnvParams;
+use super::fleet_profile::{FleetProfile, Place};
 use super::flight::{distance, heading_toward, travel_slots};
 use super::memory::{GRID, RememberedUser, UavMemory};
 use super::sight::Sight;
@@ -65,18 +66,22 @@ impl Goals {
         &self.features
     }
 
-    /// Adds one row per UAV of a fleet in slot `slot`. `memories` holds their memories, `last` their last headings.
+    /// Adds one row per UAV of a fleet in slot `slot`. `memories` holds their memories, `last` their last
+    /// headings.
     pub fn push_fleet<'a>(
         &mut self,
         env: &EnvParams,
         sight: &Sight<'_>,
         slot: u64,
         memories: impl Iterator<Item = UavMemory<'a>>,
-        last: &[u8],
+        (last, profile): (&[u8], Option<&FleetProfile>),
     ) {
         for ((i, memory), &last) in memories.enumerate().zip(last) {
             let at = sight.positions[i];
-            let view = View { env, uav: i, uavs: sight.uavs(), at, slot: slot as f64, last };
+            let place = FleetProfile::place(profile, i, sight.uavs());
+            let open = FleetProfile::is_open(profile);
+            let own = FleetProfile::env(profile, env, i);
+            let view = View { env: &own, place, open, uavs: sight.uavs(), at, slot: slot as f64, last };
             self.push_row(&view, memory, sight.detected_uavs(i).map(|(_, at)| at));
         }
     }
@@ -85,11 +90,12 @@ impl Goals {
         let mut users = std::mem::take(&mut self.users);
         users.clear();
         users.extend(memory.users().flatten());
-        let all = memory.users().len();
+        let unknown = memory.unknown_users(view.open);
+        let all = users.len() + unknown;
         let ground = Ground::new(memory);
         let common = [
-            ln1(ground.unsearched as f64 * CELL_SHARE * (all - users.len()) as f64),
-            (all - users.len()) as f64 / all.max(1) as f64,
+            ln1(ground.unsearched as f64 * CELL_SHARE * unknown as f64),
+            unknown as f64 / all.max(1) as f64,
             ground.unsearched as f64 * CELL_SHARE,
             ln1(users.len() as f64 / view.uavs as f64),
         ];
@@ -100,7 +106,7 @@ impl Goals {
         for block in 0..BLOCKS * BLOCKS {
             if ground.blocks[block] > 0 {
                 let to = ground.centers[block];
-                let goal = view.ground(to, &ground, all - users.len());
+                let goal = view.ground(to, &ground, unknown);
                 self.push(view, to, goal, common, others.clone());
             }
         }
@@ -137,7 +143,8 @@ fn ln1(x: f64) -> f64 {
 /// One UAV in one slot.
 struct View<'a> {
     env: &'a EnvParams,
-    uav: usize,
+    place: Place,
+    open: bool,
     uavs: usize,
     at: Point,
     slot: f64,
@@ -166,16 +173,8 @@ impl View<'_> {
         let slots = travel_slots(self.env, self.at, to, range);
         let expected = unknown as f64 * ground.within(to, range) / f64::from(ground.unsearched.max(1));
         let rate = expected * (self.slot + slots) / slots;
-        let own = f64::from(u8::from(self.owns(to)));
+        let own = f64::from(u8::from(self.place.owns(to)));
         [0.0, ln1(slots), 1.0 / slots, ln1(self.slot + slots), ln1(rate), ln1(expected), own]
-    }
-
-    /// Whether `p` is in the sector of this UAV, around the centre of the square. UAVs that start together search different sectors.
-    fn owns(&self, p: Point) -> bool {
-        use std::f64::consts::{PI, TAU};
-        let own = TAU * self.uav as f64 / self.uavs as f64;
-        let off = ((p[1] - 0.5).atan2(p[0] - 0.5) - own).rem_euclid(TAU);
-        off.min(TAU - off) <= PI / self.uavs as f64
     }
 }
 

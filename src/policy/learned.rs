@@ -12,8 +12,8 @@ use super::config::{AgentConfig, Identity, TOKEN};
 use super::features::{Inputs, NO_ACTION};
 use super::geometry::Geometry;
 use super::goals::Goals;
-use super::memory::{memories, uav_memory_len};
-use super::{EnvParams, FleetStep, Policy, RequiredInput};
+use super::memory::{self, memories, uav_memory_len};
+use super::{Carry, EnvParams, FleetStep, Policy, RequiredInput};
 use crate::invalid::Invalid;
 use crate::nn::{HIDDEN, Weights, argmax};
 use crate::rng;
@@ -123,6 +123,25 @@ impl Policy for LearnedPolicy {
         }
     }
 
+    fn carry(&self, from: &[f32], to: &mut [f32], carry: &Carry<'_>) {
+        let stride = self.stride();
+        let (hidden, remembered) = from.split_at(carry.from.0 * stride);
+        let (to_hidden, to_remembered) = to.split_at_mut(carry.to.0 * stride);
+        carry.uav_rows(stride, hidden, to_hidden);
+        if self.remembers_users() {
+            memory::carry(remembered, to_remembered, carry);
+        }
+    }
+
+    fn overrule(&self, memory: &mut [f32], uav: usize, heading: u8) {
+        let known = usize::from(heading) < self.actions();
+        memory[uav * self.stride() + HIDDEN] = if known { f32::from(heading) } else { -1.0 };
+    }
+
+    fn remembers_users(&self) -> bool {
+        !self.agent.config().memory.is_none()
+    }
+
     fn is_cheap(&self) -> bool {
         self.agent.config().hops <= 1
     }
@@ -146,6 +165,9 @@ impl LearnedPolicy {
         b.goals.clear();
         for fleet in fleets.iter_mut() {
             b.geometry.push_graph(&self.agent.geometry_config(&fleet.env), fleet.graph);
+            if let Some(profile) = fleet.profile {
+                b.geometry.set_places(&profile.places);
+            }
             let (memory, remembered) = fleet.memory.split_at_mut(fleet.graph.uavs() * stride);
             for uav in memory.chunks_exact(stride) {
                 // The memory may come from a client. A number that is not a heading counts as no heading.
@@ -155,9 +177,10 @@ impl LearnedPolicy {
             }
             if !self.agent.config().memory.is_none() {
                 let sight = fleet.graph.sight().expect("the caller provides what `needs` requires");
+                memory::exclude_outside(&fleet.env, sight.users(), remembered);
                 self.agent.remember(&fleet.env, &sight, fleet.step, remembered, &mut b.received);
                 let last = &b.last[b.last.len() - sight.uavs()..];
-                b.goals.push_fleet(&fleet.env, &sight, fleet.step, memories(remembered, sight.users()), last);
+                b.goals.push_fleet(&fleet.env, &sight, fleet.step, memories(remembered, sight.users()), (last, fleet.profile));
             }
             if let Some(own) = fleet.graph.uav_positions() {
                 b.position.extend(own.iter().flatten().map(|&x| x as f32));

@@ -7,7 +7,7 @@
 //! Encoding of one UAV: [`GRID`] rows of the ground, each an integer with one bit per cell; then per user [`USER`] numbers. All are
 //! integers or f32 positions, which f32 holds exactly.
 
-use super::Sight;
+use super::{Carry, EnvParams, Sight};
 use crate::env::Point;
 
 /// Cells along each side of the unit square. A row of cells is an integer below 2^GRID, which f32 holds exactly.
@@ -66,6 +66,34 @@ impl<'a> UavMemory<'a> {
     }
 }
 
+impl UavMemory<'_> {
+    /// Number of users that the UAV does not know. `open`: there may be more users than the memory has room for; their number is
+    /// estimated from the known users per searched ground.
+    pub fn unknown_users(&self, open: bool) -> usize {
+        let listed = self.users().filter(Option::is_none).count();
+        if !open {
+            return listed;
+        }
+        let searched: u32 = (0..GRID).map(|row| self.searched(row).count_ones()).sum();
+        let left = (GRID * GRID) as u32 - searched;
+        let known = self.users().flatten().count();
+        let expected = (known + 1) as f64 * f64::from(left) / f64::from(searched.max(1));
+        listed.max(expected.round() as usize)
+    }
+}
+
+/// Copies the memories of UAVs to those of another fleet (see `Policy::carry`).
+pub fn carry(from: &[f32], to: &mut [f32], carry: &Carry<'_>) {
+    let (len_from, len_to) = (uav_memory_len(carry.from.1), uav_memory_len(carry.to.1));
+    for &(a, b) in carry.uavs {
+        let (from, to) = (&from[a as usize * len_from..][..len_from], &mut to[b as usize * len_to..][..len_to]);
+        to[..GRID].copy_from_slice(&from[..GRID]);
+        for &(a, b) in carry.users {
+            to[GRID + b as usize * USER..][..USER].copy_from_slice(&from[GRID + a as usize * USER..][..USER]);
+        }
+    }
+}
+
 /// The memories of a fleet in `numbers`, one per UAV.
 pub fn memories(numbers: &[f32], users: usize) -> impl Iterator<Item = UavMemory<'_>> {
     numbers.chunks_exact(uav_memory_len(users)).map(UavMemory::new)
@@ -81,6 +109,23 @@ pub enum Sharing {
     Own,
     /// UAVs in communication range exchange their memories in every slot.
     Shared,
+}
+
+/// Marks the ground outside the area as searched, in the memories of a fleet: nothing is there.
+pub fn exclude_outside(env: &EnvParams, users: usize, memories: &mut [f32]) {
+    if env.extent == [1.0; 2] {
+        return;
+    }
+    let center = |k: usize| (k as f64 + 0.5) / GRID as f64;
+    let outside = |row: usize| {
+        (0..GRID).filter(|&column| !env.contains([center(column), center(row)])).fold(0, |bits, c| bits | 1_u32 << c)
+    };
+    let outside: [u32; GRID] = std::array::from_fn(outside);
+    for memory in memories.chunks_exact_mut(uav_memory_len(users)) {
+        for (bits, outside) in memory.iter_mut().zip(outside) {
+            *bits = ((*bits as u32 & ALL) | outside) as f32;
+        }
+    }
 }
 
 /// Advances the memories of a fleet, one after another in `memories`, to slot `slot`. `received` is a buffer.

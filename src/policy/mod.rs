@@ -7,6 +7,7 @@ mod config;
 mod env_params;
 mod features;
 mod fleet_graph;
+mod fleet_profile;
 mod flight;
 mod geometry;
 mod goal_head;
@@ -24,6 +25,7 @@ pub use config::{AgentConfig, Aggregation, Gnn, Identity, Memory, ObservationKin
 pub use env_params::EnvParams;
 pub use features::{Inputs, NO_ACTION, SetEncoder, flat_observation, flat_state};
 pub use fleet_graph::FleetGraph;
+pub use fleet_profile::{Carry, FleetProfile, Place};
 pub use geometry::{FleetSpan, Geometry, GeometryConfig, NodeView};
 pub use goals::Goals;
 pub use hop_search::HopSearch;
@@ -55,6 +57,8 @@ pub struct FleetStep<'a> {
     pub graph: &'a FleetGraph,
     /// Index of the slot in the episode.
     pub step: u64,
+    /// How the fleet differs from one of equal UAVs that has not changed since slot 0; `None` if it does not.
+    pub profile: Option<&'a FleetProfile>,
     /// The fleet's memory, of length [`Policy::memory_len`]; updated in place.
     pub memory: &'a mut [f32],
     /// Output: heading index of each UAV.
@@ -95,6 +99,18 @@ pub trait Policy: Send + Sync {
 
     /// Initialises a fleet's memory for slot 0. `seed` determines all random numbers of the episode.
     fn start(&self, uavs: usize, users: usize, seed: u64, memory: &mut [f32]);
+
+    /// Copies what the memory `from` holds about UAVs and users to the memory `to` of another fleet, and what it holds about the whole
+    /// fleet. The rest of `to` remains: it was initialised by [`Policy::start`].
+    fn carry(&self, _from: &[f32], _to: &mut [f32], _carry: &Carry<'_>) {}
+
+    /// Writes to the memory after a slot that UAV `uav` of `uavs` does not fly the heading that the policy chose, but `heading`.
+    fn overrule(&self, _memory: &mut [f32], _uav: usize, _heading: u8) {}
+
+    /// Whether the memory holds something about each user, that is carried when users come and go.
+    fn remembers_users(&self) -> bool {
+        false
+    }
 
     /// Number of nodes, of the first ones (UAVs, then users), whose detections the policy reads. Others need not be computed.
     fn observers(&self, uavs: usize, users: usize) -> usize {

@@ -9,7 +9,7 @@ mod sequence;
 mod session;
 
 pub use compute::{decode, decoding_cost};
-pub use request::{MemoryLocation, Request, Response, Sequence, SequenceId};
+pub use request::{MemoryLocation, Motion, Request, Response, Sequence, SequenceId};
 pub use sequence::SEQUENCE_PREFIX;
 
 use std::time::Instant;

@@ -50,6 +50,8 @@ pub struct App {
     pub retention: policies::Retention,
     /// The limit of uploads of checkpoints.
     pub uploads: policies::UploadLimit,
+    /// Slots after which UAVs and users that are missing are forgotten.
+    pub absent_after: u64,
     /// Maximum size of a gRPC message or HTTP body, in bytes.
     pub max_message_size: usize,
     /// Limits of watches of jobs.

@@ -53,28 +53,41 @@ impl FleetIds {
         fingerprint
     }
 
-    /// Checks that `now` has the ids of `self`.
+    /// Checks that a repetition of a step lists the UAVs of the step, `self`.
     ///
     /// # Errors
     /// [`Invalid`] with a new and a missing id, if the ids differ.
-    pub fn check_same(&self, now: &Self) -> Result<(), Invalid> {
-        for (field, what, before, after) in [("uavs", "UAVs", &self.uavs, &now.uavs), ("users", "users", &self.users, &now.users)]
-        {
-            if before == after {
-                continue;
+    pub fn check_repeated(&self, now: &Self) -> Result<(), Invalid> {
+        check_same("uavs", (&self.uavs, &now.uavs), |uavs| format!("the same {uavs} UAVs as when the step was sent first"))
+    }
+
+    /// Checks that `now` lists the UAVs, or the users, of `self`, for a policy that has a place for each.
+    ///
+    /// # Errors
+    /// [`Invalid`] with a new and a missing id, if the ids differ.
+    pub fn check_bound(&self, now: &Self, (uavs, users): (bool, bool)) -> Result<(), Invalid> {
+        for (bound, what, ids) in [(uavs, "uavs", (&self.uavs, &now.uavs)), (users, "users", (&self.users, &now.users))] {
+            if bound {
+                let place = "because the network of this policy has a place for each of them";
+                check_same(what, (ids.0, ids.1), |count| format!("the same {count} {what} as in slot 0, {place}"))?;
             }
-            let lacks = |ids: &[String], id: &String| ids.binary_search_by(|probe| Self::order(probe, id)).is_err();
-            let new = after.iter().find(|id| lacks(before, id));
-            let missing = before.iter().find(|id| lacks(after, id));
-            let value = match (new, missing) {
-                (Some(new), Some(missing)) => format!("{new:?} instead of {missing:?}"),
-                (Some(new), None) => format!("{new:?} in addition"),
-                (None, Some(missing)) => format!("no {missing:?}"),
-                (None, None) => format!("{} ids", after.len()),
-            };
-            let expected = format!("the same {} {what} as in slot 0", before.len());
-            return Err(Invalid::new(field, value, expected));
         }
         Ok(())
     }
+}
+
+fn check_same(field: &str, (before, after): (&[String], &[String]), expected: impl Fn(usize) -> String) -> Result<(), Invalid> {
+    if before == after {
+        return Ok(());
+    }
+    let lacks = |ids: &[String], id: &String| ids.binary_search_by(|probe| FleetIds::order(probe, id)).is_err();
+    let new = after.iter().find(|id| lacks(before, id));
+    let missing = before.iter().find(|id| lacks(after, id));
+    let value = match (new, missing) {
+        (Some(new), Some(missing)) => format!("{new:?} instead of {missing:?}"),
+        (Some(new), None) => format!("{new:?} in addition"),
+        (None, Some(missing)) => format!("no {missing:?}"),
+        (None, None) => format!("{} ids", after.len()),
+    };
+    Err(Invalid::new(field, value, expected(before.len())))
 }

@@ -13,8 +13,9 @@ pub const MAX_NODES: usize = 20_000;
 /// Maximum number of detections of one input, including mirrored and derived ones.
 pub const MAX_DETECTIONS: usize = 1 << 22;
 
-/// Relative coordinates may exceed the detection range by this factor, for callers that compute in f32.
-const RANGE_TOLERANCE: f64 = 1.0 + 1e-5;
+/// Reported distances may exceed the detection range by this factor, because sensors are not exact. Beyond, the caller uses other units or
+/// another sensor than the policy was trained with.
+const RANGE_TOLERANCE: f64 = 2.0;
 
 /// Input of one fleet in one slot, in canonical order of ids.
 #[derive(Clone, Debug, PartialEq)]
@@ -23,6 +24,12 @@ pub struct FleetInput {
     pub fleet: FleetIds,
     /// Canonical index of each UAV in the order of the request.
     pub canonical_of_request: Vec<u32>,
+    /// Speed of each UAV, in units of the caller per second, where it has one of its own; empty if none has.
+    pub speeds: Vec<Option<f64>>,
+    /// Time that each UAV can still fly in seconds, where known; empty if not known.
+    pub endurances: Vec<Option<f64>>,
+    /// The error of coordinates that are far from the unit square, unless the caller describes a frame.
+    pub far: Option<Box<Invalid>>,
     /// Positions or detections.
     pub content: SceneOrGraph,
 }
@@ -47,7 +54,7 @@ pub struct Scene {
     pub aoi: Vec<f32>,
 }
 
-/// Detections of each node, symmetric: where i detects j, j detects i at the negated coordinates.
+/// Detections of each node. Where only one of two nodes reports the other, the reverse detection is added as a mirrored one.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ReportedGraph {
     /// Own position of each UAV, where given.
@@ -111,7 +118,7 @@ impl FleetInput {
     /// detection lies beyond its range, or if there are too many detections.
     pub fn into_fleet_graph(self, policy: &dyn Policy) -> Result<FleetGraph, Invalid> {
         let size = (self.uavs(), self.users());
-        self.content.into_fleet_graph(size, policy)
+        self.content.into_fleet_graph(size, policy, Sensing::of(policy))
     }
 }
 
@@ -120,15 +127,21 @@ impl SceneOrGraph {
     ///
     /// # Errors
     /// As [`FleetInput::into_fleet_graph`].
-    pub fn into_fleet_graph(self, (uavs, users): (usize, usize), policy: &dyn Policy) -> Result<FleetGraph, Invalid> {
+    pub fn into_fleet_graph(
+        self,
+        (uavs, users): (usize, usize),
+        policy: &dyn Policy,
+        sensing: Sensing,
+    ) -> Result<FleetGraph, Invalid> {
         policy.check_fleet(uavs, users)?;
-        let (ranges, observers) = (policy.ranges(), policy.observers(uavs, users));
+        let observers = policy.observers(uavs, users);
         match self {
             Self::Scene(Scene { uavs, users, aoi }) => {
                 let limits = (observers, MAX_DETECTIONS);
-                FleetGraph::from_scene_within(&uavs, &users, &aoi, ranges, limits).ok_or_else(|| too_many_detections("scene"))
+                FleetGraph::from_scene_within(&uavs, &users, &aoi, sensing.ranges, limits)
+                    .ok_or_else(|| too_many_detections("scene"))
             }
-            Self::Graph(graph) => graph.into_fleet_graph(policy.needs(), observers, ranges),
+            Self::Graph(graph) => graph.into_fleet_graph(policy.needs(), observers, sensing),
         }
     }
 
@@ -137,15 +150,15 @@ impl SceneOrGraph {
     ///
     /// # Errors
     /// As [`FleetInput::into_fleet_graph`]; for large inputs, only what can be found out quickly.
-    pub fn into_task_input(self, size: (usize, usize), policy: &dyn Policy) -> Result<TaskInput, Invalid> {
+    pub fn into_task_input(self, size: (usize, usize), policy: &dyn Policy, sensing: Sensing) -> Result<TaskInput, Invalid> {
         let (uavs, users) = size;
         if uavs + users < LARGE_NODES {
-            return self.into_fleet_graph(size, policy).map(TaskInput::Graph);
+            return self.into_fleet_graph(size, policy, sensing).map(TaskInput::Graph);
         }
         policy.check_fleet(uavs, users)?;
         let detections = match &self {
             Self::Scene(Scene { uavs: own, users: all, .. }) => {
-                let estimate = estimate_detections(own, all, policy.observers(uavs, users), policy.ranges());
+                let estimate = estimate_detections(own, all, policy.observers(uavs, users), sensing.ranges);
                 if estimate.at_least > MAX_DETECTIONS {
                     return Err(too_many_detections("scene"));
                 }
@@ -154,7 +167,44 @@ impl SceneOrGraph {
             // Users detect each other about as often as UAVs detect users.
             Self::Graph(graph) => 2 * graph.detections.iter().map(Vec::len).sum::<usize>(),
         };
-        Ok(TaskInput::Large { content: Box::new(self), size, detections })
+        Ok(TaskInput::Large { content: Box::new(self), size, sensing, detections })
+    }
+
+    /// The position of each UAV, where known.
+    pub fn uav_positions(&self) -> Vec<Option<Point>> {
+        match self {
+            Self::Scene(scene) => scene.uavs.iter().copied().map(Some).collect(),
+            Self::Graph(graph) => graph.positions.clone(),
+        }
+    }
+
+    /// Whether the caller may list only what a UAV detects: it lists no user, or a graph in which every user is detected.
+    pub fn lists_only_detected(&self) -> bool {
+        match self {
+            Self::Scene(scene) => scene.users.is_empty(),
+            // What UAVs detect is mirrored, so the first detection of a user that is detected is that of a UAV.
+            Self::Graph(graph) => {
+                let uavs = graph.positions.len();
+                graph.detections[uavs..].iter().all(|list| list.first().is_some_and(|d| (d.target as usize) < uavs))
+            }
+        }
+    }
+}
+
+/// Which nodes detect each other.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sensing {
+    /// Ranges within which nodes detect each other in a scene.
+    pub ranges: Ranges,
+    /// Whether, where only one of two nodes of a graph reports the other, both detect each other. What UAVs report of users holds for both in
+    /// any case, unless the user reports detections itself.
+    pub symmetric: bool,
+}
+
+impl Sensing {
+    /// That of the environment of `policy`, symmetric.
+    pub fn of(policy: &dyn Policy) -> Self {
+        Self { ranges: policy.ranges(), symmetric: true }
     }
 }
 
@@ -172,6 +222,8 @@ pub enum TaskInput {
         content: Box<SceneOrGraph>,
         /// M and N.
         size: (usize, usize),
+        /// What detects what.
+        sensing: Sensing,
         /// Estimated number of detections.
         detections: usize,
     },
@@ -211,7 +263,8 @@ fn is_within(rel: &Point, range: f64) -> bool {
 }
 
 impl ReportedGraph {
-    fn into_fleet_graph(self, needs: RequiredInput, observers: usize, ranges: Ranges) -> Result<FleetGraph, Invalid> {
+    fn into_fleet_graph(mut self, needs: RequiredInput, observers: usize, sensing: Sensing) -> Result<FleetGraph, Invalid> {
+        let ranges = sensing.ranges;
         if needs == RequiredInput::FullScene {
             return Err(Invalid::missing("scene", "a scene instead of a graph, because this policy needs all positions"));
         }
@@ -226,6 +279,9 @@ impl ReportedGraph {
             return Err(Invalid::missing(field, "the position of the UAV, which this policy needs"));
         }
         self.check_ranges(ranges)?;
+        if !sensing.symmetric {
+            self.remove_mirrored();
+        }
         // What users detect matters to a policy only if it observes them.
         let users = observers > uavs;
         let derived = if users { self.derive_user_detections(ranges.detection)? } else { Vec::new() };
@@ -261,7 +317,18 @@ impl ReportedGraph {
         }
     }
 
-    /// Rejects detections beyond the range: the caller uses other units, or a sensor that the policy was not trained with.
+    /// Removes the reverse detections of nodes that report detections themselves.
+    fn remove_mirrored(&mut self) {
+        let uavs = self.positions.len();
+        for (node, list) in self.detections.iter_mut().enumerate() {
+            let senses = node.checked_sub(uavs).is_none_or(|user| !self.without_detections[user]);
+            if senses {
+                list.retain(|detection| !detection.mirrored);
+            }
+        }
+    }
+
+    /// Rejects detections far beyond the range: the caller uses other units, or a sensor that the policy was not trained with.
     fn check_ranges(&self, ranges: Ranges) -> Result<(), Invalid> {
         let uavs = self.positions.len();
         for (node, list) in self.detections.iter().enumerate() {
@@ -270,7 +337,10 @@ impl ReportedGraph {
                 if !is_within(&detection.rel, range * RANGE_TOLERANCE) {
                     let [x, y] = detection.rel;
                     let field = self.rel_field(node, detection.request_index, usize::from(y.abs() > x.abs()));
-                    let expected = format!("a position within the range of the policy ({range})");
+                    let expected = format!(
+                        "a position within about the range of the policy ({range} sides of the square); for other units describe the \
+                         area by a frame, for another sensor a world"
+                    );
                     return Err(Invalid::new(field, format!("({x}, {y})"), expected));
                 }
             }

@@ -9,6 +9,8 @@ mod error;
 mod fleet_ids;
 mod fleet_input;
 mod fleet_memory;
+pub mod flight;
+mod guard;
 pub(crate) mod ids;
 mod memory_budget;
 pub(crate) mod nodes;
@@ -16,6 +18,7 @@ mod owner;
 mod recurrent_state;
 mod reference;
 mod registry;
+mod roster;
 mod sessions;
 mod table;
 
@@ -28,16 +31,19 @@ pub use error::Error;
 pub use fleet_ids::FleetIds;
 pub use fleet_input::{
     FleetInput, GraphForm, LARGE_NODES, MAX_DETECTIONS, MAX_NODES, ReportedDetection, ReportedGraph, Scene, SceneOrGraph,
-    TaskInput,
+    Sensing, TaskInput,
 };
 pub use fleet_memory::FleetMemory;
-pub use nodes::{Node, NodeDetection};
+pub use flight::{ConstraintOptions, Flight, FlightOptions, Frame, FrameOptions, Warning, WorldOptions};
+pub use guard::{Constraint, Guard, Overruled, Situation, Zone};
+pub use nodes::{Node, NodeDetection, SceneUav};
 pub use owner::Owner;
-pub use recurrent_state::RecurrentState;
+pub use recurrent_state::{Members, RecurrentState};
 pub use reference::{PolicyRef, PolicySpec, VersionSelector, check_name};
 pub use registry::{
     DEFAULT_MEMORY, LoadedPolicy, MAX_SIBLINGS, MemoryShare, PolicyInfo, PolicyKind, Registry, RemovedVersions, Resolved,
     VersionDetails, VersionState,
 };
-pub use sessions::{PendingStep, Session, SessionInfo, SessionOptions, Sessions, StepStart};
+pub use roster::{FleetChange, Roster, RosterRules, UserMemory};
+pub use sessions::{Listed, PendingStep, Session, SessionInfo, SessionOptions, Sessions, StepStart};
 pub use table::{LastUse, Limits, Table, TableEntry};

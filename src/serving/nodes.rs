@@ -1,22 +1,24 @@
-//! Converts nodes and scenes of all transports to a [`FleetInput`]: resolves ids, collects the AoI of users, and makes detections
-//! symmetric.
+//! Converts nodes and scenes of all transports to a [`FleetInput`]: resolves ids, collects the AoI of users, and mirrors detections that
+//! one side reports.
 //!
-//! The adjacency matrix is symmetric (docs/model.md, "Graph"): a detection that one side reports is mirrored; the reports of both
-//! sides have to be each other's negation.
+//! Every measurement is that of one node, with an error of its own. Two nodes may report different positions of each other, and each
+//! policy input is what the node itself reports. Of several reports of a user's AoI, the user's own counts, then the smallest: the latest
+//! collection that anybody knows of.
 
 use std::collections::HashMap;
 
+use super::flight::is_far;
 use super::ids::{Ids, canonical_of_request, check_counts, check_distinct, check_nodes, node_indices};
 use super::{FleetIds, FleetInput, GraphForm, ReportedDetection, ReportedGraph, Scene, SceneOrGraph};
 use crate::env::Point;
 use crate::invalid::{Invalid, in_range};
 
-/// Maximum coordinate of an absolute position, in units of the square's side.
-const MAX_COORDINATE: f64 = 1e4;
+/// Maximum coordinate of an absolute position, in units of the square's side or of a frame.
+const MAX_COORDINATE: f64 = 1e9;
+/// Maximum speed and endurance of a UAV.
+const MAX_UAV_NUMBER: f64 = 1e9;
 /// Maximum AoI, in slots.
 const MAX_AOI: f64 = 1e6;
-/// Maximum difference of the two reports of one pair of nodes, because callers may compute in f32.
-const REPORT_TOLERANCE: f64 = 1e-5;
 
 /// A node of a graph, with an iterator of its detections.
 #[derive(Clone, Debug)]
@@ -31,6 +33,10 @@ pub struct Node<D> {
     pub position: Option<Point>,
     /// Own AoI of a user in slots, where known.
     pub aoi: Option<f64>,
+    /// Speed of a UAV, where it has one of its own.
+    pub speed: Option<f64>,
+    /// Time that a UAV can still fly in seconds, where known.
+    pub endurance: Option<f64>,
 }
 
 /// A detection of the node `target_id`.
@@ -49,15 +55,58 @@ pub(crate) fn check_finite(field: impl FnOnce() -> String, value: f64) -> Result
     if value.is_finite() { Ok(value) } else { Err(Invalid::new(field(), value, "a finite number")) }
 }
 
-/// Checks an absolute position.
-pub(crate) fn check_point(field: impl Fn() -> String, [x, y]: Point) -> Result<Point, Invalid> {
+/// Checks an absolute position. `far` gets the error of the first one that is not near the unit square.
+pub(crate) fn check_point(field: impl Fn() -> String, [x, y]: Point, far: &mut Option<Box<Invalid>>) -> Result<Point, Invalid> {
+    if !is_far([x, y]) {
+        return Ok([x, y]);
+    }
     for (axis, value) in [("x", x), ("y", y)] {
-        if !(-MAX_COORDINATE..=MAX_COORDINATE).contains(&value) {
-            check_finite(|| format!("{}.{axis}", field()), value)?;
-            in_range(&format!("{}.{axis}", field()), value, -MAX_COORDINATE..=MAX_COORDINATE)?;
-        }
+        check_finite(|| format!("{}.{axis}", field()), value)?;
+        in_range(&format!("{}.{axis}", field()), value, -MAX_COORDINATE..=MAX_COORDINATE)?;
+    }
+    if far.is_none() {
+        let (axis, value) = if is_far([x, 0.0]) { ("x", x) } else { ("y", y) };
+        let expected = "a coordinate near the unit square (-10 to 10); for metres or other units, describe the area by a frame, in \
+                        OpenSession or, without a session, in the request";
+        *far = Some(Box::new(Invalid::new(format!("{}.{axis}", field()), value, expected)));
     }
     Ok([x, y])
+}
+
+/// A UAV of a scene.
+#[derive(Clone, Debug)]
+pub struct SceneUav {
+    /// Id.
+    pub id: String,
+    /// Position.
+    pub position: Point,
+    /// Speed, where it has one of its own.
+    pub speed: Option<f64>,
+    /// Time that it can still fly in seconds, where known.
+    pub endurance: Option<f64>,
+}
+
+/// Numbers of those UAVs that have one, by index in the request.
+#[derive(Default)]
+struct UavNumbers(Vec<(u32, f64)>);
+
+impl UavNumbers {
+    fn push(&mut self, place: usize, value: Option<f64>, field: impl Fn() -> String) -> Result<(), Invalid> {
+        let Some(value) = value else { return Ok(()) };
+        check_finite(&field, value)?;
+        in_range(&field(), value, 0.0..=MAX_UAV_NUMBER)?;
+        self.0.push((place as u32, value));
+        Ok(())
+    }
+
+    /// The number of each UAV in canonical order; empty if none has one.
+    fn sorted(self, request_of_canonical: &[u32]) -> Vec<Option<f64>> {
+        if self.0.is_empty() {
+            return Vec::new();
+        }
+        let of = |place: &u32| self.0.binary_search_by_key(place, |(place, _)| *place).ok().map(|at| self.0[at].1);
+        request_of_canonical.iter().map(of).collect()
+    }
 }
 
 /// Checks an AoI.
@@ -70,26 +119,29 @@ pub(crate) fn check_aoi(field: impl Fn() -> String, value: f64) -> Result<f32, I
 }
 
 impl FleetInput {
-    /// The input of a scene: id and position of each UAV; id, position and AoI of each user.
+    /// The input of a scene: id, position and speed of each UAV; id, position and AoI of each user.
     ///
     /// # Errors
     /// A field that is not valid, named as `scene.users[2].aoi`.
     pub fn from_scene(
-        uavs: impl ExactSizeIterator<Item = (String, Point)>,
+        uavs: impl ExactSizeIterator<Item = SceneUav>,
         users: impl ExactSizeIterator<Item = (String, Point, f64)>,
     ) -> Result<Self, Invalid> {
         check_counts("scene", uavs.len(), users.len())?;
         let mut positions = Vec::with_capacity(uavs.len());
         let mut ids = Ids::with_capacity(uavs.len());
-        for (i, (id, position)) in uavs.enumerate() {
-            positions.push(check_point(|| format!("scene.uavs[{i}]"), position)?);
+        let (mut speeds, mut endurances, mut far) = (UavNumbers::default(), UavNumbers::default(), None);
+        for (i, SceneUav { id, position, speed, endurance }) in uavs.enumerate() {
+            positions.push(check_point(|| format!("scene.uavs[{i}]"), position, &mut far)?);
+            speeds.push(i, speed, || format!("scene.uavs[{i}].speed"))?;
+            endurances.push(i, endurance, || format!("scene.uavs[{i}].endurance_seconds"))?;
             ids.push(|| format!("scene.uavs[{i}].id"), id, i)?;
         }
         let (uav_ids, uav_places) = ids.sorted();
         let mut states = Vec::with_capacity(users.len());
         let mut ids = Ids::with_capacity(users.len());
         for (i, (id, position, age)) in users.enumerate() {
-            let position = check_point(|| format!("scene.users[{i}]"), position)?;
+            let position = check_point(|| format!("scene.users[{i}]"), position, &mut far)?;
             states.push((position, check_aoi(|| format!("scene.users[{i}].aoi"), age)?));
             ids.push(|| format!("scene.users[{i}].id"), id, i)?;
         }
@@ -99,6 +151,9 @@ impl FleetInput {
         })?;
         Ok(Self {
             canonical_of_request: canonical_of_request(&uav_places),
+            speeds: speeds.sorted(&uav_places),
+            endurances: endurances.sorted(&uav_places),
+            far,
             content: SceneOrGraph::Scene(Scene {
                 uavs: uav_places.iter().map(|&place| positions[place as usize]).collect(),
                 users: user_places.iter().map(|&place| states[place as usize].0).collect(),
@@ -111,12 +166,25 @@ impl FleetInput {
     /// The input of a graph.
     ///
     /// # Errors
-    /// A field that is not valid, named as `graph.nodes[2].id`; detections that contradict each other.
+    /// A field that is not valid, named as `graph.nodes[2].id`.
     pub fn from_nodes<D: ExactSizeIterator<Item = NodeDetection>>(nodes: Vec<Node<D>>) -> Result<Self, Invalid> {
         check_nodes("graph.nodes", nodes.len())?;
         let mut nodes: Vec<Option<Node<D>>> = nodes.into_iter().map(Some).collect();
         let (mut uavs, mut users) = (Ids::default(), Ids::default());
+        let (mut speeds, mut endurances) = (UavNumbers::default(), UavNumbers::default());
         for (place, node) in nodes.iter_mut().flatten().enumerate() {
+            for (name, value, numbers) in
+                [("speed", node.speed, &mut speeds), ("endurance_seconds", node.endurance, &mut endurances)]
+            {
+                if let Some(value) = value.filter(|_| !node.is_uav) {
+                    return Err(Invalid::new(
+                        format!("graph.nodes[{place}].{name}"),
+                        value,
+                        "no value, because the node is a user",
+                    ));
+                }
+                numbers.push(place, value, || format!("graph.nodes[{place}].{name}"))?;
+            }
             let ids = if node.is_uav { &mut uavs } else { &mut users };
             ids.push(|| format!("graph.nodes[{place}].id"), std::mem::take(&mut node.id), place)?;
         }
@@ -130,9 +198,12 @@ impl FleetInput {
                 builder.push(index, place, node, &indices)?;
             }
         }
-        let graph = mirror(builder.graph)?;
+        let graph = mirror(builder.graph);
         Ok(Self {
             canonical_of_request: canonical_of_request(&uav_places),
+            speeds: speeds.sorted(&uav_places),
+            endurances: endurances.sorted(&uav_places),
+            far: builder.far,
             content: SceneOrGraph::Graph(graph),
             fleet: FleetIds { uavs, users },
         })
@@ -141,8 +212,10 @@ impl FleetInput {
 
 struct Builder {
     graph: ReportedGraph,
-    /// Whether the AoI of a user was reported.
-    has_aoi: Vec<bool>,
+    /// Who reported the AoI of each user.
+    reported_by: Vec<Reporter>,
+    /// The first position that is far from the unit square.
+    far: Option<Box<Invalid>>,
 }
 
 impl Builder {
@@ -155,7 +228,7 @@ impl Builder {
             request_of_canonical: Vec::with_capacity(uavs + users),
             form: GraphForm::Nodes,
         };
-        Self { graph, has_aoi: vec![false; users] }
+        Self { graph, reported_by: vec![Reporter::Nobody; users], far: None }
     }
 
     /// Adds the node at `place` of the request. Nodes come in canonical order.
@@ -171,7 +244,7 @@ impl Builder {
         let path = || format!("graph.nodes[{place}]");
         if let Some(user) = index.checked_sub(uavs) {
             if let Some(value) = node.aoi {
-                self.set_aoi(user, value, || format!("{}.aoi", path()))?;
+                self.set_aoi(user, value, Reporter::User, || format!("{}.aoi", path()))?;
             }
             if let Some([x, y]) = node.position {
                 let expected = "no value, because only UAVs have positions in a graph";
@@ -183,7 +256,7 @@ impl Builder {
                 return Err(Invalid::new(format!("{}.aoi", path()), value, "no value, because only users have an AoI"));
             }
             if let Some(position) = node.position {
-                self.graph.positions[index] = Some(check_point(|| format!("{}.position", path()), position)?);
+                self.graph.positions[index] = Some(check_point(|| format!("{}.position", path()), position, &mut self.far)?);
             }
         }
         let mut list = Vec::with_capacity(node.detections.len());
@@ -198,7 +271,7 @@ impl Builder {
             }
             let rel = [check_finite(|| field("rel_x"), rel[0])?, check_finite(|| field("rel_y"), rel[1])?];
             match ((target as usize).checked_sub(uavs), aoi) {
-                (Some(user), Some(value)) => self.set_aoi(user, value, || field("aoi"))?,
+                (Some(user), Some(value)) => self.set_aoi(user, value, Reporter::Other, || field("aoi"))?,
                 (Some(_), None) => return Err(Invalid::missing(field("aoi"), "the AoI of the user in slots")),
                 (None, Some(value)) => return Err(Invalid::new(field("aoi"), value, "no value, because the target is a UAV")),
                 (None, None) => {}
@@ -215,37 +288,35 @@ impl Builder {
         Ok(())
     }
 
-    fn set_aoi(&mut self, user: usize, value: f64, field: impl Fn() -> String) -> Result<(), Invalid> {
+    fn set_aoi(&mut self, user: usize, value: f64, by: Reporter, field: impl Fn() -> String) -> Result<(), Invalid> {
         let value = check_aoi(&field, value)?;
-        let known = self.graph.aoi[user];
-        if self.has_aoi[user] && known.to_bits() != value.to_bits() {
-            return Err(Invalid::new(field(), value, format!("{known}, the AoI of the same user elsewhere in the graph")));
+        let (known, reported_by) = (&mut self.graph.aoi[user], &mut self.reported_by[user]);
+        if by > *reported_by || (by == *reported_by && value < *known) {
+            (*known, *reported_by) = (value, by);
         }
-        self.graph.aoi[user] = value;
-        self.has_aoi[user] = true;
         Ok(())
     }
 }
 
-/// Mirrors detections that one side reports, and compares those that both report. Lists are in ascending order of target.
-pub(crate) fn mirror(mut graph: ReportedGraph) -> Result<ReportedGraph, Invalid> {
+/// Who reported the AoI of a user, from the least to the most reliable.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Reporter {
+    Nobody,
+    /// A node that detects the user.
+    Other,
+    User,
+}
+
+/// Mirrors detections that one side reports. Lists are in ascending order of target.
+pub(crate) fn mirror(mut graph: ReportedGraph) -> ReportedGraph {
     let mut mirrored = Vec::new();
     for (node, list) in graph.detections.iter().enumerate() {
         for detection in list {
-            let back = [-detection.rel[0], -detection.rel[1]];
             let other = &graph.detections[detection.target as usize];
-            let Ok(at) = other.binary_search_by_key(&(node as u32), |s| s.target) else {
-                let back = ReportedDetection { target: node as u32, rel: back, request_index: 0, mirrored: true };
+            if other.binary_search_by_key(&(node as u32), |s| s.target).is_err() {
+                let rel = [-detection.rel[0], -detection.rel[1]];
+                let back = ReportedDetection { target: node as u32, rel, request_index: 0, mirrored: true };
                 mirrored.push((detection.target as usize, back));
-                continue;
-            };
-            let [x, y] = other[at].rel;
-            let differs = [(x - back[0]).abs() > REPORT_TOLERANCE, (y - back[1]).abs() > REPORT_TOLERANCE];
-            if let Some(axis) = differs.iter().position(|&differs| differs) {
-                let field = graph.rel_field(detection.target as usize, other[at].request_index, axis);
-                let expected =
-                    format!("about ({}, {}), the negation of the position that the other node reports", back[0], back[1]);
-                return Err(Invalid::new(field, format!("({x}, {y})"), expected));
             }
         }
     }
@@ -255,5 +326,5 @@ pub(crate) fn mirror(mut graph: ReportedGraph) -> Result<ReportedGraph, Invalid>
     for list in &mut graph.detections {
         list.sort_by_key(|s| s.target);
     }
-    Ok(graph)
+    graph
 }

@@ -307,6 +307,14 @@ impl TrainConfig {
             return Err(Invalid::new("training.mixer", if mixes { "a mixer" } else { "none" }, expected));
         }
         let (env, t) = (&self.environment, &self.training);
+        if env.changes() {
+            let field = if env.lose_uav.is_some() { "environment.lose_uav" } else { "environment.user_slots" };
+            return Err(Invalid::new(
+                field,
+                "a fleet that changes",
+                "no value, because training has a fixed fleet; for hosted environments",
+            ));
+        }
         if t.hops > 1 && self.algorithm.gnn() != Gnn::None {
             return Err(Invalid::new(
                 "training.hops",

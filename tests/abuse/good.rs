@@ -88,7 +88,13 @@ impl Client {
 
     async fn fly(mut self, number: u64) {
         let id = format!("good-{number}");
-        let open = v1::OpenSessionRequest { policy: "qedgix".into(), session_id: id.clone(), run_id: None, seed: Some(number) };
+        let open = v1::OpenSessionRequest {
+            policy: "qedgix".into(),
+            session_id: id.clone(),
+            run_id: None,
+            seed: Some(number),
+            ..Default::default()
+        };
         let request = self.signed(open);
         if let Err(status) = self.policies.open_session(request).await {
             self.fail("opening a session", &status);

@@ -33,8 +33,12 @@ const SLOWER: f64 = 4.0;
 fn scene(uavs: usize, users: usize, seed: u64) -> v1::Scene {
     let mut rng = qedgix::rng::stream(seed, "abuse-scene", 0);
     v1::Scene {
-        uavs: (0..uavs).map(|i| v1::SceneUav { id: format!("a{i}"), x: rng.random(), y: rng.random() }).collect(),
-        users: (0..users).map(|j| v1::SceneUser { id: format!("u{j}"), x: rng.random(), y: rng.random(), aoi: 1.0 }).collect(),
+        uavs: (0..uavs)
+            .map(|i| v1::SceneUav { id: format!("a{i}"), x: rng.random(), y: rng.random(), ..Default::default() })
+            .collect(),
+        users: (0..users)
+            .map(|j| v1::SceneUser { id: format!("u{j}"), x: rng.random(), y: rng.random(), aoi: 1.0, z: None })
+            .collect(),
     }
 }
 

@@ -5,7 +5,7 @@ use qedgix::policy::EnvParams;
 use qedgix::policy::baselines::{LIST, by_name};
 use qedgix::policy::{FleetGraph, FleetStep, Policy, RequiredInput};
 use qedgix::service::act;
-use qedgix::serving::FleetInput;
+use qedgix::serving::{FleetInput, Sensing};
 use qedgix::wire::v1;
 
 use super::harness::*;
@@ -23,6 +23,7 @@ fn decide(policy: &dyn Policy, graph: &FleetGraph) -> Vec<u8> {
     policy.act(&mut [FleetStep {
         env: policy.env(),
         graph,
+        profile: None,
         step: 0,
         memory: &mut memory,
         headings: &mut headings,
@@ -106,6 +107,41 @@ fn what_one_side_reports_is_mirrored() {
     }
 }
 
+#[test]
+fn every_node_keeps_its_own_measurements() {
+    let policy = by_name("nearest", EnvParams::default()).unwrap();
+    let (uav, user) = (v1::NodeKind::Uav, v1::NodeKind::User);
+    let node = |id: &str, kind: v1::NodeKind, x: f64, detections: &[(&str, f64, Option<f64>)]| v1::Node {
+        id: id.into(),
+        kind: kind.into(),
+        position: (kind == uav).then_some(v1::Position { x, y: 0.5, z: None }),
+        detections: detections
+            .iter()
+            .map(|&(target, rel_x, aoi)| v1::Detection { target_id: target.into(), rel_x, rel_y: 0.0, aoi, rel_z: None })
+            .collect(),
+        ..Default::default()
+    };
+    let sent = v1::Graph {
+        nodes: vec![
+            node("a", uav, 0.4, &[("b", 0.11, None), ("u", 0.05, Some(7.0))]),
+            node("b", uav, 0.5, &[("a", -0.09, None), ("c", 0.29, None), ("u", -0.06, Some(6.0))]),
+            node("c", uav, 0.78, &[]),
+            node("u", user, 0.0, &[]),
+        ],
+    };
+    let input = FleetInput::try_from(sent).unwrap();
+    let rels = |graph: &FleetGraph, i: usize| graph.detections(i).iter().map(|d| (d.target, d.rel[0])).collect::<Vec<_>>();
+    let graph = slot_of(input.clone(), &*policy);
+    assert_eq!(rels(&graph, 0), [(1, 0.11), (3, 0.05)]);
+    assert_eq!(rels(&graph, 1), [(0, -0.09), (2, 0.29), (3, -0.06)], "a little further than the range");
+    assert_eq!(rels(&graph, 2), [(1, -0.29)], "mirrored");
+    assert_eq!(graph.aoi(), [6.0], "the latest collection that anybody knows of");
+    let sensing = Sensing { symmetric: false, ..Sensing::of(&*policy) };
+    let graph = input.content.into_fleet_graph((3, 1), &*policy, sensing).unwrap();
+    assert_eq!(rels(&graph, 1), [(0, -0.09), (2, 0.29), (3, -0.06)]);
+    assert_eq!(rels(&graph, 2), [], "not mirrored");
+}
+
 fn number() -> impl Strategy<Value = f64> {
     prop_oneof![
         4 => -0.3..0.3_f64,
@@ -120,7 +156,7 @@ fn id() -> impl Strategy<Value = String> {
 
 prop_compose! {
     fn detection()(target_id in id(), rel_x in number(), rel_y in number(), aoi in prop::option::of(number())) -> v1::Detection {
-        v1::Detection { target_id, rel_x, rel_y, aoi }
+        v1::Detection { target_id, rel_x, rel_y, aoi, rel_z: None }
     }
 }
 
@@ -132,15 +168,15 @@ prop_compose! {
         position in prop::option::of((number(), number())),
         aoi in prop::option::weighted(0.2, number()),
     ) -> v1::Node {
-        v1::Node { id, kind, detections, position: position.map(|(x, y)| v1::Position { x, y }), aoi }
+        v1::Node { id, kind, detections, position: position.map(|(x, y)| v1::Position { x, y, z: None }), aoi, ..Default::default() }
     }
 }
 
 fn observation() -> impl Strategy<Value = v1::act_request::Observation> {
     use v1::act_request::Observation;
     let graph = prop::collection::vec(node(), 0..5).prop_map(|nodes| Observation::Graph(v1::Graph { nodes }));
-    let uav = (id(), number(), number()).prop_map(|(id, x, y)| v1::SceneUav { id, x, y });
-    let user = (id(), number(), number(), number()).prop_map(|(id, x, y, aoi)| v1::SceneUser { id, x, y, aoi });
+    let uav = (id(), number(), number()).prop_map(|(id, x, y)| v1::SceneUav { id, x, y, ..Default::default() });
+    let user = (id(), number(), number(), number()).prop_map(|(id, x, y, aoi)| v1::SceneUser { id, x, y, aoi, z: None });
     let scene = (prop::collection::vec(uav, 0..3), prop::collection::vec(user, 0..4))
         .prop_map(|(uavs, users)| Observation::Scene(v1::Scene { uavs, users }));
     prop_oneof![graph, scene]
@@ -155,7 +191,7 @@ prop_compose! {
         run_id in prop::option::of(id()),
     ) -> v1::ActRequest {
         let memory = state.map(|state| v1::act_request::Memory::RecurrentState(state.into()));
-        v1::ActRequest { policy, observation, memory, step, run_id, return_q_values: true, seed: None }
+        v1::ActRequest { policy, observation, memory, step, run_id, return_q_values: true, ..Default::default() }
     }
 }
 
@@ -189,7 +225,7 @@ proptest! {
             let len = policy.memory_len(3, 5);
             let mut memory: Vec<f32> = values.iter().cycle().take(len).map(|&x| x as f32).collect();
             let mut headings = vec![0; 3];
-            policy.act(&mut [FleetStep { env: policy.env(), graph: &graph, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
+            policy.act(&mut [FleetStep { env: policy.env(), graph: &graph, profile: None, step, memory: &mut memory, headings: &mut headings, q_values: None }]);
             prop_assert!(headings.iter().all(|&h| usize::from(h) < policy.actions()));
         }
     }

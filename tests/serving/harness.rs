@@ -190,13 +190,16 @@ impl Policy for TestPolicy {
 pub fn scene(uavs: usize, users: usize, seed: u64) -> v1::Scene {
     let mut rng = qedgix::rng::stream(seed, "test-scene", 0);
     v1::Scene {
-        uavs: (0..uavs).map(|i| v1::SceneUav { id: format!("uav-{i}"), x: rng.random(), y: rng.random() }).collect(),
+        uavs: (0..uavs)
+            .map(|i| v1::SceneUav { id: format!("uav-{i}"), x: rng.random(), y: rng.random(), ..Default::default() })
+            .collect(),
         users: (0..users)
             .map(|j| v1::SceneUser {
                 id: format!("user-{j}"),
                 x: rng.random(),
                 y: rng.random(),
                 aoi: f64::from(rng.random_range(0..80_u32)),
+                z: None,
             })
             .collect(),
     }
@@ -212,14 +215,15 @@ pub fn graph(scene: &v1::Scene, range: f64, of_users: bool) -> v1::Graph {
             all.iter().filter(|(other, _, _)| other != id && (aoi.is_none() || of_users)).filter_map(|(target, p, aoi)| {
                 let (x, y) = (p[0] - at[0], p[1] - at[1]);
                 let within = x * x + y * y <= range * range;
-                within.then(|| v1::Detection { target_id: target.clone(), rel_x: x, rel_y: y, aoi: *aoi })
+                within.then(|| v1::Detection { target_id: target.clone(), rel_x: x, rel_y: y, aoi: *aoi, rel_z: None })
             });
         v1::Node {
             id: id.clone(),
             kind: if aoi.is_none() { v1::NodeKind::Uav.into() } else { v1::NodeKind::User.into() },
             detections: detections.collect(),
-            position: aoi.is_none().then_some(v1::Position { x: at[0], y: at[1] }),
+            position: aoi.is_none().then_some(v1::Position { x: at[0], y: at[1], z: None }),
             aoi: *aoi,
+            ..Default::default()
         }
     });
     v1::Graph { nodes: nodes.collect() }
@@ -247,7 +251,7 @@ pub fn held(policy: &str, state: bytes::Bytes, scene: v1::Scene) -> v1::ActReque
 
 /// A request to open session `id`, with seed 0.
 pub fn open(policy: &str, id: &str) -> v1::OpenSessionRequest {
-    v1::OpenSessionRequest { policy: policy.into(), session_id: id.into(), run_id: None, seed: Some(0) }
+    v1::OpenSessionRequest { policy: policy.into(), session_id: id.into(), run_id: None, seed: Some(0), ..Default::default() }
 }
 
 /// Heading index of each UAV by id.

@@ -207,7 +207,12 @@ impl Model {
             self.sessions.len() - 1
         });
         let (app, policy) = (self.app.clone(), self.policy.parse().unwrap());
-        let how = SessionOptions { id: Some(self.session(name)), run_id: run.map(|run| run.to_string()), seed: Some(seed) };
+        let how = SessionOptions {
+            id: Some(self.session(name)),
+            run_id: run.map(|run| run.to_string()),
+            seed: Some(seed),
+            ..SessionOptions::default()
+        };
         let answer = async move { sessions::open(&app, &Caller::default(), &policy, how).await.map(|_| None) }.boxed();
         self.begin(Call { session, kind: CallKind::Open { seed, run, fresh: known.is_none() }, answer });
     }
@@ -228,6 +233,8 @@ impl Model {
             step,
             run_id: run.map(|run| run.to_string()),
             seed: None,
+            flight: None,
+            return_motion: false,
         };
         let app = self.app.clone();
         let answer = async move {

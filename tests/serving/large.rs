@@ -50,6 +50,7 @@ async fn thousand_uavs_and_ten_thousand_users_are_answered() {
     policy.act(&mut [FleetStep {
         env: policy.env(),
         graph: &slot,
+        profile: None,
         step: 0,
         memory: &mut memory,
         headings: &mut expected,

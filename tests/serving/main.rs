@@ -8,6 +8,8 @@ mod binary;
 mod certificates;
 mod conversion;
 mod environments;
+mod fleets;
+mod guard;
 mod harness;
 mod health;
 mod interleavings;

@@ -139,6 +139,7 @@ fn offline() -> [Vec<Vec<u8>>; 2] {
             policy.act(&mut [FleetStep {
                 env: policy.env(),
                 graph: &slot,
+                profile: None,
                 step,
                 memory: &mut memory,
                 headings: &mut headings,

@@ -6,7 +6,7 @@ use qedgix::policy::FleetStep;
 use qedgix::service::Error;
 use qedgix::service::policies::{self, Publisher};
 use qedgix::serving::{FleetInput, PolicyRef};
-use qedgix::train_config::{Algorithm, Preset, TrainConfig};
+use qedgix::train_config::{Algorithm, Preset, TrainConfig, Training};
 use qedgix::wire::v1;
 use rand::RngExt;
 
@@ -14,7 +14,13 @@ use super::harness::*;
 
 /// A checkpoint with weights drawn from `seed`.
 pub fn checkpoint(algorithm: Algorithm, preset: Preset, seed: u64) -> Checkpoint {
+    checkpoint_with(algorithm, preset, seed, |_| {})
+}
+
+/// A checkpoint with weights drawn from `seed` and a changed configuration.
+pub fn checkpoint_with(algorithm: Algorithm, preset: Preset, seed: u64, change: impl FnOnce(&mut Training)) -> Checkpoint {
     let mut config = TrainConfig::preset(algorithm, preset);
+    change(&mut config.training);
     config.environment.reward_scale = Some(1.0);
     let mut rng = qedgix::rng::stream(seed, "test-weights", 0);
     let weights = (0..parameter_layout(&config).len()).map(|_| rng.random_range(-0.3..0.3_f32)).collect();
@@ -101,7 +107,15 @@ async fn a_learned_policy_flies_like_all_others() {
             let slot = FleetInput::try_from(sent.clone()).unwrap().into_fleet_graph(policy).unwrap();
             let (mut expected, mut q) = (vec![0; 3], vec![0.0; 3 * policy.actions()]);
             let (memory, headings) = (&mut memory[..], &mut expected[..]);
-            policy.act(&mut [FleetStep { env: policy.env(), graph: &slot, step, memory, headings, q_values: Some(&mut q) }]);
+            policy.act(&mut [FleetStep {
+                env: policy.env(),
+                graph: &slot,
+                profile: None,
+                step,
+                memory,
+                headings,
+                q_values: Some(&mut q),
+            }]);
 
             let by_graph = v1::act_request::Observation::Graph(graph(&sent, policy.env().detection_range, true));
             let requests = [

@@ -160,6 +160,7 @@ impl Reference {
         self.policy.act(&mut [FleetStep {
             env: self.policy.env(),
             graph: &slot,
+            profile: None,
             step: 0,
             memory,
             headings: headings_out,

@@ -37,6 +37,12 @@ def test_simulator(server, tmp_path):
     assert (EXAMPLES / "simulator.py").read_text().count("\n") <= 42
 
 
+def test_metric_simulator(server, tmp_path):
+    for policy in ["qedgix", "sweep"]:
+        (mean,) = numbers(run("metric_simulator.py", server.grpc, "--policy", policy, cwd=tmp_path))
+        assert mean < 320, policy
+
+
 def test_training_job(server, tmp_path):
     arguments = [server.grpc, server.http, "--name", "example", "--steps", "4000"]
     told = run("training_job.py", *arguments, cwd=tmp_path)

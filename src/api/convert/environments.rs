@@ -3,6 +3,7 @@
 use serde_json::Value;
 
 use super::response::{duration, timestamp};
+use super::scene_graph::graph;
 use super::structs::{from_struct, to_struct};
 use crate::env::EpisodeMetrics;
 use crate::invalid::Invalid;
@@ -90,7 +91,7 @@ impl From<CopyState> for v1::CopyState {
     fn from(copy: CopyState) -> Self {
         let CopyState { observation, seed, reward, finished } = copy;
         let truncated = finished.is_some();
-        let (scene, graph) = (Some((&observation.scene).into()), observation.graph.as_ref().map(Into::into));
+        let (scene, graph) = (Some((&observation).into()), graph(&observation));
         Self { scene, graph, reward, truncated, seed, finished: finished.map(Into::into) }
     }
 }
@@ -98,8 +99,8 @@ impl From<CopyState> for v1::CopyState {
 impl From<FinishedEpisode> for v1::FinishedEpisode {
     fn from(finished: FinishedEpisode) -> Self {
         let FinishedEpisode { seed, metrics, observation } = finished;
-        let graph = observation.as_ref().and_then(|last| last.graph.as_ref()).map(Into::into);
-        Self { seed, metrics: Some(metrics.into()), scene: observation.as_ref().map(|last| (&last.scene).into()), graph }
+        let graph = observation.as_ref().and_then(graph);
+        Self { seed, metrics: Some(metrics.into()), scene: observation.as_ref().map(Into::into), graph }
     }
 }
 

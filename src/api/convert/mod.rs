@@ -2,6 +2,7 @@
 //! the path of the field.
 
 pub mod environments;
+pub mod flight;
 pub mod jobs;
 pub mod request;
 pub mod response;

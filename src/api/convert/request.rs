@@ -2,6 +2,7 @@
 
 use bytes::Bytes;
 
+use super::flight::{self, FlightFields};
 use crate::invalid::Invalid;
 use crate::service::act;
 use crate::serving::{FleetIds, FleetInput, PolicySpec, SessionOptions};
@@ -22,20 +23,25 @@ pub struct ActFields {
     pub run_id: Option<String>,
     /// The seed, if the caller sets it.
     pub seed: Option<u64>,
+    /// The frame and the world, if the request describes them.
+    pub flight: FlightFields,
+    /// Whether velocities or waypoints are requested.
+    pub return_motion: bool,
 }
 
 impl ActFields {
     /// The checked request.
     ///
     /// # Errors
-    /// [`Invalid`] for an invalid name, or if there is neither a scene nor a graph.
+    /// [`Invalid`] for an invalid name, an area without size, or if there is neither a scene nor a graph.
     pub fn request(self, input: Option<FleetInput>) -> Result<act::Request, Invalid> {
-        let Self { policy, session_id, recurrent_state, step, run_id, seed } = self;
+        let Self { policy, session_id, recurrent_state, step, run_id, seed, flight, return_motion } = self;
+        let flight = flight.options()?;
         let policy = if policy.is_empty() { None } else { Some(policy.parse()?) };
         check_ids(session_id.as_deref(), run_id.as_deref())?;
         let memory = session_id.map_or(act::MemoryLocation::RecurrentState(recurrent_state), act::MemoryLocation::Session);
         let input = input.ok_or_else(|| Invalid::missing("observation", "a graph or a scene"))?;
-        Ok(act::Request { policy, input, memory, step, run_id, seed })
+        Ok(act::Request { policy, input, memory, step, run_id, seed, flight, return_motion })
     }
 }
 
@@ -49,7 +55,10 @@ impl TryFrom<v1::ActRequest> for act::Request {
 
     fn try_from(request: v1::ActRequest) -> Result<Self, Invalid> {
         use v1::act_request::{Memory, Observation as Sent};
-        let v1::ActRequest { policy, observation, memory, step, run_id, seed, .. } = request;
+        let return_motion = request.return_velocity || request.return_waypoint;
+        let v1::ActRequest { policy, observation, memory, step, run_id, seed, symmetric, frame, world, constraints, .. } =
+            request;
+        let flight = flight::fields(frame, world, symmetric, constraints)?;
         let (session_id, recurrent_state) = match memory {
             Some(Memory::SessionId(id)) => (Some(id), Bytes::new()),
             Some(Memory::RecurrentState(state)) => (None, state),
@@ -60,7 +69,7 @@ impl TryFrom<v1::ActRequest> for act::Request {
             Some(Sent::Scene(scene)) => Some(scene.try_into()?),
             None => None,
         };
-        ActFields { policy, session_id, recurrent_state, step, run_id, seed }.request(input)
+        ActFields { policy, session_id, recurrent_state, step, run_id, seed, flight, return_motion }.request(input)
     }
 }
 
@@ -73,9 +82,10 @@ pub fn open_session(
     session_id: String,
     run_id: Option<String>,
     seed: Option<u64>,
+    flight: FlightFields,
 ) -> Result<(PolicySpec, SessionOptions), Invalid> {
     let policy = policy.parse()?;
     let id = Some(session_id).filter(|id| !id.is_empty());
     check_ids(id.as_deref(), run_id.as_deref())?;
-    Ok((policy, SessionOptions { id, run_id, seed }))
+    Ok((policy, SessionOptions { id, run_id, seed, flight: flight.options()? }))
 }

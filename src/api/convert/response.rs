@@ -3,13 +3,15 @@
 use std::time::Duration;
 
 use jiff::Timestamp;
+use serde::Deserialize;
 
 use super::structs::to_struct;
-use crate::env::EnvConfig;
+use crate::env::{Boundary, EnvConfig, Point};
 use crate::policy::RequiredInput;
 use crate::service::act;
 use crate::service::policies::{PolicyDetails, VersionSummary};
-use crate::serving::{Decision, PolicyKind, PolicyRef, SessionInfo};
+use crate::serving::flight::degrees;
+use crate::serving::{Constraint, Decision, Overruled, PolicyInfo, PolicyKind, PolicyRef, SessionInfo, Warning};
 use crate::wire::v1;
 
 /// The action of one UAV.
@@ -19,41 +21,70 @@ pub struct Action {
     pub uav_id: String,
     /// Heading index.
     pub heading: u8,
+    /// Direction in the coordinates of the caller, in degrees; `None` for hover.
+    pub degrees: Option<f64>,
     /// Q-value of each heading; empty if not requested, or if the policy has none.
     pub q_values: Vec<f32>,
+    /// Velocity, if requested.
+    pub velocity: Option<Point>,
+    /// Position after the slot, if requested and if the position is known.
+    pub waypoint: Option<Point>,
+    /// What constraints did to the heading, if anything.
+    pub overruled: Option<Overruled>,
 }
 
-/// The direction of a heading in degrees, counter-clockwise from +x; `None` for hover.
-pub fn degrees(heading: u8) -> Option<f64> {
-    /// Number of headings with a direction; the next index is hover.
-    const COMPASS: u8 = EnvConfig::COMPASS as u8;
-    (heading < COMPASS).then(|| 360.0 / f64::from(COMPASS) * f64::from(heading))
+/// What a request wants of each UAV besides its heading.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Wanted {
+    /// Q-values, if the policy has them.
+    pub q_values: bool,
+    /// Velocities.
+    pub velocity: bool,
+    /// Positions after the slot.
+    pub waypoint: bool,
 }
 
 /// Takes the actions of all UAVs out of `response`, in the order of the request.
-pub fn actions(response: &mut act::Response, q_values: bool) -> impl Iterator<Item = Action> {
+pub fn actions(response: &mut act::Response, wanted: Wanted) -> impl Iterator<Item = Action> {
     let width = response.policy.implementation.actions();
-    let act::Response { canonical_of_request, uavs, decision: Decision { headings, q_values: values, .. }, .. } = response;
+    let act::Response {
+        canonical_of_request,
+        uavs,
+        decision: Decision { headings, q_values: values, overruled, .. },
+        flight,
+        motion,
+        ..
+    } = response;
     canonical_of_request.iter().map(move |&uav| {
         let uav = uav as usize;
         let q = values.get(uav * width..(uav + 1) * width).unwrap_or_default();
+        let heading = headings[uav];
+        let speed = motion.as_ref().and_then(|motion| motion.speeds.get(uav).copied().flatten());
+        let at = motion.as_ref().and_then(|motion| motion.positions[uav]).filter(|_| wanted.waypoint);
         Action {
             uav_id: std::mem::take(&mut uavs[uav]),
-            heading: headings[uav],
-            q_values: if q_values && q.iter().all(|q| q.is_finite()) { q.to_vec() } else { Vec::new() },
+            heading,
+            degrees: flight.as_ref().map_or_else(|| degrees(heading), |flight| flight.degrees(heading)),
+            q_values: if wanted.q_values && q.iter().all(|q| q.is_finite()) { q.to_vec() } else { Vec::new() },
+            velocity: flight.as_ref().filter(|_| wanted.velocity).map(|flight| flight.velocity(heading, speed)),
+            overruled: overruled.iter().find(|overruled| overruled.uav as usize == uav).cloned(),
+            waypoint: flight.as_ref().zip(at).map(|(flight, at)| flight.waypoint(at, heading, speed)),
         }
     })
 }
 
-/// The response, with Q-values if `q_values` were requested and the policy has them.
-pub fn act_response(mut response: act::Response, q_values: bool) -> v1::ActResponse {
+/// The response, with what is wanted.
+pub fn act_response(mut response: act::Response, wanted: Wanted) -> v1::ActResponse {
     let action = |action: Action| v1::Action {
         heading_index: action.heading.into(),
-        heading_deg: degrees(action.heading),
+        heading_deg: action.degrees,
         uav_id: action.uav_id,
         q_values: action.q_values,
+        velocity: action.velocity.map(|[x, y]| v1::Velocity { x, y }),
+        waypoint: action.waypoint.map(|[x, y]| v1::Position { x, y, z: None }),
+        overruled: action.overruled.map(Into::into),
     };
-    let actions = actions(&mut response, q_values).map(action).collect();
+    let actions = actions(&mut response, wanted).map(action).collect();
     let act::Response { policy, decision: Decision { step, timings, .. }, recurrent_state, .. } = response;
     v1::ActResponse {
         actions,
@@ -83,7 +114,25 @@ impl From<SessionInfo> for v1::Session {
             opened_at: Some(timestamp(session.opened_at)),
             ttl: Some(duration(session.ttl)),
             owner: session.owner.id().unwrap_or_default().to_owned(),
+            warnings: session.warnings.into_iter().map(Into::into).collect(),
         }
+    }
+}
+
+impl From<Overruled> for v1::Overruled {
+    fn from(overruled: Overruled) -> Self {
+        let list = |constraints: Vec<Constraint>| constraints.into_iter().map(|of| v1::Constraint::from(of).into()).collect();
+        Self {
+            preferred_heading_index: overruled.preferred.into(),
+            because: list(overruled.because),
+            violates: list(overruled.violates),
+        }
+    }
+}
+
+impl From<Warning> for v1::Warning {
+    fn from(warning: Warning) -> Self {
+        Self { field: warning.field.to_owned(), message: warning.message }
     }
 }
 
@@ -115,6 +164,7 @@ impl From<PolicyDetails> for v1::Policy {
             headings: info.actions as u32,
             needs: needs.into(),
             detection_range: info.detection_range,
+            world: Some(world(&info)),
             aliases,
             loaded,
             loaded_versions: versions.iter().filter(|(_, loaded)| *loaded).map(|(version, _)| *version).collect(),
@@ -124,6 +174,29 @@ impl From<PolicyDetails> for v1::Policy {
             metrics: to_struct(&info.metrics),
             created_at: Some(timestamp(info.created_at)),
         }
+    }
+}
+
+/// The environment that a policy was trained in, or made for.
+pub fn environment(info: &PolicyInfo) -> EnvConfig {
+    let trained = info.config.get("environment").and_then(|environment| EnvConfig::deserialize(environment).ok());
+    trained.unwrap_or_else(|| EnvConfig { detection_range: info.detection_range, ..EnvConfig::default() })
+}
+
+fn world(info: &PolicyInfo) -> v1::World {
+    let environment = environment(info);
+    let boundary = match environment.boundary {
+        Boundary::Clamp => v1::Boundary::Clamp,
+        Boundary::Free => v1::Boundary::Free,
+    };
+    v1::World {
+        slot_seconds: None,
+        speed: Some(environment.speed),
+        transmission_range: Some(environment.transmission_range),
+        detection_range: Some(environment.detection_range),
+        communication_range: Some(environment.ranges().communication),
+        slots: Some(environment.slots as u32),
+        boundary: boundary.into(),
     }
 }
 

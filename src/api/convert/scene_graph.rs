@@ -2,8 +2,7 @@
 
 use crate::env::Point;
 use crate::invalid::Invalid;
-use crate::policy::FleetGraph;
-use crate::serving::{FleetInput, Node, NodeDetection, Scene};
+use crate::serving::{CopyObservation, FleetInput, Node, NodeDetection, SceneUav};
 use crate::wire::v1;
 
 impl TryFrom<v1::Graph> for FleetInput {
@@ -21,7 +20,16 @@ impl TryFrom<v1::Graph> for FleetInput {
             };
             let detection = |d: v1::Detection| NodeDetection { target_id: d.target_id, rel: [d.rel_x, d.rel_y], aoi: d.aoi };
             let position = node.position.map(|p| [p.x, p.y]);
-            Ok(Node { id: node.id, is_uav, detections: node.detections.into_iter().map(detection), position, aoi: node.aoi })
+            let detections = node.detections.into_iter().map(detection);
+            Ok(Node {
+                id: node.id,
+                is_uav,
+                detections,
+                position,
+                aoi: node.aoi,
+                speed: node.speed,
+                endurance: node.endurance_seconds,
+            })
         };
         Self::from_nodes(graph.nodes.into_iter().enumerate().map(node).collect::<Result<_, _>>()?)
     }
@@ -31,37 +39,43 @@ impl TryFrom<v1::Scene> for FleetInput {
     type Error = Invalid;
 
     fn try_from(scene: v1::Scene) -> Result<Self, Invalid> {
-        let uavs = scene.uavs.into_iter().map(|u| (u.id, [u.x, u.y]));
+        let uavs = scene.uavs.into_iter().map(|u| SceneUav {
+            id: u.id,
+            position: [u.x, u.y],
+            speed: u.speed,
+            endurance: u.endurance_seconds,
+        });
         let users = scene.users.into_iter().map(|u| (u.id, [u.x, u.y], u.aoi));
         Self::from_scene(uavs, users)
     }
 }
 
-fn uav_id(i: usize) -> String {
+fn uav_id(i: u32) -> String {
     format!("uav-{i}")
 }
 
-fn user_id(j: usize) -> String {
+fn user_id(j: u32) -> String {
     format!("user-{j}")
 }
 
-/// The UAVs of a scene.
-pub fn uavs(scene: &Scene) -> impl Iterator<Item = (String, Point)> {
-    scene.uavs.iter().enumerate().map(|(i, &position)| (uav_id(i), position))
+/// The UAVs of an observation.
+pub fn uavs(observation: &CopyObservation) -> impl Iterator<Item = (String, Point)> {
+    observation.scene.uavs.iter().zip(&observation.numbers.0).map(|(&position, &i)| (uav_id(i), position))
 }
 
-/// The users of a scene with their AoI.
-pub fn users(scene: &Scene) -> impl Iterator<Item = (String, Point, f64)> {
-    let users = scene.users.iter().zip(&scene.aoi).enumerate();
-    users.map(|(j, (&position, &aoi))| (user_id(j), position, f64::from(aoi)))
+/// The users of an observation with their AoI.
+pub fn users(observation: &CopyObservation) -> impl Iterator<Item = (String, Point, f64)> {
+    let users = observation.scene.users.iter().zip(&observation.scene.aoi).zip(&observation.numbers.1);
+    users.map(|((&position, &aoi), &j)| (user_id(j), position, f64::from(aoi)))
 }
 
-/// The nodes of a slot with their detections.
-pub fn nodes(graph: &FleetGraph) -> impl Iterator<Item = Node<impl Iterator<Item = NodeDetection>>> {
+/// The nodes of an observation with their detections; `None` if it has no graph.
+pub fn nodes(observation: &CopyObservation) -> Option<impl Iterator<Item = Node<impl Iterator<Item = NodeDetection>>>> {
+    let (graph, (uav_numbers, user_numbers)) = (observation.graph.as_ref()?, &observation.numbers);
     let uavs = graph.uavs();
-    let id = move |node: usize| node.checked_sub(uavs).map_or_else(|| uav_id(node), user_id);
+    let id = move |node: usize| node.checked_sub(uavs).map_or_else(|| uav_id(uav_numbers[node]), |j| user_id(user_numbers[j]));
     let aoi = move |node: usize| node.checked_sub(uavs).map(|user| f64::from(graph.aoi()[user]));
-    (0..uavs + graph.users()).map(move |node| Node {
+    Some((0..uavs + graph.users()).map(move |node| Node {
         id: id(node),
         is_uav: node < uavs,
         detections: graph.detections(node).iter().map(move |detection| {
@@ -70,27 +84,31 @@ pub fn nodes(graph: &FleetGraph) -> impl Iterator<Item = Node<impl Iterator<Item
         }),
         position: graph.uav_positions().and_then(|positions| positions.get(node)).copied(),
         aoi: aoi(node),
-    })
+        speed: None,
+        endurance: None,
+    }))
 }
 
-impl From<&Scene> for v1::Scene {
-    fn from(scene: &Scene) -> Self {
-        let uav = |(id, [x, y]): (String, Point)| v1::SceneUav { id, x, y };
-        let user = |(id, [x, y], aoi): (String, Point, f64)| v1::SceneUser { id, x, y, aoi };
-        Self { uavs: uavs(scene).map(uav).collect(), users: users(scene).map(user).collect() }
+impl From<&CopyObservation> for v1::Scene {
+    fn from(observation: &CopyObservation) -> Self {
+        let uav = |(id, [x, y]): (String, Point)| v1::SceneUav { id, x, y, ..Default::default() };
+        let user = |(id, [x, y], aoi): (String, Point, f64)| v1::SceneUser { id, x, y, aoi, z: None };
+        Self { uavs: uavs(observation).map(uav).collect(), users: users(observation).map(user).collect() }
     }
 }
 
-impl From<&FleetGraph> for v1::Graph {
-    fn from(graph: &FleetGraph) -> Self {
-        let detection = |d: NodeDetection| v1::Detection { target_id: d.target_id, rel_x: d.rel[0], rel_y: d.rel[1], aoi: d.aoi };
-        let nodes = nodes(graph).map(|node| v1::Node {
-            id: node.id,
-            kind: if node.is_uav { v1::NodeKind::Uav } else { v1::NodeKind::User }.into(),
-            detections: node.detections.map(detection).collect(),
-            position: node.position.map(|[x, y]| v1::Position { x, y }),
-            aoi: node.aoi,
-        });
-        Self { nodes: nodes.collect() }
-    }
+/// The graph of an observation, if it has one.
+pub fn graph(observation: &CopyObservation) -> Option<v1::Graph> {
+    let detection =
+        |d: NodeDetection| v1::Detection { target_id: d.target_id, rel_x: d.rel[0], rel_y: d.rel[1], aoi: d.aoi, rel_z: None };
+    let nodes = nodes(observation)?.map(|node| v1::Node {
+        id: node.id,
+        kind: if node.is_uav { v1::NodeKind::Uav } else { v1::NodeKind::User }.into(),
+        detections: node.detections.map(detection).collect(),
+        position: node.position.map(|[x, y]| v1::Position { x, y, z: None }),
+        aoi: node.aoi,
+        speed: None,
+        endurance_seconds: None,
+    });
+    Some(v1::Graph { nodes: nodes.collect() })
 }

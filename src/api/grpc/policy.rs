@@ -9,7 +9,9 @@ use tonic::{Request, Response, Status, Streaming};
 
 use super::{deadline, stream};
 use crate::api::auth::{caller, count_message};
-use crate::api::convert::{request::open_session, response::act_response};
+use crate::api::convert::flight;
+use crate::api::convert::request::open_session;
+use crate::api::convert::response::{Wanted, act_response};
 use crate::api::errors::act_error;
 use crate::invalid::in_range;
 use crate::service::keys::Caller;
@@ -37,10 +39,11 @@ async fn act_one(
     request: v1::ActRequest,
     deadline: Option<Instant>,
 ) -> Result<v1::ActResponse, Error> {
-    let (return_q_values, cost) = (request.return_q_values, decoding_cost(&request));
+    let (q_values, velocity, waypoint) = (request.return_q_values, request.return_velocity, request.return_waypoint);
+    let (wanted, cost) = (Wanted { q_values, velocity, waypoint }, decoding_cost(&request));
     let decode = || act::Request::try_from(request);
     let request = act::decode(app, caller, cost, deadline, decode).await??;
-    Ok(act_response(act::act(app, caller, request, deadline).await?, return_q_values))
+    Ok(act_response(act::act(app, caller, request, deadline).await?, wanted))
 }
 
 /// Estimated cost of converting the request.
@@ -99,8 +102,10 @@ impl PolicyService for Handlers {
 
     async fn open_session(&self, request: Request<v1::OpenSessionRequest>) -> Result<Response<v1::Session>, Status> {
         let caller = caller(request.extensions());
-        let v1::OpenSessionRequest { policy, session_id, run_id, seed } = request.into_inner();
-        let (policy, options) = open_session(&policy, session_id, run_id, seed).map_err(Error::from)?;
+        let v1::OpenSessionRequest { policy, session_id, run_id, seed, symmetric, frame, world, constraints } =
+            request.into_inner();
+        let flight = flight::fields(frame, world, symmetric, constraints).map_err(Error::from)?;
+        let (policy, options) = open_session(&policy, session_id, run_id, seed, flight).map_err(Error::from)?;
         Ok(Response::new(sessions::open(&self.0, &caller, &policy, options).await?.into()))
     }
 

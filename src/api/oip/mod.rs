@@ -75,7 +75,8 @@ pub struct InferResponse {
 pub async fn infer(app: &App, caller: &Caller, request: InferRequest, deadline: Option<Instant>) -> Result<InferResponse, Error> {
     let InferRequest { model, version, id, parameters, inputs, outputs } = request;
     let spec = policy_spec(&model, &version)?;
-    let Parameters { sequence, step, seed, timeout } = Parameters::read(parameters)?;
+    let Parameters { sequence, step, seed, timeout, flight } = Parameters::read(parameters)?;
+    let flight = flight.options()?;
     let outputs = OutputSelection::new(outputs, sequence.is_none())?;
     check_names(&inputs)?;
     let timeout = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
@@ -89,7 +90,8 @@ pub async fn infer(app: &App, caller: &Caller, request: InferRequest, deadline: 
             return Err(Invalid::new(STATE, "a tensor", expected).into());
         }
     };
-    let request = act::Request { policy: Some(spec.clone()), input, memory, step, run_id: None, seed };
+    let request =
+        act::Request { policy: Some(spec.clone()), input, memory, step, run_id: None, seed, flight, return_motion: false };
     let response = act::act(app, caller, request, deadline).await.map_err(model_error)?;
     let reference = &response.policy.reference;
     let (version, digest, step) = (reference.version, reference.digest_hex(), response.decision.step);

@@ -1,10 +1,10 @@
 //! Outputs of inference: headings, Q-values and the recurrent state.
 
 use super::STATE;
-use crate::api::convert::response::degrees;
 use crate::api::convert::tensors::{Data, Datatype, Tensor, TensorShape};
 use crate::invalid::Invalid;
 use crate::service::act::Response;
+use crate::serving::flight::degrees;
 
 const NAMES: [&str; 4] = [INDEX, DEGREES, Q_VALUES, STATE];
 const INDEX: &str = "heading_index";
@@ -57,7 +57,9 @@ fn output(name: String, response: &Response) -> Tensor {
         INDEX => (vec![uavs], Data::Int32(uav_indices.map(|uav| i32::from(heading(uav))).collect())),
         // Hovering has no direction.
         DEGREES => {
-            (vec![uavs], Data::Fp32(uav_indices.map(|uav| degrees(heading(uav)).map_or(f32::NAN, |x| x as f32)).collect()))
+            let degrees =
+                |uav| response.flight.as_ref().map_or_else(|| degrees(heading(uav)), |flight| flight.degrees(heading(uav)));
+            (vec![uavs], Data::Fp32(uav_indices.map(|uav| degrees(uav).map_or(f32::NAN, |x| x as f32)).collect()))
         }
         Q_VALUES => {
             let values =

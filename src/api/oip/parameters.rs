@@ -2,7 +2,13 @@
 
 use std::time::Duration;
 
+use serde::de::DeserializeOwned;
+
+use crate::api::convert::flight::FlightFields;
+use crate::api::rest::extract::parse;
+use crate::api::rest::flight::{Constraints, Frame, World, constraints};
 use crate::invalid::Invalid;
+use crate::service::Error;
 use crate::service::act::{Sequence, SequenceId};
 use crate::serving::FleetIds;
 
@@ -23,7 +29,8 @@ pub enum Parameter {
 
 /// Parameters without effect, which clients of Triton send by default.
 const IGNORED: [&str; 2] = ["priority", "triton_enable_empty_final_response"];
-const KNOWN: &str = "one of sequence_id, sequence_start, sequence_end, step, seed, timeout";
+const KNOWN: &str = "one of sequence_id, sequence_start, sequence_end, step, seed, timeout, symmetric, frame, world, \
+                     constraints";
 
 /// The parsed parameters.
 #[derive(Debug, Default)]
@@ -32,6 +39,7 @@ pub(super) struct Parameters {
     pub(super) step: Option<u64>,
     pub(super) seed: Option<u64>,
     pub(super) timeout: Option<Duration>,
+    pub(super) flight: FlightFields,
 }
 
 impl Parameters {
@@ -50,6 +58,10 @@ impl Parameters {
                 "step" => parsed.step = Some(whole(&name, &value)?),
                 "seed" => parsed.seed = Some(whole(&name, &value)?),
                 "timeout" => parsed.timeout = Some(whole(&name, &value)?).filter(|&us| us > 0).map(Duration::from_micros),
+                "symmetric" => parsed.flight.symmetric = Some(flag(&name, &value)?),
+                "frame" => parsed.flight.frame = Some(document::<Frame>(&name, &value)?.into()),
+                "constraints" => parsed.flight.constraints = Some(constraints(document::<Constraints>(&name, &value)?)?),
+                "world" => parsed.flight.world = Some(document::<World>(&name, &value)?.into()),
                 ignored if IGNORED.contains(&ignored) => {}
                 _ => return Err(Invalid::new("parameters", format!("{name:?}"), KNOWN)),
             }
@@ -77,6 +89,15 @@ fn invalid(name: &str, value: &Parameter, expected: &str) -> Invalid {
 
 fn flag(name: &str, value: &Parameter) -> Result<bool, Invalid> {
     if let Parameter::Bool(value) = value { Ok(*value) } else { Err(invalid(name, value, "true or false")) }
+}
+
+/// A JSON document in a text.
+fn document<T: DeserializeOwned>(name: &str, value: &Parameter) -> Result<T, Invalid> {
+    let Parameter::Text(text) = value else { return Err(invalid(name, value, "a JSON object as a text")) };
+    parse(text.as_bytes()).map_err(|error| match error {
+        Error::Invalid(error) => error.with_prefix(&format!("parameters.{name}")),
+        _ => invalid(name, value, "a JSON object as a text"),
+    })
 }
 
 fn whole(name: &str, value: &Parameter) -> Result<u64, Invalid> {

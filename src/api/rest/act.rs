@@ -11,13 +11,15 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::extract;
+use super::flight::{self, Constraints, Frame, Overruled, World};
 use super::json;
 use super::openapi::{BadBody, Conflict, Draining, NotFound};
 use super::policies::PolicyRef;
 use super::scene_graph::{Graph, Scene};
 use super::schemas::{self, Base64, Seconds};
 use crate::api::convert::request::ActFields;
-use crate::api::convert::response::{self, actions, degrees};
+use crate::api::convert::response::{self, Wanted, actions};
+use crate::env::Point;
 use crate::invalid::Invalid;
 use crate::service::keys::Caller;
 use crate::service::{App, Error, act};
@@ -59,6 +61,18 @@ struct ActRequest {
     /// session.
     #[serde(default, deserialize_with = "json::optional_integer")]
     seed: Option<u64>,
+    /// Whether, where only one of two nodes of a graph reports the other, both detect each other; default: true. This, `frame`,
+    /// `world` and `constraints` are not accepted with a session: set them when you open it. Without one, send the same in every slot.
+    symmetric: Option<bool>,
+    frame: Option<Frame>,
+    world: Option<World>,
+    constraints: Option<Constraints>,
+    /// Whether to return the velocity of each UAV.
+    #[serde(default)]
+    return_velocity: bool,
+    /// Whether to return where each UAV should be after the slot. UAVs without a position in the request get none.
+    #[serde(default)]
+    return_waypoint: bool,
 }
 
 fn example() -> serde_json::Value {
@@ -87,7 +101,23 @@ impl TryFrom<ActRequest> for act::Request {
     type Error = Invalid;
 
     fn try_from(request: ActRequest) -> Result<Self, Invalid> {
-        let ActRequest { policy, graph, scene, session_id, recurrent_state, step, run_id, return_q_values: _, seed } = request;
+        let return_motion = request.return_velocity || request.return_waypoint;
+        let ActRequest {
+            policy,
+            graph,
+            scene,
+            session_id,
+            recurrent_state,
+            step,
+            run_id,
+            seed,
+            symmetric,
+            frame,
+            world,
+            constraints,
+            ..
+        } = request;
+        let flight = flight::fields(frame, world, symmetric, constraints)?;
         let observation = match (graph, scene) {
             (Some(graph), None) => Some(FleetInput::try_from(graph)?),
             (None, Some(scene)) => Some(FleetInput::try_from(scene)?),
@@ -98,7 +128,7 @@ impl TryFrom<ActRequest> for act::Request {
             return Err(Invalid::schema("session_id", "session_id and recurrent_state", "one of them"));
         }
         let recurrent_state = recurrent_state.map(|state| state.0).unwrap_or_default();
-        ActFields { policy, session_id, recurrent_state, step, run_id, seed }.request(observation)
+        ActFields { policy, session_id, recurrent_state, step, run_id, seed, flight, return_motion }.request(observation)
     }
 }
 
@@ -119,16 +149,41 @@ struct ActResponse {
 #[derive(Debug, Serialize, ToSchema)]
 struct Action {
     uav_id: String,
-    /// Heading index h: direction 45*h degrees counter-clockwise from +x; 8 = hover, if the policy supports it.
+    /// Heading index h: direction 45*h degrees counter-clockwise from the x axis of the area; 8 = hover, if the policy supports it.
     #[schema(maximum = 8)]
     heading_index: u8,
-    /// Direction in degrees, counter-clockwise from +x; absent for hover.
+    /// Direction in degrees, counter-clockwise from the x axis of the caller; absent for hover.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
     heading_deg: Option<f64>,
     /// Q-value of each heading, if requested and if the policy has Q-values.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     q_values: Vec<f32>,
+    /// Velocity along the axes of the caller, per second, if requested.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    velocity: Option<Vector>,
+    /// Where the UAV should be after the slot, if requested: in the area, unless the boundary is free.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    waypoint: Option<Vector>,
+    /// Set if constraints changed the heading, or if the heading breaks one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    overruled: Option<Overruled>,
+}
+
+/// A velocity or a position, along the axes of the caller.
+#[derive(Debug, Serialize, ToSchema)]
+struct Vector {
+    x: f64,
+    y: f64,
+}
+
+impl From<Point> for Vector {
+    fn from([x, y]: Point) -> Self {
+        Self { x, y }
+    }
 }
 
 #[derive(Debug, Serialize, ToSchema)]
@@ -142,14 +197,17 @@ struct Timings {
 }
 
 impl ActResponse {
-    fn new(mut response: act::Response, q_values: bool) -> Self {
+    fn new(mut response: act::Response, wanted: Wanted) -> Self {
         let action = |action: response::Action| Action {
             heading_index: action.heading,
-            heading_deg: degrees(action.heading),
+            heading_deg: action.degrees,
             uav_id: action.uav_id,
             q_values: action.q_values,
+            velocity: action.velocity.map(Into::into),
+            waypoint: action.waypoint.map(Into::into),
+            overruled: action.overruled.map(Into::into),
         };
-        let actions = actions(&mut response, q_values).map(action).collect();
+        let actions = actions(&mut response, wanted).map(action).collect();
         let Decision { step, timings: serving::Timings { queue, compute, batch_size, .. }, .. } = response.decision;
         Self {
             actions,
@@ -171,8 +229,9 @@ async fn decide(
     caller: Caller,
     extract::Json(request): extract::Json<ActRequest>,
 ) -> Result<Json<ActResponse>, Error> {
-    let (q_values, cost) = (request.return_q_values, request.decoding_cost());
+    let (q_values, velocity, waypoint) = (request.return_q_values, request.return_velocity, request.return_waypoint);
+    let (wanted, cost) = (Wanted { q_values, velocity, waypoint }, request.decoding_cost());
     let decode = move || act::Request::try_from(request);
     let request = act::decode(&app, &caller, cost, None, decode).await??;
-    Ok(Json(ActResponse::new(act::act(&app, &caller, request, None).await?, q_values)))
+    Ok(Json(ActResponse::new(act::act(&app, &caller, request, None).await?, wanted)))
 }

@@ -49,6 +49,19 @@ fn boolean() -> Value {
     json!({"type": "boolean"})
 }
 
+/// An object with these fields only.
+fn plain_object(fields: &[(&str, Value)], required: &[&str]) -> Value {
+    let properties: Map<String, Value> = fields.iter().map(|(name, schema)| ((*name).to_owned(), schema.clone())).collect();
+    json!({"type": "object", "properties": properties, "required": required, "additionalProperties": false})
+}
+
+/// An object with these fields only, or null.
+fn nullable_object(fields: &[(&str, Value)], required: &[&str]) -> Value {
+    let mut schema = plain_object(fields, required);
+    schema["type"] = json!(["object", "null"]);
+    schema
+}
+
 /// One of `words`, or `{"given": [[x, y], ...]}`.
 fn words_or_points(words: &[&str]) -> Value {
     let point = json!({"type": "array", "items": number(0.0, 1.0), "minItems": 2, "maxItems": 2});
@@ -57,6 +70,13 @@ fn words_or_points(words: &[&str]) -> Value {
         "properties": {"given": {"type": "array", "items": point}}
     });
     json!({"oneOf": [{"type": "string", "enum": words}, given]})
+}
+
+/// A boundary, or null.
+pub(super) fn optional_boundary() -> RefOr<Schema> {
+    let mut words = string_enum::<Boundary>();
+    words["type"] = json!(["string", "null"]);
+    schema(words)
 }
 
 impl PartialSchema for EnvConfig {
@@ -89,6 +109,19 @@ impl PartialSchema for EnvConfig {
                 "Weight of each user in the reward and the mean AoI, scaled to mean 1; absent: all equal.",
             ),
             ("user_speed", number(0.0, 1.0), "Distance that a user walks per slot; 0: users stay in place."),
+            (
+                "lose_uav",
+                nullable_object(&[("uav", integer(0, 4095)), ("slot", integer(0, 9999))], &["uav", "slot"]),
+                "A UAV that is lost from a slot on: it is not in observations, and its actions have no effect. Not for training.",
+            ),
+            (
+                "user_slots",
+                json!({"type": "array", "items": plain_object(&[
+                    ("user", integer(0, 65_535)), ("from", integer(0, 10_000)),
+                    ("until", json!({"type": ["integer", "null"], "minimum": 0, "maximum": 10_000})),
+                ], &["user"])}),
+                "The slots of users that come and go: from, and until (exclusive). All other users are always there. Not for training.",
+            ),
         ];
         schema(object(&fields, &defaults).into())
     }

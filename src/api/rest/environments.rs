@@ -227,8 +227,8 @@ impl EnvironmentState {
 impl From<serving::CopyState> for CopyState {
     fn from(copy: serving::CopyState) -> Self {
         Self {
-            scene: (&copy.observation.scene).into(),
-            graph: copy.observation.graph.as_ref().map(Into::into),
+            scene: (&copy.observation).into(),
+            graph: Graph::of(&copy.observation),
             reward: copy.reward,
             truncated: copy.finished.is_some(),
             seed: copy.seed,
@@ -243,8 +243,8 @@ impl From<serving::FinishedEpisode> for FinishedEpisode {
         Self {
             seed: finished.seed,
             metrics: EpisodeMetrics { mean_aoi, peak_aoi, p95_aoi, coverage, fairness },
-            scene: finished.observation.as_ref().map(|last| (&last.scene).into()),
-            graph: finished.observation.as_ref().and_then(|last| last.graph.as_ref()).map(Into::into),
+            scene: finished.observation.as_ref().map(Into::into),
+            graph: finished.observation.as_ref().and_then(Graph::of),
         }
     }
 }

@@ -7,6 +7,7 @@ mod dashboard;
 mod environments;
 mod events;
 pub mod extract;
+pub mod flight;
 mod jobs;
 mod json;
 mod middleware;

@@ -17,6 +17,8 @@ use super::extract::{self, MaxBody, Path, Query};
 use super::json;
 use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
 use super::schemas;
+use crate::api::convert::response::environment;
+use crate::env::{Boundary, EnvConfig};
 use crate::policy::RequiredInput;
 use crate::service::keys::Caller;
 use crate::service::policies::{PolicyDetails, VersionSummary};
@@ -137,6 +139,7 @@ struct Policy {
     needs: Needs,
     /// In units of the square's side.
     detection_range: f64,
+    world: PolicyWorld,
     /// Aliases that point to this version.
     aliases: Vec<String>,
     /// The newest 100 versions of the policy, oldest first. `GET /v1/policies/{name}/versions` lists all.
@@ -157,6 +160,39 @@ struct Policy {
     #[schema(value_type = Object, required = false)]
     metrics: Value,
     created_at: Timestamp,
+}
+
+/// The world that a policy was trained in, or made for. Lengths are in units of the square's side.
+#[derive(Debug, Serialize, ToSchema)]
+struct PolicyWorld {
+    /// Distance per slot.
+    speed: f64,
+    /// Range within which a UAV collects the data of a user.
+    transmission_range: f64,
+    /// Range within which nodes detect each other.
+    detection_range: f64,
+    /// Range within which UAVs exchange messages.
+    communication_range: f64,
+    /// Slots per episode.
+    slots: usize,
+    /// `clamp`: UAVs stay in the square; `free`: they may leave it.
+    boundary: &'static str,
+}
+
+impl From<EnvConfig> for PolicyWorld {
+    fn from(env: EnvConfig) -> Self {
+        Self {
+            speed: env.speed,
+            transmission_range: env.transmission_range,
+            detection_range: env.detection_range,
+            communication_range: env.ranges().communication,
+            slots: env.slots,
+            boundary: match env.boundary {
+                Boundary::Clamp => "clamp",
+                Boundary::Free => "free",
+            },
+        }
+    }
 }
 
 /// Where a policy comes from.
@@ -198,6 +234,7 @@ impl From<PolicyDetails> for Policy {
                 RequiredInput::FullScene => Needs::FullScene,
             },
             detection_range: info.detection_range,
+            world: environment(&info).into(),
             aliases,
             loaded,
             loaded_versions: versions.iter().filter(|(_, loaded)| *loaded).map(|(version, _)| *version).collect(),

@@ -11,11 +11,10 @@ use super::json::objects_only;
 use crate::api::convert::scene_graph::{nodes, uavs, users};
 use crate::env::Point;
 use crate::invalid::Invalid;
-use crate::policy::FleetGraph;
-use crate::serving::{self, FleetInput};
+use crate::serving::{self, CopyObservation, FleetInput};
 
-/// The detections of all nodes. If only one of two nodes reports a detection, the server adds the reverse detection. If both
-/// report one, the relative position of one must be the negation of the other, within 1e-5.
+/// The detections of all nodes. Every measurement is that of its node, with an error of its own; two nodes need not agree.
+/// If only one of two nodes reports the other, the server adds the reverse detection (see `symmetric`).
 #[derive(Debug, Deserialize, Serialize, ToSchema)]
 #[serde(deny_unknown_fields, remote = "Self")]
 pub(super) struct Graph {
@@ -38,10 +37,18 @@ struct Node {
     /// Position of a UAV. Required by policies with `NEEDS_OWN_POSITIONS`.
     #[serde(skip_serializing_if = "Option::is_none")]
     position: Option<Position>,
-    /// AoI of a user in slots. Default: the AoI in a detection of the user, or 0 if no node detects the user.
+    /// AoI of a user in slots. Default: the smallest AoI in the detections of the user, or 0 if no node detects the user.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0, maximum = 1e6)]
     aoi: Option<f64>,
+    /// Speed of a UAV, per second. Default: that of the world.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 0)]
+    speed: Option<f64>,
+    /// Time that the UAV can still fly, in seconds; for the constraint `return_in_time`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 0)]
+    endurance_seconds: Option<f64>,
 }
 
 #[derive(Clone, Copy, Debug, Deserialize, Serialize)]
@@ -60,23 +67,29 @@ fn node_kind() -> RefOr<Schema> {
 #[serde(deny_unknown_fields, remote = "Self")]
 struct Detection {
     target_id: String,
-    /// Position of the target minus position of the node, in units of the side of the square.
+    /// Position of the target minus position of the node, in units of the side of the square or of the frame.
     rel_x: f64,
     rel_y: f64,
+    /// Height difference. Ignored: policies fly in the plane.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    rel_z: Option<f64>,
     /// AoI in slots; required if the target is a user, absent if it is a UAV.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0, maximum = 1e6)]
     aoi: Option<f64>,
 }
 
-/// A position in units of the square's side.
+/// A position, in units of the square's side or in the coordinates of the frame.
 #[derive(Debug, Deserialize, Serialize, ToSchema)]
 #[serde(deny_unknown_fields, remote = "Self")]
 struct Position {
-    #[schema(minimum = -1e4, maximum = 1e4)]
+    #[schema(minimum = -1e9, maximum = 1e9)]
     x: f64,
-    #[schema(minimum = -1e4, maximum = 1e4)]
+    #[schema(minimum = -1e9, maximum = 1e9)]
     y: f64,
+    /// Altitude. Ignored: policies fly in the plane.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    z: Option<f64>,
 }
 
 /// The absolute positions of all UAVs and users. The server derives the detections.
@@ -95,10 +108,21 @@ pub(super) struct Scene {
 struct Uav {
     #[schema(min_length = 1, max_length = 128)]
     id: String,
-    #[schema(minimum = -1e4, maximum = 1e4)]
+    #[schema(minimum = -1e9, maximum = 1e9)]
     x: f64,
-    #[schema(minimum = -1e4, maximum = 1e4)]
+    #[schema(minimum = -1e9, maximum = 1e9)]
     y: f64,
+    /// Altitude. Ignored: policies fly in the plane.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    z: Option<f64>,
+    /// Speed per second. Default: that of the world.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 0)]
+    speed: Option<f64>,
+    /// Time that the UAV can still fly, in seconds; for the constraint `return_in_time`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 0)]
+    endurance_seconds: Option<f64>,
 }
 
 #[derive(Debug, Deserialize, Serialize, ToSchema)]
@@ -106,10 +130,13 @@ struct Uav {
 struct User {
     #[schema(min_length = 1, max_length = 128)]
     id: String,
-    #[schema(minimum = -1e4, maximum = 1e4)]
+    #[schema(minimum = -1e9, maximum = 1e9)]
     x: f64,
-    #[schema(minimum = -1e4, maximum = 1e4)]
+    #[schema(minimum = -1e9, maximum = 1e9)]
     y: f64,
+    /// Altitude. Ignored: policies fly in the plane.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    z: Option<f64>,
     /// AoI in slots.
     #[schema(minimum = 0, maximum = 1e6)]
     aoi: f64,
@@ -138,25 +165,30 @@ impl TryFrom<Graph> for FleetInput {
             }),
             position: node.position.map(|p| [p.x, p.y]),
             aoi: node.aoi,
+            speed: node.speed,
+            endurance: node.endurance_seconds,
         };
         Self::from_nodes(graph.nodes.into_iter().map(node).collect())
     }
 }
 
-impl From<&FleetGraph> for Graph {
-    fn from(graph: &FleetGraph) -> Self {
+impl Graph {
+    /// The graph of an observation, if it has one.
+    pub(super) fn of(observation: &CopyObservation) -> Option<Self> {
         let detection = |d: serving::NodeDetection| {
             let [rel_x, rel_y] = d.rel;
-            Detection { target_id: d.target_id, rel_x, rel_y, aoi: d.aoi }
+            Detection { target_id: d.target_id, rel_x, rel_y, rel_z: None, aoi: d.aoi }
         };
-        let nodes = nodes(graph).map(|node| Node {
+        let nodes = nodes(observation)?.map(|node| Node {
             id: node.id,
             kind: if node.is_uav { NodeKind::Uav } else { NodeKind::User },
             detections: node.detections.map(detection).collect(),
-            position: node.position.map(|[x, y]| Position { x, y }),
+            position: node.position.map(|[x, y]| Position { x, y, z: None }),
             aoi: node.aoi,
+            speed: None,
+            endurance_seconds: None,
         });
-        Self { nodes: nodes.collect() }
+        Some(Self { nodes: nodes.collect() })
     }
 }
 
@@ -171,16 +203,21 @@ impl TryFrom<Scene> for FleetInput {
     type Error = Invalid;
 
     fn try_from(scene: Scene) -> Result<Self, Invalid> {
-        let uavs = scene.uavs.into_iter().map(|u| (u.id, [u.x, u.y]));
+        let uavs = scene.uavs.into_iter().map(|u| serving::SceneUav {
+            id: u.id,
+            position: [u.x, u.y],
+            speed: u.speed,
+            endurance: u.endurance_seconds,
+        });
         let users = scene.users.into_iter().map(|u| (u.id, [u.x, u.y], u.aoi));
         Self::from_scene(uavs, users)
     }
 }
 
-impl From<&serving::Scene> for Scene {
-    fn from(scene: &serving::Scene) -> Self {
-        let uav = |(id, [x, y]): (String, Point)| Uav { id, x, y };
-        let user = |(id, [x, y], aoi): (String, Point, f64)| User { id, x, y, aoi };
-        Self { uavs: uavs(scene).map(uav).collect(), users: users(scene).map(user).collect() }
+impl From<&CopyObservation> for Scene {
+    fn from(observation: &CopyObservation) -> Self {
+        let uav = |(id, [x, y]): (String, Point)| Uav { id, x, y, z: None, speed: None, endurance_seconds: None };
+        let user = |(id, [x, y], aoi): (String, Point, f64)| User { id, x, y, z: None, aoi };
+        Self { uavs: uavs(observation).map(uav).collect(), users: users(observation).map(user).collect() }
     }
 }

@@ -13,6 +13,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::extract::{self, Path, Query};
+use super::flight::{self, Constraints, Frame, Warning, World};
 use super::json;
 use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
 use super::policies::{Paging, PolicyRef};
@@ -54,6 +55,11 @@ struct OpenSessionRequest {
     /// Seed of the random choices of the policy. Default: derived from `session_id` and `run_id`.
     #[serde(default, deserialize_with = "json::optional_integer")]
     seed: Option<u64>,
+    /// Whether, where only one of two nodes of a graph reports the other, both detect each other; default: true.
+    symmetric: Option<bool>,
+    frame: Option<Frame>,
+    world: Option<World>,
+    constraints: Option<Constraints>,
 }
 
 #[derive(Debug, Serialize, ToSchema)]
@@ -69,6 +75,8 @@ struct Session {
     /// Id of the API key that made it, or of the first of the keys that replaced each other; null: no key was required.
     #[schema(required = true)]
     owner: Option<String>,
+    /// How the world of the session differs from the one that the policy was trained in, or made for.
+    warnings: Vec<Warning>,
 }
 
 impl From<SessionInfo> for Session {
@@ -80,6 +88,7 @@ impl From<SessionInfo> for Session {
             opened_at: session.opened_at,
             ttl: Seconds(session.ttl),
             owner: session.owner.id().map(str::to_owned),
+            warnings: session.warnings.into_iter().map(Into::into).collect(),
         }
     }
 }
@@ -101,8 +110,9 @@ async fn open(
     caller: Caller,
     extract::Json(request): extract::Json<OpenSessionRequest>,
 ) -> Result<impl IntoResponse, Error> {
-    let OpenSessionRequest { policy, session_id, run_id, seed } = request;
-    let (policy, options) = open_session(&policy, session_id, run_id, seed)?;
+    let OpenSessionRequest { policy, session_id, run_id, seed, symmetric, frame, world, constraints } = request;
+    let flight = flight::fields(frame, world, symmetric, constraints)?;
+    let (policy, options) = open_session(&policy, session_id, run_id, seed, flight)?;
     let session = Session::from(sessions::open(&app, &caller, &policy, options).await?);
     Ok((StatusCode::CREATED, [(header::CACHE_CONTROL, "no-store")], Json(session)))
 }

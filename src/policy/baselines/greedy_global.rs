@@ -1,8 +1,8 @@
 //! `greedy-global`: knows all positions and AoI, and pairs UAVs with users by AoI per slot of flight.
 
-use super::rule::{Rule, uav_positions, user_positions};
+use super::rule::{Rule, Slot, uav_positions, user_positions};
 use crate::policy::flight::{heading_toward, travel_slots};
-use crate::policy::{EnvParams, FleetGraph, RequiredInput};
+use crate::policy::{FleetProfile, RequiredInput};
 
 /// Has no memory.
 #[derive(Default)]
@@ -24,12 +24,14 @@ impl Rule for GreedyGlobal {
 
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}
 
-    fn decide(&self, env: &EnvParams, graph: &FleetGraph, _step: u64, _memory: &mut [f32], headings: &mut [u8]) {
+    fn decide(&self, slot: &Slot<'_>, _memory: &mut [f32], headings: &mut [u8]) {
+        let Slot { env, graph, .. } = *slot;
         let (uavs, users) = (uav_positions(graph), user_positions(graph));
         let mut pairs = Vec::with_capacity(uavs.len() * users.len());
         for (i, &at) in uavs.iter().enumerate() {
+            let own = FleetProfile::env(slot.profile, env, i);
             for (j, &to) in users.iter().enumerate() {
-                let slots = travel_slots(env, at, to, env.transmission_range);
+                let slots = travel_slots(&own, at, to, env.transmission_range);
                 let age = f64::from(graph.aoi()[j]) + slots;
                 pairs.push((age / slots, i, j));
             }

@@ -15,9 +15,9 @@ mod tour;
 
 use std::sync::Arc;
 
-use self::rule::Rule;
+use self::rule::{Rule, Slot};
 use self::search::Search;
-use super::{EnvParams, FleetStep, Policy, RequiredInput};
+use super::{Carry, EnvParams, FleetStep, Policy, RequiredInput};
 use crate::invalid::{Invalid, in_range};
 
 /// A baseline in the list of policies.
@@ -82,7 +82,7 @@ impl<R: Rule> Policy for Baseline<R> {
 
     fn check_fleet(&self, uavs: usize, users: usize) -> Result<(), Invalid> {
         in_range("uavs", uavs, 1..=4096)?;
-        in_range("users", users, 1..=MAX_PAIRS / uavs)
+        in_range("users", users, 0..=MAX_PAIRS / uavs)
     }
 
     fn observers(&self, uavs: usize, _users: usize) -> usize {
@@ -107,9 +107,18 @@ impl<R: Rule> Policy for Baseline<R> {
         self.rule.start(seed, memory);
     }
 
+    fn carry(&self, from: &[f32], to: &mut [f32], carry: &Carry<'_>) {
+        self.rule.carry(from, to, carry);
+    }
+
+    fn remembers_users(&self) -> bool {
+        self.rule.remembers_users()
+    }
+
     fn act(&self, fleets: &mut [FleetStep<'_>]) {
         for fleet in fleets {
-            self.rule.decide(&fleet.env, fleet.graph, fleet.step, fleet.memory, fleet.headings);
+            let slot = Slot { env: &fleet.env, graph: fleet.graph, step: fleet.step, profile: fleet.profile };
+            self.rule.decide(&slot, fleet.memory, fleet.headings);
             if let Some(q) = &mut fleet.q_values {
                 q.fill(f32::NAN);
             }

@@ -2,8 +2,8 @@
 
 use rand::RngExt;
 
-use super::rule::{Rule, SEED_LEN, slot_rng, store_seed};
-use crate::policy::{EnvParams, FleetGraph, RequiredInput};
+use super::rule::{Rule, SEED_LEN, Slot, slot_rng, store_seed};
+use crate::policy::{Carry, RequiredInput};
 
 #[derive(Default)]
 pub(super) struct Random;
@@ -21,7 +21,12 @@ impl Rule for Random {
         store_seed(seed, memory);
     }
 
-    fn decide(&self, env: &EnvParams, _graph: &FleetGraph, step: u64, memory: &mut [f32], headings: &mut [u8]) {
+    fn carry(&self, from: &[f32], to: &mut [f32], _carry: &Carry<'_>) {
+        to.copy_from_slice(from);
+    }
+
+    fn decide(&self, slot: &Slot<'_>, memory: &mut [f32], headings: &mut [u8]) {
+        let Slot { env, step, .. } = *slot;
         let mut rng = slot_rng(memory, "random", step);
         for h in headings {
             *h = rng.random_range(0..env.actions as u8);

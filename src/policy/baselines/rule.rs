@@ -3,8 +3,17 @@
 use rand_chacha::ChaCha8Rng;
 
 use crate::env::Point;
-use crate::policy::{EnvParams, FleetGraph, RequiredInput};
+use crate::policy::{Carry, EnvParams, FleetGraph, FleetProfile, RequiredInput};
 use crate::rng;
+
+/// One fleet in one slot.
+#[derive(Clone, Copy)]
+pub(super) struct Slot<'a> {
+    pub(super) env: &'a EnvParams,
+    pub(super) graph: &'a FleetGraph,
+    pub(super) step: u64,
+    pub(super) profile: Option<&'a FleetProfile>,
+}
 
 /// How one fleet acts in one slot. No rule but `random` hovers.
 pub(super) trait Rule: Default + Send + Sync {
@@ -24,8 +33,16 @@ pub(super) trait Rule: Default + Send + Sync {
     /// Initialises the memory for slot 0. All numbers are 0 before.
     fn start(&self, seed: u64, memory: &mut [f32]);
 
+    /// As [`Policy::carry`](crate::policy::Policy::carry). Without it, a fleet that changes begins afresh.
+    fn carry(&self, _from: &[f32], _to: &mut [f32], _carry: &Carry<'_>) {}
+
+    /// As [`Policy::remembers_users`](crate::policy::Policy::remembers_users).
+    fn remembers_users(&self) -> bool {
+        false
+    }
+
     /// Writes one heading per UAV and advances the memory.
-    fn decide(&self, env: &EnvParams, graph: &FleetGraph, step: u64, memory: &mut [f32], headings: &mut [u8]);
+    fn decide(&self, slot: &Slot<'_>, memory: &mut [f32], headings: &mut [u8]);
 }
 
 /// Length of a seed in a memory: 16 bits per f32, which f32 holds exactly.

@@ -6,10 +6,10 @@ use std::marker::PhantomData;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
-use super::rule::{Rule, SEED_LEN, slot_rng, store_seed, uav_positions};
+use super::rule::{Rule, SEED_LEN, Slot, slot_rng, store_seed, uav_positions};
 use crate::env::{EnvConfig, Point};
-use crate::policy::flight::{heading_toward, in_square, next_position};
-use crate::policy::{EnvParams, FleetGraph, RequiredInput};
+use crate::policy::flight::{heading_toward, next_position};
+use crate::policy::{Carry, EnvParams, FleetGraph, FleetProfile, RequiredInput};
 
 /// A user that a UAV detects.
 #[derive(Clone, Copy, Debug)]
@@ -47,10 +47,17 @@ impl<T: TargetChoice> Rule for Search<T> {
         store_seed(seed, memory);
     }
 
-    fn decide(&self, env: &EnvParams, graph: &FleetGraph, step: u64, memory: &mut [f32], headings: &mut [u8]) {
+    fn carry(&self, from: &[f32], to: &mut [f32], carry: &Carry<'_>) {
+        to[..SEED_LEN].copy_from_slice(&from[..SEED_LEN]);
+        carry.uav_rows(1, &from[SEED_LEN..], &mut to[SEED_LEN..]);
+    }
+
+    fn decide(&self, slot: &Slot<'_>, memory: &mut [f32], headings: &mut [u8]) {
+        let Slot { graph, step, .. } = *slot;
         let mut rng = slot_rng(memory, T::NAME, step);
         for (i, (course, heading)) in memory[SEED_LEN..].iter_mut().zip(headings).enumerate() {
             let at = uav_positions(graph)[i];
+            let env = &FleetProfile::env(slot.profile, slot.env, i);
             // Always called, so that the random numbers of other UAVs do not depend on what this UAV detects.
             *heading = cruise(env, &mut rng, at, course);
             if let Some(user) = T::choose(detected_users(graph, i, at)) {
@@ -74,9 +81,9 @@ fn detected_users(graph: &FleetGraph, i: usize, at: Point) -> impl Iterator<Item
 }
 
 /// The heading of a UAV that flies straight on. `course` is 1 + the heading, 0 before the first. Where the move would leave
-/// the square, draws among the headings that do not, or among all headings if all do.
+/// the area, draws among the headings that do not, or among all headings if all do.
 fn cruise(env: &EnvParams, rng: &mut ChaCha8Rng, at: Point, course: &mut f32) -> u8 {
-    let stays = |h: usize| in_square(next_position(env, at, h));
+    let stays = |h: usize| env.contains(next_position(env, at, h));
     let heading = *course as usize;
     if !(1..=EnvConfig::COMPASS).contains(&heading) || !stays(heading - 1) {
         let open = (0..EnvConfig::COMPASS).filter(|&h| stays(h)).count();

@@ -1,17 +1,15 @@
 //! `sweep`: no prior knowledge. UAVs fan out over the square, search it, and serve the users they have found. `sweep-shared`: the same,
 //! and UAVs in communication range exchange their memories.
 //!
-//! A UAV knows the square, its own index among M, and what it remembers (`policy::memory`). It flies to where it expects to remove most
+//! A UAV knows the square, its place among the UAVs, and what it remembers (`policy::memory`). It flies to where it expects to remove most
 //! AoI per slot of flight: to a known user, or to a part of the square that it has not searched and that may hold the users it does
 //! not know. Each UAV searches its own sector of the square first.
 
-use std::f64::consts::{PI, TAU};
-
-use super::rule::Rule;
+use super::rule::{Rule, Slot};
 use crate::env::Point;
 use crate::policy::flight::{distance, heading_toward, travel_slots};
-use crate::policy::memory::{GRID, RememberedUser, Sharing, UavMemory, remember, uav_memory_len};
-use crate::policy::{EnvParams, FleetGraph, RequiredInput};
+use crate::policy::memory::{self, GRID, RememberedUser, Sharing, UavMemory, remember, uav_memory_len};
+use crate::policy::{Carry, EnvParams, FleetProfile, Place, RequiredInput};
 
 /// With or without shared memories. The memory is that of `policy::memory`.
 #[derive(Default)]
@@ -58,17 +56,28 @@ impl<const SHARED: bool> Rule for Sweep<SHARED> {
 
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}
 
-    fn decide(&self, env: &EnvParams, graph: &FleetGraph, step: u64, memory: &mut [f32], headings: &mut [u8]) {
+    fn carry(&self, from: &[f32], to: &mut [f32], carry: &Carry<'_>) {
+        memory::carry(from, to, carry);
+    }
+
+    fn remembers_users(&self) -> bool {
+        true
+    }
+
+    fn decide(&self, slot: &Slot<'_>, memory: &mut [f32], headings: &mut [u8]) {
+        let Slot { env, graph, step, profile } = *slot;
         let sight = graph.sight().expect("the caller provides what `needs` requires");
         let sharing = if SHARED { Sharing::Shared } else { Sharing::Own };
+        memory::exclude_outside(env, sight.users(), memory);
         remember(&sight, env.detection_range, step, sharing, memory, &mut Vec::new());
         let memories = memory.chunks_exact(uav_memory_len(graph.users())).map(UavMemory::new);
         for ((i, memory), heading) in memories.enumerate().zip(headings) {
-            let uav = Uav { env, index: i, uavs: graph.uavs(), at: sight.positions[i], now: step as f64 };
+            let place = FleetProfile::place(profile, i, graph.uavs());
+            let own = FleetProfile::env(profile, env, i);
+            let uav = Uav { env: &own, place, at: sight.positions[i], now: step as f64 };
             let nearby: Vec<Point> = sight.detected_uavs(i).map(|(_, at)| at).collect();
             let serving = uav.best_user(memory.users().flatten(), &nearby);
-            let unknown = memory.users().filter(Option::is_none).count();
-            let searching = uav.best_block(memory, unknown);
+            let searching = uav.best_block(memory, memory.unknown_users(FleetProfile::is_open(profile)));
             let best = if serving.score >= searching.score { serving } else { searching };
             *heading = heading_toward(env, uav.at, best.position);
         }
@@ -89,8 +98,7 @@ const NOTHING: Candidate = Candidate { score: 0.0, position: [0.5, 0.5] };
 /// One UAV in one slot.
 struct Uav<'a> {
     env: &'a EnvParams,
-    index: usize,
-    uavs: usize,
+    place: Place,
     at: Point,
     now: f64,
 }
@@ -144,8 +152,6 @@ impl Uav<'_> {
 
     /// Weight of a block at `p`: 1 in the UAV's own sector around the centre of the square.
     fn sector_weight(&self, p: Point) -> f64 {
-        let own = TAU * self.index as f64 / self.uavs as f64;
-        let off = ((p[1] - 0.5).atan2(p[0] - 0.5) - own).rem_euclid(TAU);
-        if off.min(TAU - off) <= PI / self.uavs as f64 { 1.0 } else { WEIGHTS.foreign_sector }
+        if self.place.owns(p) { 1.0 } else { WEIGHTS.foreign_sector }
     }
 }

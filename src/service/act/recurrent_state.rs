@@ -6,11 +6,14 @@ use std::time::Instant;
 use bytes::Bytes;
 
 use super::compute;
-use super::request::{Request, Response};
+use super::request::{Placed, Request, Response};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::service::{App, Error, policies};
-use crate::serving::{FleetIds, FleetInput, FleetMemory, LoadedPolicy, OutputBuffers, Owner, PolicySpec, RecurrentState, Task};
+use crate::serving::{
+    FleetMemory, Flight, LoadedPolicy, Members, OutputBuffers, Owner, PolicySpec, RecurrentState, Roster, RosterRules, Task,
+    UserMemory,
+};
 
 pub(super) async fn act(
     app: &App,
@@ -27,23 +30,35 @@ pub(super) async fn act(
         None => policies::resolve(app, spec).await?,
         Some(state) => pinned_version(app, spec, state).await?,
     };
-    let FleetInput { fleet, canonical_of_request, content } = request.input;
-    let input = content.into_task_input(fleet.size(), &*policy.implementation)?;
+    let implementation = &*policy.implementation;
+    let flight = request.flight.map(|options| Flight::new(&options, implementation).map(Arc::new)).transpose()?;
+    let placed = Placed::new(request.input, &policy, flight.as_ref(), request.return_motion)?;
+    let sensing = placed.sensing(&policy);
+    let Placed { fleet, canonical_of_request, content, speeds, endurance, flight, motion } = placed;
+    let only_detected = implementation.remembers_users() && content.lists_only_detected();
+    let input = content.into_task_input(fleet.size(), implementation, sensing)?;
     let step = state.as_ref().map_or(0, |state| state.step);
     if let Some(sent) = request.step.filter(|&sent| sent != step) {
         let message = format!("step {sent} does not match recurrent_state, which belongs to step {step}");
         return Err(Error::Precondition { code: ErrorCode::WrongStep, message });
     }
-    let memory = if let Some(state) = state {
-        memory_of(state, &fleet, &policy)?
-    } else {
-        let seed = request.seed.unwrap_or(0);
-        FleetMemory::initial(&*policy.implementation, fleet.size(), seed, Vec::new())
+    let seed = state.as_ref().map_or_else(|| request.seed.unwrap_or(0), |state| state.seed);
+    let before = match &state {
+        None => Roster::new(&fleet, step, only_detected, UserMemory::of(&policy)),
+        Some(state) => state.roster(&fleet, &policy)?,
     };
-    let task = Task::new(policy.clone(), input, step, memory, OutputBuffers::default());
+    let rules = RosterRules { policy: &policy, absent_after: app.absent_after, seed };
+    let (roster, change) = before.advance(&fleet, step, &rules);
+    let memory = match state {
+        None => FleetMemory::initial(implementation, before.size(), seed, Vec::new()),
+        Some(state) => state.memory.unpack_small(implementation, before.size())?,
+    };
+    let task = Task::new(policy.clone(), input, step, memory, OutputBuffers::default()).with_change(Some(Box::new(change)));
+    let task = Placed::in_world(task, flight.as_ref(), speeds, endurance);
     let output = compute::run(app, owner, task, deadline).await?;
-    let memory = output.memory.into_packed(&*policy.implementation, fleet.size());
-    let next = RecurrentState::new(policy.reference.digest, step.saturating_add(1), &fleet, memory).encode();
+    let memory = output.memory.into_packed(implementation, roster.size());
+    let (digest, step, members) = (policy.reference.digest, step.saturating_add(1), Members::Roster(roster));
+    let next = RecurrentState { digest, step, seed, members, memory }.encode();
     // The caller has to be able to send it back, also in JSON, where it grows by a third, and with the scene of the next slot.
     let limit = app.max_message_size / 8 * 5;
     if next.len() > limit {
@@ -54,7 +69,8 @@ pub(super) async fn act(
         );
         return Err(Error::TooLarge { message, limit: Some(limit as u64) });
     }
-    Ok(Response { policy, uavs: fleet.uavs, canonical_of_request, decision: output.decision, recurrent_state: Some(next) })
+    let (uavs, decision, recurrent_state) = (fleet.uavs, output.decision, Some(next));
+    Ok(Response { policy, uavs, canonical_of_request, decision, recurrent_state, flight, motion })
 }
 
 /// The version that wrote `state`: an episode stays on its version even if an alias has moved or a newer version has been
@@ -65,20 +81,4 @@ async fn pinned_version(app: &App, spec: &PolicySpec, state: &RecurrentState) ->
         Error::from(Invalid::new("recurrent_state", "the state of another policy or version", expected))
     })?;
     policies::in_memory(app, found).await
-}
-
-/// The memory in `state`, checked against the fleet and the policy.
-fn memory_of(state: RecurrentState, fleet: &FleetIds, policy: &LoadedPolicy) -> Result<FleetMemory, Invalid> {
-    let wrong = |value: &str| {
-        let expected = "the recurrent_state of an earlier response to the same UAVs and users";
-        Invalid::new("recurrent_state", value, expected)
-    };
-    let (uavs, users) = fleet.size();
-    if (state.uavs as usize, state.users as usize) != (uavs, users) {
-        return Err(wrong(&format!("the state of {} UAVs and {} users", state.uavs, state.users)));
-    }
-    if state.fleet != fleet.fingerprint() {
-        return Err(wrong("the state of UAVs or users with other ids"));
-    }
-    state.memory.unpack_small(&*policy.implementation, (uavs, users))
 }

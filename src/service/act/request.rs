@@ -5,7 +5,11 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 
-use crate::serving::{Decision, FleetInput, LoadedPolicy, PolicySpec};
+use crate::env::Point;
+use crate::invalid::Invalid;
+use crate::serving::{
+    Decision, FleetIds, FleetInput, Flight, FlightOptions, LoadedPolicy, PolicySpec, SceneOrGraph, Sensing, Task,
+};
 
 /// A request for one slot.
 #[derive(Clone, Debug)]
@@ -22,6 +26,10 @@ pub struct Request {
     pub run_id: Option<String>,
     /// Seed of the policy's random choices, at slot 0 of a sequence or of memory that the caller keeps.
     pub seed: Option<u64>,
+    /// The frame and the world, at step 0 of a sequence or if the caller keeps the memory.
+    pub flight: Option<Box<FlightOptions>>,
+    /// Whether the response has what velocities and waypoints follow from.
+    pub return_motion: bool,
 }
 
 /// Where the memory of a fleet is kept between slots.
@@ -77,4 +85,84 @@ pub struct Response {
     pub decision: Decision,
     /// Memory for the next slot, if the caller keeps it.
     pub recurrent_state: Option<Bytes>,
+    /// The frame and the world of the fleet, if it has its own or the request asks for [`Motion`].
+    pub flight: Option<Arc<Flight>>,
+    /// The motion of the UAVs, if the request asks for it.
+    pub motion: Option<Motion>,
+}
+
+/// Where UAVs are and how fast, in canonical order.
+#[derive(Clone, Debug)]
+pub struct Motion {
+    /// In the unit square, where known.
+    pub positions: Vec<Option<Point>>,
+    /// In units of the caller per second, where they differ from that of the world; empty if none does.
+    pub speeds: Vec<Option<f64>>,
+}
+
+/// An input in the unit square, with what the response needs of it.
+pub(super) struct Placed {
+    pub(super) fleet: FleetIds,
+    pub(super) canonical_of_request: Vec<u32>,
+    pub(super) content: SceneOrGraph,
+    /// Speed of each UAV per slot; empty if all have that of the world.
+    pub(super) speeds: Vec<f64>,
+    /// Slots that each UAV can still fly; empty if not known.
+    pub(super) endurance: Vec<f64>,
+    pub(super) flight: Option<Arc<Flight>>,
+    pub(super) motion: Option<Motion>,
+}
+
+impl Placed {
+    /// Translates `input` to the unit square. `flight`: absent if the fleet flies in the unit square and in the world of `policy`.
+    ///
+    /// # Errors
+    /// [`Invalid`] for coordinates that are far from the area, and speeds that are too high.
+    pub(super) fn new(
+        input: FleetInput,
+        policy: &LoadedPolicy,
+        flight: Option<&Arc<Flight>>,
+        motion: bool,
+    ) -> Result<Self, Invalid> {
+        let FleetInput { fleet, canonical_of_request, speeds: own, endurances, far, mut content } = input;
+        let plain = || Arc::new(Flight::plain(&*policy.implementation));
+        let flight = flight.cloned().or_else(|| (motion || !own.is_empty()).then(plain));
+        let Some(flight) = flight else {
+            return match far {
+                Some(far) => Err(*far),
+                None => Ok(Self {
+                    fleet,
+                    canonical_of_request,
+                    content,
+                    speeds: Vec::new(),
+                    endurance: Vec::new(),
+                    flight: None,
+                    motion: None,
+                }),
+            };
+        };
+        flight.translate(&mut content, far)?;
+        let speeds = flight.speeds(&own)?;
+        let endurance = flight.endurance(&endurances);
+        if flight.guard.is_some() && content.uav_positions().contains(&None) {
+            return Err(Invalid::missing("position", "the position of every UAV, which constraints need"));
+        }
+        let motion = motion.then(|| Motion { positions: content.uav_positions(), speeds: own });
+        Ok(Self { fleet, canonical_of_request, content, speeds, endurance, flight: Some(flight), motion })
+    }
+
+    /// `task` in the world of the fleet, with its constraints.
+    pub(super) fn in_world(task: Task, flight: Option<&Arc<Flight>>, speeds: Vec<f64>, endurance: Vec<f64>) -> Task {
+        let Some(flight) = flight else { return task };
+        let task = task.in_world(flight.env, speeds);
+        match &flight.guard {
+            Some(guard) => task.guarded(guard.clone(), endurance),
+            None => task,
+        }
+    }
+
+    /// What the policy detects.
+    pub(super) fn sensing(&self, policy: &LoadedPolicy) -> Sensing {
+        self.flight.as_ref().map_or_else(|| Sensing::of(&*policy.implementation), |flight| flight.sensing())
+    }
 }

@@ -6,12 +6,12 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::request::{Request, Response, Sequence, SequenceId};
+use super::request::{Placed, Request, Response, Sequence, SequenceId};
 use super::session::{self, SessionStep};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::service::{App, Error, policies};
-use crate::serving::{FleetInput, Owner, PolicySpec, Session};
+use crate::serving::{Owner, PolicySpec, Session, SessionOptions};
 
 /// Prefix of the names of sessions that are sequences.
 pub const SEQUENCE_PREFIX: &str = "sequence:";
@@ -71,11 +71,20 @@ async fn start(
         return Err(Error::Precondition { code: ErrorCode::WrongStep, message });
     }
     let policy = policies::resolve(app, spec).await?;
-    let FleetInput { fleet, canonical_of_request, content } = request.input;
-    let input = content.into_task_input(fleet.size(), &*policy.implementation)?;
-    let step = SessionStep { fleet, canonical_of_request, input, step: Some(0), run_id: None };
+    let options = SessionOptions { seed: request.seed, flight: request.flight, ..SessionOptions::default() };
     let former = app.sessions.get(owner, name).ok();
-    let session = app.sessions.start_replacing(owner, name, policy, request.seed)?;
+    let session = app.sessions.start_replacing(owner, name, policy.clone(), options)?;
+    let placed = Placed::new(request.input, &policy, session.flight(), request.return_motion);
+    let step = match placed.and_then(|placed| SessionStep::new(placed, &policy, Some(0), None)) {
+        Ok(step) => step,
+        Err(error) => {
+            match &former {
+                Some(former) => app.sessions.restore(&session, former),
+                None => app.sessions.discard(&session),
+            }
+            return Err(error.into());
+        }
+    };
     let mut guard = StartGuard { app, session, completed: false };
     let response = session::advance(app, &guard.session, step, deadline).await;
     // Large inputs are checked when they are computed.

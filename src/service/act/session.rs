@@ -1,13 +1,14 @@
 //! `Act` with memory in a session.
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use super::compute;
-use super::request::{Request, Response};
+use super::request::{Motion, Placed, Request, Response};
 use crate::invalid::Invalid;
 use crate::service::{App, Error};
 use crate::serving::{
-    FleetIds, FleetInput, LoadedPolicy, PolicySpec, Session, StepStart, TableEntry, Task, TaskInput, VersionSelector,
+    FleetIds, Flight, Listed, LoadedPolicy, PolicySpec, Session, StepStart, TableEntry, Task, TaskInput, VersionSelector,
 };
 
 pub(super) async fn act(app: &App, session: &Session, request: Request, deadline: Option<Instant>) -> Result<Response, Error> {
@@ -17,19 +18,37 @@ pub(super) async fn act(app: &App, session: &Session, request: Request, deadline
     if let Some(seed) = request.seed {
         return Err(Invalid::new("seed", seed, "no value, because a session takes its seed when it is opened").into());
     }
-    let FleetInput { fleet, canonical_of_request, content } = request.input;
-    let input = content.into_task_input(fleet.size(), &*session.policy().implementation)?;
-    let step = SessionStep { fleet, canonical_of_request, input, step: request.step, run_id: request.run_id };
-    advance(app, session, step, deadline).await
+    if request.flight.is_some() {
+        let expected = "no value, because a session takes it when it is opened";
+        return Err(Invalid::new("frame", "frame, world, symmetric or constraints", expected).into());
+    }
+    let placed = Placed::new(request.input, session.policy(), session.flight(), request.return_motion)?;
+    advance(app, session, SessionStep::new(placed, session.policy(), request.step, request.run_id)?, deadline).await
 }
 
 /// A step with the input of the session's policy.
 pub(super) struct SessionStep {
-    pub(super) fleet: FleetIds,
-    pub(super) canonical_of_request: Vec<u32>,
-    pub(super) input: TaskInput,
-    pub(super) step: Option<u64>,
-    pub(super) run_id: Option<String>,
+    fleet: FleetIds,
+    canonical_of_request: Vec<u32>,
+    /// Whether the input lists only what a UAV detects.
+    only_detected: bool,
+    input: TaskInput,
+    speeds: Vec<f64>,
+    endurance: Vec<f64>,
+    flight: Option<Arc<Flight>>,
+    motion: Option<Motion>,
+    step: Option<u64>,
+    run_id: Option<String>,
+}
+
+impl SessionStep {
+    pub(super) fn new(placed: Placed, policy: &LoadedPolicy, step: Option<u64>, run_id: Option<String>) -> Result<Self, Invalid> {
+        let sensing = placed.sensing(policy);
+        let Placed { fleet, canonical_of_request, content, speeds, endurance, flight, motion } = placed;
+        let only_detected = policy.implementation.remembers_users() && content.lists_only_detected();
+        let input = content.into_task_input(fleet.size(), &*policy.implementation, sensing)?;
+        Ok(Self { fleet, canonical_of_request, only_detected, input, speeds, endurance, flight, motion, step, run_id })
+    }
 }
 
 /// Computes `step` and commits it, or returns the last decision if `step` repeats the last step.
@@ -40,16 +59,18 @@ pub(super) async fn advance(
     deadline: Option<Instant>,
 ) -> Result<Response, Error> {
     let policy = session.policy().clone();
-    let SessionStep { fleet, canonical_of_request, input, step, run_id } = step;
-    let decision = match session.begin_step(&fleet, step, run_id.as_deref()).await? {
+    let SessionStep { fleet, canonical_of_request, only_detected, input, speeds, endurance, flight, motion, step, run_id } = step;
+    let listed = Listed { fleet: &fleet, only_detected };
+    let decision = match session.begin_step(listed, step, run_id.as_deref(), app.absent_after).await? {
         StepStart::Repeated(decision) => decision,
         StepStart::Next(mut pending) => {
             let (memory, buffers) = (std::mem::take(&mut pending.memory), std::mem::take(&mut pending.buffers));
-            let task = Task::new(policy.clone(), input, pending.step, memory, buffers);
+            let task = Task::new(policy.clone(), input, pending.step, memory, buffers).with_change(pending.change.take());
+            let task = Placed::in_world(task, flight.as_ref(), speeds, endurance);
             pending.commit(compute::run(app, session.owner(), task, deadline).await?)?
         }
     };
-    Ok(Response { policy, uavs: fleet.uavs, canonical_of_request, decision, recurrent_state: None })
+    Ok(Response { policy, uavs: fleet.uavs, canonical_of_request, decision, recurrent_state: None, flight, motion })
 }
 
 /// Checks that `spec` fits the session's version: the same name, and no other version. An alias always fits, because it may

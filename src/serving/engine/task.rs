@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::invalid::Invalid;
-use crate::policy::{FleetGraph, FleetStep};
-use crate::serving::{FleetMemory, LoadedPolicy, SceneOrGraph, TaskInput};
+use crate::policy::{EnvParams, FleetGraph, FleetProfile, FleetStep};
+use crate::serving::{FleetChange, FleetMemory, Guard, LoadedPolicy, Overruled, SceneOrGraph, Sensing, Situation, TaskInput};
 
 /// One fleet in one slot, with buffers for the output.
 #[derive(Debug)]
@@ -13,9 +13,19 @@ pub struct Task {
     policy: Arc<LoadedPolicy>,
     graph: FleetGraph,
     /// A large scene or graph, of which [`Task::prepare`] makes `graph`.
-    unconverted: Option<Box<SceneOrGraph>>,
-    /// M and N.
+    unconverted: Option<(Box<SceneOrGraph>, Sensing)>,
+    /// M and N of the input.
     size: (usize, usize),
+    /// How the memory changes before the slot, if the fleet has changed.
+    change: Option<Box<FleetChange>>,
+    /// What the policy is told about the fleet.
+    profile: Option<Box<FleetProfile>>,
+    /// The world that the fleet flies in.
+    env: EnvParams,
+    /// Constraints, and the slots that each UAV can still fly.
+    guard: Option<(Arc<Guard>, Vec<f64>)>,
+    /// The memory of a fleet of which some UAVs are missing.
+    all: Option<Vec<f32>>,
     /// The memory before the slot, until [`Task::prepare`] moves it to `numbers`.
     memory: FleetMemory,
     /// The memory that the policy works on.
@@ -44,6 +54,8 @@ pub struct Decision {
     pub q_values: Vec<f32>,
     /// How long it took.
     pub timings: Timings,
+    /// What constraints changed.
+    pub overruled: Vec<Overruled>,
 }
 
 /// Duration of a task.
@@ -67,21 +79,62 @@ pub struct OutputBuffers {
 }
 
 impl Task {
-    /// A task for slot `step` of a fleet with this memory.
+    /// A task for slot `step` of a fleet with this memory, in the world of the policy.
     pub fn new(policy: Arc<LoadedPolicy>, input: TaskInput, step: u64, memory: FleetMemory, buffers: OutputBuffers) -> Self {
+        let env = policy.implementation.env();
         let (uavs, users) = input.size();
         let OutputBuffers { mut headings, mut q_values } = buffers;
         headings.clear();
         headings.resize(uavs, 0);
         q_values.clear();
         q_values.resize(uavs * policy.implementation.actions(), f32::NAN);
-        let decision = Decision { step, headings, q_values, timings: Timings::default() };
+        let decision = Decision { step, headings, q_values, timings: Timings::default(), overruled: Vec::new() };
         let work = policy.implementation.work(uavs, users, input.detection_count());
         let (graph, unconverted) = match input {
             TaskInput::Graph(graph) => (graph, None),
-            TaskInput::Large { content, .. } => (FleetGraph::default(), Some(content)),
+            TaskInput::Large { content, sensing, .. } => (FleetGraph::default(), Some((content, sensing))),
         };
-        Self { policy, graph, unconverted, size: (uavs, users), memory, numbers: Vec::new(), decision, work }
+        let size = (uavs, users);
+        Self {
+            policy,
+            graph,
+            unconverted,
+            size,
+            change: None,
+            profile: None,
+            env,
+            guard: None,
+            all: None,
+            memory,
+            numbers: Vec::new(),
+            decision,
+            work,
+        }
+    }
+
+    /// The same task for a fleet that has changed.
+    #[must_use]
+    pub fn with_change(mut self, mut change: Option<Box<FleetChange>>) -> Self {
+        self.profile = change.as_mut().map(|change| Box::new(std::mem::take(&mut change.profile)));
+        self.change = change;
+        self
+    }
+
+    /// The same task in the world `env`, with the speed of each UAV per slot, if they differ.
+    #[must_use]
+    pub fn in_world(mut self, env: EnvParams, speeds: Vec<f64>) -> Self {
+        self.env = env;
+        if !speeds.is_empty() {
+            self.profile.get_or_insert_default().speeds = speeds;
+        }
+        self
+    }
+
+    /// The same task with constraints, and the slots that each UAV can still fly. The input has the positions of all UAVs.
+    #[must_use]
+    pub fn guarded(mut self, guard: Arc<Guard>, endurance: Vec<f64>) -> Self {
+        self.guard = Some((guard, endurance));
+        self
     }
 
     /// The policy version to run.
@@ -95,22 +148,49 @@ impl Task {
     /// [`Invalid`] for an input or a memory that the policy does not accept.
     pub(super) fn prepare(&mut self) -> Result<(), Invalid> {
         let policy = &*self.policy.implementation;
-        if let Some(content) = self.unconverted.take() {
-            self.graph = content.into_fleet_graph(self.size, policy)?;
+        if let Some((content, sensing)) = self.unconverted.take() {
+            self.graph = content.into_fleet_graph(self.size, policy, sensing)?;
         }
-        self.numbers = std::mem::take(&mut self.memory).unpack(policy, self.size)?;
+        let memory = std::mem::take(&mut self.memory);
+        match &self.change {
+            None => self.numbers = memory.unpack(policy, self.size)?,
+            Some(change) => {
+                (self.numbers, self.all) = change.apply(policy, memory.unpack(policy, change.before)?);
+                if policy.remembers_users() {
+                    self.graph.add_undetected_users(change.after.1);
+                }
+            }
+        }
         Ok(())
     }
 
     /// The arguments of the policy for this task. [`Task::prepare`] has succeeded.
     pub(super) fn as_fleet_step(&mut self) -> FleetStep<'_> {
-        let Self { policy, graph, numbers, decision, .. } = self;
+        let Self { graph, numbers, decision, profile, env, .. } = self;
         let Decision { step, headings, q_values, .. } = decision;
-        FleetStep { env: policy.implementation.env(), graph, step: *step, memory: numbers, headings, q_values: Some(q_values) }
+        let (env, profile) = (*env, profile.as_deref());
+        FleetStep { env, graph, step: *step, profile, memory: numbers, headings, q_values: Some(q_values) }
     }
 
-    pub(super) fn finish(self, timings: Timings) -> TaskOutput {
-        let memory = FleetMemory::pack(self.numbers, &*self.policy.implementation, self.size);
+    pub(super) fn finish(mut self, timings: Timings) -> TaskOutput {
+        let policy = &*self.policy.implementation;
+        if let (Some((guard, endurance)), Some(positions)) = (&self.guard, self.graph.uav_positions()) {
+            let Decision { headings, q_values, overruled, .. } = &mut self.decision;
+            let speeds = self.profile.as_ref().map_or(&[][..], |profile| &profile.speeds);
+            *overruled = guard.apply(&Situation { env: &self.env, speeds, positions, endurance, q_values }, headings);
+            for change in overruled.iter() {
+                policy.overrule(&mut self.numbers, change.uav as usize, headings[change.uav as usize]);
+            }
+        }
+        let (numbers, size) = match (self.change, self.all) {
+            (Some(change), Some(mut all)) => {
+                change.restore(policy, &self.numbers, &mut all);
+                (all, change.after)
+            }
+            (Some(change), None) => (self.numbers, change.after),
+            (None, _) => (self.numbers, self.size),
+        };
+        let memory = FleetMemory::pack(numbers, policy, size);
         TaskOutput { memory, decision: Decision { timings, ..self.decision } }
     }
 

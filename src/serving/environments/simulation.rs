@@ -116,7 +116,8 @@ impl Simulation {
 
     pub(super) fn state(&self, graph: bool) -> EnvironmentState {
         let config = self.env.config();
-        let observations = CopyObservation::of_copies(config, self.env.uav_xy(), self.env.user_xy(), self.env.aoi(), graph);
+        let observations =
+            CopyObservation::of_copies((config, self.env.slot()), self.env.uav_xy(), self.env.user_xy(), self.env.aoi(), graph);
         let mut copies: Vec<CopyState> = observations
             .zip(self.seeds(self.cursor.episode))
             .map(|(observation, seed)| CopyState { observation, seed, reward: 0.0, finished: None })
@@ -129,7 +130,7 @@ impl Simulation {
                     copy.finished = Some(FinishedEpisode { seed, metrics, observation: None });
                 }
                 if let Some([uavs, users, aoi]) = &ended.scene {
-                    let observations = CopyObservation::of_copies(config, uavs, users, aoi, graph);
+                    let observations = CopyObservation::of_copies((config, config.slots), uavs, users, aoi, graph);
                     let finished = copies.iter_mut().filter_map(|copy| copy.finished.as_mut());
                     finished.zip(observations).for_each(|(finished, last)| finished.observation = Some(last));
                 }

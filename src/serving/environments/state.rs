@@ -1,6 +1,6 @@
 //! What a reset or a step of an environment returns, per copy.
 
-use crate::env::{EnvConfig, EpisodeMetrics, points};
+use crate::env::{EnvConfig, EpisodeMetrics};
 use crate::policy::FleetGraph;
 use crate::serving::Scene;
 
@@ -48,23 +48,38 @@ pub struct CopyObservation {
     pub scene: Scene,
     /// Detections within the environment's detection range.
     pub graph: Option<FleetGraph>,
+    /// Numbers of the UAVs and of the users that are there, from which their ids are made.
+    pub numbers: (Vec<u32>, Vec<u32>),
 }
 
 impl CopyObservation {
-    /// The observation of each copy, from (B, M, 2) and (B, N, 2) positions and (B, N) AoI.
+    /// The observation of each copy in `slot`, from (B, M, 2) and (B, N, 2) positions and (B, N) AoI.
     pub(super) fn of_copies(
-        config: &EnvConfig,
+        (config, slot): (&EnvConfig, usize),
         uav_xy: &[f32],
         user_xy: &[f32],
         aoi: &[f32],
         graph: bool,
     ) -> impl Iterator<Item = Self> {
         let (m, n, ranges) = (config.uavs, config.users, config.ranges());
+        let mut present = vec![true; n];
+        config.user_slots.iter().for_each(|user| present[user.user] = config.is_there(user.user, slot));
+        let there: Vec<u32> = (0..n as u32).filter(|&j| present[j as usize]).collect();
         let copies = uav_xy.chunks_exact(2 * m).zip(user_xy.chunks_exact(2 * n)).zip(aoi.chunks_exact(n));
         copies.map(move |((uavs, users), aoi)| {
-            let scene = Scene { uavs: points(uavs).collect(), users: points(users).collect(), aoi: aoi.to_vec() };
+            let flying = |i: &usize| config.flies(*i, slot);
+            let numbers: (Vec<u32>, Vec<u32>) = ((0..m).filter(flying).map(|i| i as u32).collect(), there.clone());
+            let listed = |all: &[f32], numbers: &[u32]| {
+                let at = |&i: &u32| [0, 1].map(|axis| f64::from(all[2 * i as usize + axis]));
+                numbers.iter().map(at).collect()
+            };
+            let scene = Scene {
+                uavs: listed(uavs, &numbers.0),
+                users: listed(users, &numbers.1),
+                aoi: numbers.1.iter().map(|&j| aoi[j as usize]).collect(),
+            };
             let graph = graph.then(|| FleetGraph::from_scene(&scene.uavs, &scene.users, &scene.aoi, ranges));
-            Self { scene, graph }
+            Self { scene, graph, numbers }
         })
     }
 

@@ -8,8 +8,9 @@ use jiff::Timestamp;
 use serde_json::Value;
 
 use super::memory::MemoryShare;
+use crate::invalid::Invalid;
 use crate::policy::{Policy, RequiredInput};
-use crate::serving::PolicyRef;
+use crate::serving::{FleetIds, PolicyRef};
 
 /// Origin of a policy.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -68,6 +69,15 @@ impl LoadedPolicy {
     /// Bytes that it takes from the budget.
     pub fn memory_bytes(&self) -> usize {
         self.memory.bytes()
+    }
+
+    /// Checks that a fleet of which the last step listed `before` may list `now`: a policy that has a place for each UAV or user cannot
+    /// follow changes.
+    ///
+    /// # Errors
+    /// [`Invalid`] with a new and a missing id.
+    pub fn check_same_fleet(&self, before: &FleetIds, now: &FleetIds) -> Result<(), Invalid> {
+        before.check_bound(now, (self.info.uavs.is_some(), self.info.users.is_some()))
     }
 
     /// A baseline. It takes nothing from the budget and never leaves memory.

@@ -5,12 +5,12 @@ mod seed;
 mod session;
 
 use session::EMPTY_SESSION;
-pub use session::{PendingStep, Session, SessionInfo, SessionOptions, StepStart};
+pub use session::{Listed, PendingStep, Session, SessionInfo, SessionOptions, StepStart};
 
 use std::sync::Arc;
 
 use super::table::{Lookup, Table, generate_id};
-use super::{Error, LoadedPolicy, Owner};
+use super::{Error, Flight, FlightOptions, LoadedPolicy, Owner};
 
 /// All sessions of this server.
 pub type Sessions = Table<Session>;
@@ -25,13 +25,15 @@ impl Sessions {
     /// [`Error::Conflict`] if the name is taken, `run_fenced` if `run_id` names a former run, [`Error::Busy`] if the number or
     /// the memory of sessions is exhausted.
     pub async fn open(&self, owner: &Owner, policy: Arc<LoadedPolicy>, options: SessionOptions) -> Result<SessionInfo, Error> {
+        let flight = flight(&policy, &options)?;
         let id = options.id.clone().unwrap_or_else(generate_id);
         // Checked first, so that a retry succeeds even if no memory is left.
         let session = if let Some(session) = self.peek(owner, &id) {
             Lookup::Found(session)
         } else {
             let charge = self.charge_memory(owner, EMPTY_SESSION)?;
-            let make = || Session::new((owner.clone(), id.clone()), policy.clone(), &options, charge, self.clock().clone());
+            let make =
+                || Session::new((owner.clone(), id.clone()), policy.clone(), (&options, flight), charge, self.clock().clone());
             self.find_or_add(owner, &id, make)?
         };
         let session = match session {
@@ -48,18 +50,18 @@ impl Sessions {
     /// flight complete.
     ///
     /// # Errors
-    /// [`Error::Busy`] if the number or the memory of sessions is exhausted.
+    /// [`Error::Busy`] if the number or the memory of sessions is exhausted, [`Error::Invalid`] for a frame or a world that is not valid.
     pub fn start_replacing(
         &self,
         owner: &Owner,
         id: &str,
         policy: Arc<LoadedPolicy>,
-        seed: Option<u64>,
+        options: SessionOptions,
     ) -> Result<Arc<Session>, Error> {
-        let options = SessionOptions { seed, ..SessionOptions::default() };
+        let flight = flight(&policy, &options)?;
         let name = (owner.clone(), id.to_owned());
         let charge = self.charge_memory(owner, EMPTY_SESSION)?;
-        self.replace(owner, id, || Session::new(name, policy, &options, charge, self.clock().clone()))
+        self.replace(owner, id, || Session::new(name, policy, (&options, flight), charge, self.clock().clone()))
     }
 
     /// Removes a session that [`Sessions::start_replacing`] started, unless another session has taken its name.
@@ -90,6 +92,12 @@ impl Sessions {
         session.close().await;
         Ok(session.info(self.ttl()))
     }
+}
+
+/// The frame and the world of a session with these options, if it has its own.
+fn flight(policy: &LoadedPolicy, options: &SessionOptions) -> Result<Option<Arc<Flight>>, Error> {
+    let flight = |options: &FlightOptions| Flight::new(options, &*policy.implementation).map(Arc::new);
+    Ok(options.flight.as_deref().map(flight).transpose()?)
 }
 
 #[cfg(test)]

@@ -1,6 +1,7 @@
 //! One session: a fleet's memory, its step and its run. Only one step runs at a time. Others wait and are checked afterwards,
 //! so a retry that arrives before its first attempt has finished returns the result of the first attempt.
 
+use std::borrow::Cow;
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -12,9 +13,13 @@ use tokio::sync::{Mutex, MutexGuard};
 use super::seed::{run_hash, session_seed};
 use crate::clock::Clock;
 use crate::error_code::ErrorCode;
+use crate::invalid::Invalid;
 use crate::serving::memory_budget::MemoryCharge;
 use crate::serving::table::{LastUse, TableEntry};
-use crate::serving::{Decision, Error, FleetIds, FleetMemory, LoadedPolicy, OutputBuffers, Owner, PolicyRef, TaskOutput};
+use crate::serving::{
+    Decision, Error, FleetChange, FleetIds, FleetMemory, Flight, FlightOptions, LoadedPolicy, OutputBuffers, Owner, PolicyRef,
+    Roster, RosterRules, TaskOutput, UserMemory, Warning,
+};
 
 /// Maximum number of former runs that a session remembers, in order to reject them.
 const MAX_FORMER_RUNS: usize = 64;
@@ -36,6 +41,8 @@ pub struct SessionInfo {
     pub opened_at: Timestamp,
     /// Idle time after which it expires.
     pub ttl: Duration,
+    /// How its world differs from that of the policy.
+    pub warnings: Vec<Warning>,
 }
 
 /// Options of opening a session.
@@ -47,6 +54,17 @@ pub struct SessionOptions {
     pub run_id: Option<String>,
     /// Seed of the policy's random choices; derived from session and run if absent.
     pub seed: Option<u64>,
+    /// The frame and the world of the fleet, if it has its own.
+    pub flight: Option<Box<FlightOptions>>,
+}
+
+/// Who sends a step.
+#[derive(Clone, Copy, Debug)]
+pub struct Listed<'a> {
+    /// The UAVs and users that it lists.
+    pub fleet: &'a FleetIds,
+    /// Whether it lists only what a UAV detects, so that there may be more users.
+    pub only_detected: bool,
 }
 
 /// A fleet whose memory the server keeps, pinned to one policy version.
@@ -55,6 +73,8 @@ pub struct Session {
     owner: Owner,
     id: String,
     policy: Arc<LoadedPolicy>,
+    /// The frame and the world, if the fleet has its own, and the options that they follow from.
+    flight: Option<(Arc<Flight>, Box<FlightOptions>)>,
     opened_at: Timestamp,
     clock: Clock,
     last_use: LastUse,
@@ -77,9 +97,11 @@ struct SessionState {
     seed: Option<u64>,
     /// Steps of the current run.
     steps: u64,
-    /// The ids of the run's first step.
+    /// The ids of the last step.
     fleet: Option<FleetIds>,
-    /// Bytes of `fleet`.
+    /// The members of a fleet that has changed.
+    roster: Option<Roster>,
+    /// Bytes of `fleet` and `roster`.
     fleet_bytes: usize,
     memory: FleetMemory,
     last: Option<Decision>,
@@ -99,6 +121,26 @@ pub enum StepStart<'a> {
     Next(PendingStep<'a>),
 }
 
+/// How a fleet differs from that of the last step.
+#[derive(Default)]
+struct Followed {
+    /// The members after the step, if the fleet has changed.
+    roster: Option<Roster>,
+    change: Option<Box<FleetChange>>,
+    /// The ids, if they differ from those of the last step.
+    fleet: Option<FleetIds>,
+}
+
+impl Followed {
+    /// In the first step of a run.
+    fn first(listed: Listed<'_>, rules: &RosterRules<'_>) -> Self {
+        let Listed { fleet, only_detected } = listed;
+        let roster = only_detected.then(|| Roster::new(fleet, 0, true, UserMemory::of(rules.policy)));
+        let change = roster.as_ref().map(|roster| Box::new(roster.advance(fleet, 0, rules).1));
+        Self { roster, change, fleet: Some(fleet.clone()) }
+    }
+}
+
 /// The next step of a session, which is locked meanwhile. [`PendingStep::commit`] completes the step; dropping it leaves the
 /// session unchanged.
 #[derive(Debug)]
@@ -107,22 +149,26 @@ pub struct PendingStep<'a> {
     state: MutexGuard<'a, SessionState>,
     /// The run that this step begins.
     new_run: Option<String>,
-    /// The ids, if this is the first step of a run.
+    /// The ids, if they differ from those of the last step.
     fleet: Option<FleetIds>,
+    /// The members after the step, if the fleet has changed.
+    roster: Option<Roster>,
     /// The step's index.
     pub step: u64,
     /// A copy of the memory before the step.
     pub memory: FleetMemory,
+    /// How it changes, if the fleet has changed.
+    pub change: Option<Box<FleetChange>>,
     /// Buffers for the output.
     pub buffers: OutputBuffers,
 }
 
 impl Session {
-    /// `charge`: [`EMPTY_SESSION`] bytes.
+    /// `charge`: [`EMPTY_SESSION`] bytes. `flight`: that of the options.
     pub(super) fn new(
         (owner, id): (Owner, String),
         policy: Arc<LoadedPolicy>,
-        options: &SessionOptions,
+        (options, flight): (&SessionOptions, Option<Arc<Flight>>),
         charge: MemoryCharge,
         clock: Clock,
     ) -> Self {
@@ -135,6 +181,7 @@ impl Session {
             seed: options.seed,
             steps: 0,
             fleet: None,
+            roster: None,
             fleet_bytes: 0,
             memory: FleetMemory::default(),
             last: None,
@@ -142,9 +189,10 @@ impl Session {
             spare_buffers: OutputBuffers::default(),
             charge,
         };
+        let flight = flight.zip(options.flight.clone());
         let last_use = LastUse::at(clock.monotonic());
         let (steps, ended) = (AtomicU64::new(0), AtomicBool::new(false));
-        Self { owner, id, policy, opened_at, clock, last_use, steps, ended, state: Mutex::new(state) }
+        Self { owner, id, policy, flight, opened_at, clock, last_use, steps, ended, state: Mutex::new(state) }
     }
 
     /// The policy version that the session is pinned to.
@@ -152,24 +200,32 @@ impl Session {
         &self.policy
     }
 
+    /// The frame and the world of the fleet, if it has its own.
+    pub fn flight(&self) -> Option<&Arc<Flight>> {
+        self.flight.as_ref().map(|(flight, _)| flight)
+    }
+
     /// Waits for the step in flight, then checks a request for `step` of `run_id` by `fleet`.
     ///
-    /// A repetition of the last step returns the last decision. The content of the request is ignored.
+    /// A repetition of the last step returns the last decision. The content of the request is ignored, except that it lists the same
+    /// UAVs. `absent_after`: slots after which UAVs and users that are missing are forgotten.
     ///
     /// # Errors
     /// `wrong_step` if the step is neither the last nor the next, `run_fenced` if `run_id` names a former run,
-    /// [`Error::Invalid`] if the ids differ from those of the run's first step, [`Error::NotFound`] if the session is closed,
+    /// [`Error::Invalid`] if the policy does not accept other ids than those of the first step, [`Error::NotFound`] if the session is closed,
     /// [`Error::Busy`] if the memory of all sessions is exhausted.
     pub async fn begin_step<'a>(
         &'a self,
-        fleet: &FleetIds,
+        listed: Listed<'_>,
         step: Option<u64>,
         run_id: Option<&str>,
+        absent_after: u64,
     ) -> Result<StepStart<'a>, Error> {
+        let fleet = listed.fleet;
         let mut state = self.state.lock().await;
         let repeated = state.last.as_ref().filter(|last| state.ended && step == Some(last.step));
         if let (Some(last), Some(known)) = (repeated, &state.fleet) {
-            known.check_same(fleet)?;
+            known.check_repeated(fleet)?;
             return Ok(StepStart::Repeated(last.clone()));
         }
         if state.closed || state.ended {
@@ -178,26 +234,25 @@ impl Session {
         let new_run = state.new_run(&self.id, run_id)?;
         let steps = if new_run.is_some() { 0 } else { state.steps };
         let step = step.unwrap_or(steps);
-        if new_run.is_none() {
-            if let Some(known) = &state.fleet {
-                known.check_same(fleet)?;
-            }
-            if let Some(last) = state.last.as_ref().filter(|last| last.step == step) {
-                return Ok(StepStart::Repeated(last.clone()));
-            }
+        if let (None, Some(known), Some(last)) = (&new_run, &state.fleet, state.last.as_ref().filter(|last| last.step == step)) {
+            known.check_repeated(fleet)?;
+            return Ok(StepStart::Repeated(last.clone()));
         }
         if step != steps {
             return Err(wrong_step(&self.id, steps, step, new_run.is_some()));
         }
+        let policy = &*self.policy.implementation;
         let first = new_run.is_some() || state.fleet.is_none();
+        let run = new_run.as_deref().or(state.run_id.as_deref());
+        let seed = state.seed.unwrap_or_else(|| session_seed(&self.id, run));
+        let rules = RosterRules { policy: &self.policy, absent_after, seed };
+        let Followed { roster, change, fleet: ids } =
+            if first { Followed::first(listed, &rules) } else { self.follow(&state, fleet, step, &rules)? };
         let buffer = std::mem::take(&mut state.spare_memory);
         let memory = if first {
-            let run = new_run.as_deref().or(state.run_id.as_deref());
-            let seed = state.seed.unwrap_or_else(|| session_seed(&self.id, run));
-            let (uavs, users) = (fleet.uavs.len(), fleet.users.len());
-            let memory = FleetMemory::initial(&*self.policy.implementation, (uavs, users), seed, buffer);
+            let memory = FleetMemory::initial(policy, fleet.size(), seed, buffer);
             // The step needs at least this much, so it is refused before it is computed. The charge of a former run remains.
-            let needed = EMPTY_SESSION + fleet.bytes() + state_bytes(&memory, uavs, self.policy.implementation.actions());
+            let needed = EMPTY_SESSION + fleet.bytes() + state_bytes(&memory, fleet.uavs.len(), policy.actions());
             let charge = state.charge.bytes().max(needed);
             state.charge.resize(charge)?;
             memory
@@ -205,8 +260,26 @@ impl Session {
             state.memory.copy(buffer)
         };
         let buffers = std::mem::take(&mut state.spare_buffers);
-        let fleet = first.then(|| fleet.clone());
-        Ok(StepStart::Next(PendingStep { session: self, state, new_run, fleet, step, memory, buffers }))
+        Ok(StepStart::Next(PendingStep { session: self, state, new_run, fleet: ids, roster, step, memory, change, buffers }))
+    }
+
+    /// How a fleet that lists `fleet` in `step` differs from that of the last step.
+    fn follow(&self, state: &SessionState, fleet: &FleetIds, step: u64, rules: &RosterRules<'_>) -> Result<Followed, Invalid> {
+        let Some(last) = &state.fleet else { return Ok(Followed::default()) };
+        let other_ids = last != fleet;
+        if other_ids {
+            self.policy.check_same_fleet(last, fleet)?;
+        } else if state.roster.is_none() {
+            return Ok(Followed::default());
+        }
+        let users = UserMemory::of(rules.policy);
+        if state.roster.is_none() && users == UserMemory::None && last.uavs == fleet.uavs {
+            return Ok(Followed::default());
+        }
+        let made = || Roster::new(last, step.saturating_sub(1), false, users);
+        let before = state.roster.as_ref().map_or_else(|| Cow::Owned(made()), Cow::Borrowed);
+        let (roster, change) = before.advance(fleet, step, rules);
+        Ok(Followed { roster: Some(roster), change: Some(Box::new(change)), fleet: other_ids.then(|| fleet.clone()) })
     }
 
     /// Handles another `OpenSession` with the name of this session. With a new run id it restarts the session; with the same
@@ -225,6 +298,9 @@ impl Session {
         }
         if policy.reference.name != self.policy.reference.name {
             return taken(&format!("with policy {}", self.policy.reference));
+        }
+        if self.flight.as_ref().map(|(_, flight)| flight) != options.flight.as_ref() {
+            return taken("with another frame, world or meaning of detections");
         }
         match state.new_run(&self.id, options.run_id.as_deref())? {
             Some(run) => {
@@ -262,6 +338,7 @@ impl Session {
             steps: self.steps.load(Ordering::Relaxed),
             opened_at: self.opened_at,
             ttl,
+            warnings: self.flight().map_or_else(Vec::new, |flight| flight.warnings(&*self.policy.implementation)),
         }
     }
 }
@@ -310,6 +387,7 @@ impl SessionState {
         }
         self.steps = 0;
         self.fleet = None;
+        self.roster = None;
         self.memory = FleetMemory::default();
         self.last = None;
     }
@@ -323,7 +401,13 @@ impl PendingStep<'_> {
     pub fn commit(mut self, output: TaskOutput) -> Result<Decision, Error> {
         let TaskOutput { memory, decision } = output;
         let state = &mut *self.state;
-        let fleet_bytes = self.fleet.as_ref().map_or(state.fleet_bytes, FleetIds::bytes);
+        let fleet_bytes = match (&self.fleet, &self.roster) {
+            (None, None) => state.fleet_bytes,
+            (fleet, roster) => {
+                let ids = fleet.as_ref().or(state.fleet.as_ref()).map_or(0, FleetIds::bytes);
+                ids + roster.as_ref().map_or(0, Roster::bytes)
+            }
+        };
         let decided = state_bytes(&memory, decision.headings.len(), self.session.policy.implementation.actions());
         state.charge.resize(EMPTY_SESSION + fleet_bytes + decided)?;
         if let Some(run) = self.new_run.take() {
@@ -331,8 +415,12 @@ impl PendingStep<'_> {
         }
         if let Some(fleet) = self.fleet.take() {
             state.fleet = Some(fleet);
-            state.fleet_bytes = fleet_bytes;
         }
+        // A roster stays: the fleet is not that of slot 0 again.
+        if self.roster.is_some() {
+            state.roster = self.roster.take();
+        }
+        state.fleet_bytes = fleet_bytes;
         state.spare_memory = std::mem::replace(&mut state.memory, memory).into_buffer();
         state.steps = self.step + 1;
         if let Some(Decision { headings, q_values, .. }) = state.last.replace(decision.clone()) {

@@ -64,8 +64,13 @@ fn fleet(ids: [&str; 2]) -> FleetIds {
     FleetIds { uavs: ids.map(str::to_owned).to_vec(), users: vec!["user".into()] }
 }
 
+async fn begin<'a>(session: &'a Session, uavs: [&str; 2], step: Option<u64>, run: Option<&str>) -> Result<StepStart<'a>, Error> {
+    let fleet = fleet(uavs);
+    session.begin_step(Listed { fleet: &fleet, only_detected: false }, step, run, 100).await
+}
+
 async fn step_once(session: &Session, step: Option<u64>, run: Option<&str>) -> Result<(u64, Vec<f32>), &'static str> {
-    match session.begin_step(&fleet(["a", "b"]), step, run).await {
+    match begin(session, ["a", "b"], step, run).await {
         Err(error) => Err(code(&error)),
         Ok(StepStart::Repeated(answer)) => Ok((answer.step, answer.q_values)),
         Ok(StepStart::Next(next)) => {
@@ -105,8 +110,9 @@ async fn dropped_step_leaves_the_session_unchanged() {
         .unwrap();
     let s = sessions.get(&Owner::NOBODY, "s").unwrap();
     step_once(&s, Some(0), None).await.unwrap();
-    drop(s.begin_step(&fleet(["a", "b"]), Some(1), None).await.unwrap());
-    drop(s.begin_step(&fleet(["c", "d"]), Some(0), Some("r2")).await.unwrap());
+    drop(begin(&s, ["a", "b"], Some(1), None).await.unwrap());
+    drop(begin(&s, ["c", "d"], Some(1), None).await.unwrap());
+    drop(begin(&s, ["c", "d"], Some(0), Some("r2")).await.unwrap());
     assert_eq!(step_once(&s, Some(0), Some("r1")).await, Ok((0, vec![1.0; 2])));
     assert_eq!(step_once(&s, Some(1), Some("r1")).await, Ok((1, vec![2.0; 2])));
 }
@@ -135,14 +141,15 @@ async fn new_run_restarts_the_session_and_fences_the_former_run() {
 }
 
 #[tokio::test]
-async fn ids_of_a_run_may_not_change() {
+async fn a_repetition_lists_the_same_uavs() {
     let (sessions, _) = sessions(10);
     sessions.open(&Owner::NOBODY, policy("p"), named("s")).await.unwrap();
     let s = sessions.get(&Owner::NOBODY, "s").unwrap();
     step_once(&s, None, None).await.unwrap();
-    let other = s.begin_step(&fleet(["a", "c"]), None, None).await.map(|_| ()).unwrap_err();
+    let other = begin(&s, ["a", "c"], Some(0), None).await.map(|_| ()).unwrap_err();
     assert!(matches!(&other, Error::Invalid(e) if e.field == "uavs" && e.value.as_deref() == Some("\"c\" instead of \"b\"")));
-    assert!(s.begin_step(&fleet(["a", "c"]), None, Some("another run")).await.is_ok());
+    let next = begin(&s, ["a", "c"], None, None).await;
+    assert!(matches!(next, Ok(StepStart::Next(next)) if next.change.as_ref().is_some_and(|change| change.after == (3, 0))));
 }
 
 #[tokio::test]

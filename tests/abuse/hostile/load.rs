@@ -104,7 +104,13 @@ impl Attacker {
                 for number in 0..20 {
                     let id = format!("flood-{round}-{lane}-{number}");
                     let policy = if number % 2 == 0 { "tour" } else { "qedgix" };
-                    let open = v1::OpenSessionRequest { policy: policy.into(), session_id: id.clone(), run_id: None, seed: None };
+                    let open = v1::OpenSessionRequest {
+                        policy: policy.into(),
+                        session_id: id.clone(),
+                        run_id: None,
+                        seed: None,
+                        ..Default::default()
+                    };
                     self.count(&client.open_session(self.signed(open)).await);
                     let request = v1::ActRequest { memory: Some(Memory::SessionId(id)), ..template.clone() };
                     self.count(&client.act(self.signed(request)).await);

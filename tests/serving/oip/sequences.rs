@@ -154,8 +154,13 @@ async fn a_start_starts_over_and_a_refused_one_does_not() {
     let state = slot("count", 5).byte_strings("recurrent_state", &[b"x"]);
     assert_eq!(fails(&mut client, state).await.2, "recurrent_state");
     assert_eq!(fails(&mut client, slot("count", 5).asking(&["recurrent_state"])).await.2, "outputs[0].name");
-    let other_ids = Ask::new("count", As::Raw, false).scene(&narrow(2, 1, 0)).int("sequence_id", 5);
-    assert_eq!(fails(&mut client, other_ids.byte_strings("uav_ids", &["a", "b"])).await.2, "uavs");
+    let other_ids = || Ask::new("count", As::Raw, false).scene(&narrow(2, 1, 0)).int("sequence_id", 5);
+    let repeated = other_ids().int("step", 0);
+    assert_eq!(
+        fails(&mut client, repeated.byte_strings("uav_ids", &["a", "b"])).await.2,
+        "uavs",
+        "a repetition lists the same UAVs"
+    );
 }
 
 #[tokio::test]

@@ -64,12 +64,13 @@ pub fn fleet_input(tensors: &mut Vec<Tensor>) -> Result<FleetInput, Invalid> {
     check_counts("uavs and users", uavs, users)?;
     let ages = user_aoi.numbers(users)?.into_iter().enumerate();
     let ages = ages.map(|(j, value)| check_aoi(|| format!("user_aoi[{j}]"), value)).collect::<Result<Vec<f32>, _>>()?;
-    let own = uav_positions.map(|tensor| points(&tensor, "[M, 2]", uavs)).transpose()?;
+    let mut far = None;
+    let own = uav_positions.map(|tensor| points(&tensor, "[M, 2]", uavs, &mut far)).transpose()?;
     let nodes = Nodes::new(uavs, users, uav_ids.as_ref(), user_ids.as_ref())?;
     let content = match (user_positions, edge_index, edge_relative) {
         (Some(tensor), None, None) => {
             let own = own.ok_or_else(|| Invalid::missing("uav_positions", "the position of each UAV, [M, 2]"))?;
-            let all = points(&tensor, "[N, 2]", users)?;
+            let all = points(&tensor, "[N, 2]", users, &mut far)?;
             let uavs = nodes.uavs.iter().map(|&place| own[place as usize]).collect();
             SceneOrGraph::Scene(Scene { uavs, users: nodes.sort_users(&all), aoi: nodes.sort_users(&ages) })
         }
@@ -85,7 +86,8 @@ pub fn fleet_input(tensors: &mut Vec<Tensor>) -> Result<FleetInput, Invalid> {
             return Err(Invalid::new("user_positions", "a tensor", expected));
         }
     };
-    Ok(FleetInput { canonical_of_request: canonical_of_request(&nodes.uavs), content, fleet: nodes.fleet })
+    let canonical_of_request = canonical_of_request(&nodes.uavs);
+    Ok(FleetInput { canonical_of_request, speeds: Vec::new(), endurances: Vec::new(), far, content, fleet: nodes.fleet })
 }
 
 /// The number of UAVs. All inputs that imply it must agree.
@@ -111,13 +113,13 @@ fn count_uavs(positions: Option<&Tensor>, count: Option<&Tensor>, ids: Option<&T
     }
 }
 
-fn points(tensor: &Tensor, expected: &str, count: usize) -> Result<Vec<Point>, Invalid> {
+fn points(tensor: &Tensor, expected: &str, count: usize, far: &mut Option<Box<Invalid>>) -> Result<Vec<Point>, Invalid> {
     if tensor.rows(expected, &[2], MAX_NODES)? != count {
         return Err(tensor.invalid_shape(&format!("[{count}, 2]")));
     }
     let values = tensor.numbers(2 * count)?;
     let pairs = values.chunks_exact(2).enumerate();
-    pairs.map(|(i, pair)| check_point(|| format!("{}[{i}]", tensor.name), [pair[0], pair[1]])).collect()
+    pairs.map(|(i, pair)| check_point(|| format!("{}[{i}]", tensor.name), [pair[0], pair[1]], far)).collect()
 }
 
 /// The ids of the fleet, and the order of the request.
@@ -208,7 +210,7 @@ fn graph(
             return Err(Invalid::new(format!("edge_index[{again}]"), ends, format!("an edge that differs from edge {first}")));
         }
     }
-    mirror(ReportedGraph {
+    Ok(mirror(ReportedGraph {
         positions: match own {
             Some(own) => nodes.uavs.iter().map(|&place| Some(own[place as usize])).collect(),
             None => vec![None; uavs],
@@ -219,5 +221,5 @@ fn graph(
         // Errors about edges name the index of the edge, so no node indices are needed.
         request_of_canonical: Vec::new(),
         form: GraphForm::Edges,
-    })
+    }))
 }

@@ -72,7 +72,13 @@ impl SimulatedFleet {
     /// The request that opens the session.
     pub(super) fn open_request(&self, config: &FleetConfig) -> v1::OpenSessionRequest {
         let (policy, session_id) = (config.policy.clone(), self.session.clone());
-        v1::OpenSessionRequest { policy, session_id, run_id: Some(self.run_id()), seed: Some(self.episode.seed()) }
+        v1::OpenSessionRequest {
+            policy,
+            session_id,
+            run_id: Some(self.run_id()),
+            seed: Some(self.episode.seed()),
+            ..Default::default()
+        }
     }
 
     fn run_id(&self) -> String {
@@ -97,9 +103,10 @@ impl SimulatedFleet {
     }
 
     fn scene(&self, uavs: &[Point], users: &[Point]) -> v1::Scene {
-        let uavs = self.uavs.iter().zip(uavs).map(|(id, p)| v1::SceneUav { id: id.clone(), x: p[0], y: p[1] });
+        let uavs =
+            self.uavs.iter().zip(uavs).map(|(id, p)| v1::SceneUav { id: id.clone(), x: p[0], y: p[1], ..Default::default() });
         let users = self.users.iter().zip(users).zip(self.episode.aoi());
-        let users = users.map(|((id, p), &aoi)| v1::SceneUser { id: id.clone(), x: p[0], y: p[1], aoi: aoi.into() });
+        let users = users.map(|((id, p), &aoi)| v1::SceneUser { id: id.clone(), x: p[0], y: p[1], aoi: aoi.into(), z: None });
         v1::Scene { uavs: uavs.collect(), users: users.collect() }
     }
 
@@ -113,14 +120,14 @@ impl SimulatedFleet {
                 Some(user) => (&self.users[user], Some(aoi[user].into())),
                 None => (&self.uavs[target], None),
             };
-            v1::Detection { target_id: id.clone(), rel_x: d.rel[0].into(), rel_y: d.rel[1].into(), aoi }
+            v1::Detection { target_id: id.clone(), rel_x: d.rel[0].into(), rel_y: d.rel[1].into(), aoi, rel_z: None }
         };
         let uav = |(i, p): (usize, &Point)| v1::Node {
             id: self.uavs[i].clone(),
             kind: v1::NodeKind::Uav.into(),
             detections: self.graph.detections(i).iter().map(detection).collect(),
-            position: Some(v1::Position { x: p[0], y: p[1] }),
-            aoi: None,
+            position: Some(v1::Position { x: p[0], y: p[1], z: None }),
+            ..Default::default()
         };
         let user = |(id, &aoi): (&String, &f32)| v1::Node {
             id: id.clone(),

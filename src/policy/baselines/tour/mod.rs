@@ -10,10 +10,10 @@ mod pilot;
 mod plan;
 
 use self::pilot::{Pilot, Problem, TourState};
-use super::rule::{Rule, uav_positions, user_positions};
+use super::rule::{Rule, Slot, uav_positions, user_positions};
 use crate::env::Point;
 use crate::policy::flight::distance;
-use crate::policy::{EnvParams, FleetGraph, RequiredInput};
+use crate::policy::{EnvParams, RequiredInput};
 
 /// Memory: for each UAV, 1 + the index in its tour, and the length of the tour; the positions of users at the time of planning;
 /// then all tours, one after another. All zeros before the first plan.
@@ -44,7 +44,8 @@ impl Rule for Tour {
 
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}
 
-    fn decide(&self, env: &EnvParams, graph: &FleetGraph, step: u64, memory: &mut [f32], headings: &mut [u8]) {
+    fn decide(&self, slot: &Slot<'_>, memory: &mut [f32], headings: &mut [u8]) {
+        let Slot { env, graph, step, .. } = *slot;
         let (uavs, users) = (uav_positions(graph), user_positions(graph));
         let mut states = read_plan(env, uavs.len(), users, memory).unwrap_or_else(|| {
             let left = env.slots.saturating_sub(usize::try_from(step).unwrap_or(usize::MAX));

@@ -5,7 +5,7 @@
 
 use crate::env::{EnvConfig, Point};
 use crate::policy::EnvParams;
-use crate::policy::flight::{distance, in_square, next_position};
+use crate::policy::flight::{distance, next_position};
 
 /// A fleet, its users, and the number of slots to plan for.
 #[derive(Clone, Copy)]
@@ -59,7 +59,7 @@ impl<'a> Pilot<'a> {
         for h in 0..EnvConfig::COMPASS {
             let end = next_position(self.env, at, h);
             let beyond = (end[0] - after[0]).powi(2) + (end[1] - after[1]).powi(2);
-            let cost = (!in_square(end), self.slots(end, to), beyond);
+            let cost = (!self.env.contains(end), self.slots(end, to), beyond);
             if cost < (best.0, best.1, best.2) {
                 best = (cost.0, cost.1, cost.2, h);
             }

@@ -18,6 +18,9 @@ const TRIES: usize = 400;
 
 /// A tour per UAV, `capacity` entries in all.
 pub fn tours(problem: &Problem, capacity: usize) -> Vec<Vec<u32>> {
+    if problem.users.is_empty() {
+        return vec![Vec::new(); problem.uavs.len()];
+    }
     let mut plan = partition::tours(problem);
     if problem.users.len() > MAX_SIMULATED {
         return plan;

@@ -12,6 +12,20 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
 
+class Constraint(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    CONSTRAINT_UNSPECIFIED: _ClassVar[Constraint]
+    CONSTRAINT_NO_FLY: _ClassVar[Constraint]
+    CONSTRAINT_MIN_SEPARATION: _ClassVar[Constraint]
+    CONSTRAINT_MAX_DISTANCE: _ClassVar[Constraint]
+    CONSTRAINT_RETURN_IN_TIME: _ClassVar[Constraint]
+
+class Boundary(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    BOUNDARY_UNSPECIFIED: _ClassVar[Boundary]
+    BOUNDARY_CLAMP: _ClassVar[Boundary]
+    BOUNDARY_FREE: _ClassVar[Boundary]
+
 class NodeKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     NODE_KIND_UNSPECIFIED: _ClassVar[NodeKind]
@@ -30,6 +44,14 @@ class Needs(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     NEEDS_DETECTIONS: _ClassVar[Needs]
     NEEDS_OWN_POSITIONS: _ClassVar[Needs]
     NEEDS_FULL_SCENE: _ClassVar[Needs]
+CONSTRAINT_UNSPECIFIED: Constraint
+CONSTRAINT_NO_FLY: Constraint
+CONSTRAINT_MIN_SEPARATION: Constraint
+CONSTRAINT_MAX_DISTANCE: Constraint
+CONSTRAINT_RETURN_IN_TIME: Constraint
+BOUNDARY_UNSPECIFIED: Boundary
+BOUNDARY_CLAMP: Boundary
+BOUNDARY_FREE: Boundary
 NODE_KIND_UNSPECIFIED: NodeKind
 NODE_KIND_UAV: NodeKind
 NODE_KIND_USER: NodeKind
@@ -42,7 +64,7 @@ NEEDS_OWN_POSITIONS: Needs
 NEEDS_FULL_SCENE: Needs
 
 class ActRequest(_message.Message):
-    __slots__ = ("policy", "graph", "scene", "session_id", "recurrent_state", "step", "run_id", "return_q_values", "seed")
+    __slots__ = ("policy", "graph", "scene", "session_id", "recurrent_state", "step", "run_id", "return_q_values", "seed", "symmetric", "frame", "world", "return_velocity", "return_waypoint", "constraints")
     POLICY_FIELD_NUMBER: _ClassVar[int]
     GRAPH_FIELD_NUMBER: _ClassVar[int]
     SCENE_FIELD_NUMBER: _ClassVar[int]
@@ -52,6 +74,12 @@ class ActRequest(_message.Message):
     RUN_ID_FIELD_NUMBER: _ClassVar[int]
     RETURN_Q_VALUES_FIELD_NUMBER: _ClassVar[int]
     SEED_FIELD_NUMBER: _ClassVar[int]
+    SYMMETRIC_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    WORLD_FIELD_NUMBER: _ClassVar[int]
+    RETURN_VELOCITY_FIELD_NUMBER: _ClassVar[int]
+    RETURN_WAYPOINT_FIELD_NUMBER: _ClassVar[int]
+    CONSTRAINTS_FIELD_NUMBER: _ClassVar[int]
     policy: str
     graph: Graph
     scene: Scene
@@ -61,7 +89,79 @@ class ActRequest(_message.Message):
     run_id: str
     return_q_values: bool
     seed: int
-    def __init__(self, policy: _Optional[str] = ..., graph: _Optional[_Union[Graph, _Mapping]] = ..., scene: _Optional[_Union[Scene, _Mapping]] = ..., session_id: _Optional[str] = ..., recurrent_state: _Optional[bytes] = ..., step: _Optional[int] = ..., run_id: _Optional[str] = ..., return_q_values: bool = ..., seed: _Optional[int] = ...) -> None: ...
+    symmetric: bool
+    frame: Frame
+    world: World
+    return_velocity: bool
+    return_waypoint: bool
+    constraints: Constraints
+    def __init__(self, policy: _Optional[str] = ..., graph: _Optional[_Union[Graph, _Mapping]] = ..., scene: _Optional[_Union[Scene, _Mapping]] = ..., session_id: _Optional[str] = ..., recurrent_state: _Optional[bytes] = ..., step: _Optional[int] = ..., run_id: _Optional[str] = ..., return_q_values: bool = ..., seed: _Optional[int] = ..., symmetric: bool = ..., frame: _Optional[_Union[Frame, _Mapping]] = ..., world: _Optional[_Union[World, _Mapping]] = ..., return_velocity: bool = ..., return_waypoint: bool = ..., constraints: _Optional[_Union[Constraints, _Mapping]] = ...) -> None: ...
+
+class Constraints(_message.Message):
+    __slots__ = ("no_fly", "min_separation", "home", "max_distance", "return_in_time")
+    NO_FLY_FIELD_NUMBER: _ClassVar[int]
+    MIN_SEPARATION_FIELD_NUMBER: _ClassVar[int]
+    HOME_FIELD_NUMBER: _ClassVar[int]
+    MAX_DISTANCE_FIELD_NUMBER: _ClassVar[int]
+    RETURN_IN_TIME_FIELD_NUMBER: _ClassVar[int]
+    no_fly: _containers.RepeatedCompositeFieldContainer[Zone]
+    min_separation: float
+    home: Position
+    max_distance: float
+    return_in_time: bool
+    def __init__(self, no_fly: _Optional[_Iterable[_Union[Zone, _Mapping]]] = ..., min_separation: _Optional[float] = ..., home: _Optional[_Union[Position, _Mapping]] = ..., max_distance: _Optional[float] = ..., return_in_time: bool = ...) -> None: ...
+
+class Zone(_message.Message):
+    __slots__ = ("corners", "center", "radius")
+    CORNERS_FIELD_NUMBER: _ClassVar[int]
+    CENTER_FIELD_NUMBER: _ClassVar[int]
+    RADIUS_FIELD_NUMBER: _ClassVar[int]
+    corners: _containers.RepeatedCompositeFieldContainer[Position]
+    center: Position
+    radius: float
+    def __init__(self, corners: _Optional[_Iterable[_Union[Position, _Mapping]]] = ..., center: _Optional[_Union[Position, _Mapping]] = ..., radius: _Optional[float] = ...) -> None: ...
+
+class Overruled(_message.Message):
+    __slots__ = ("preferred_heading_index", "because", "violates")
+    PREFERRED_HEADING_INDEX_FIELD_NUMBER: _ClassVar[int]
+    BECAUSE_FIELD_NUMBER: _ClassVar[int]
+    VIOLATES_FIELD_NUMBER: _ClassVar[int]
+    preferred_heading_index: int
+    because: _containers.RepeatedScalarFieldContainer[Constraint]
+    violates: _containers.RepeatedScalarFieldContainer[Constraint]
+    def __init__(self, preferred_heading_index: _Optional[int] = ..., because: _Optional[_Iterable[_Union[Constraint, str]]] = ..., violates: _Optional[_Iterable[_Union[Constraint, str]]] = ...) -> None: ...
+
+class Frame(_message.Message):
+    __slots__ = ("origin", "side", "width", "height", "rotation_deg")
+    ORIGIN_FIELD_NUMBER: _ClassVar[int]
+    SIDE_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_DEG_FIELD_NUMBER: _ClassVar[int]
+    origin: Position
+    side: float
+    width: float
+    height: float
+    rotation_deg: float
+    def __init__(self, origin: _Optional[_Union[Position, _Mapping]] = ..., side: _Optional[float] = ..., width: _Optional[float] = ..., height: _Optional[float] = ..., rotation_deg: _Optional[float] = ...) -> None: ...
+
+class World(_message.Message):
+    __slots__ = ("slot_seconds", "speed", "transmission_range", "detection_range", "communication_range", "slots", "boundary")
+    SLOT_SECONDS_FIELD_NUMBER: _ClassVar[int]
+    SPEED_FIELD_NUMBER: _ClassVar[int]
+    TRANSMISSION_RANGE_FIELD_NUMBER: _ClassVar[int]
+    DETECTION_RANGE_FIELD_NUMBER: _ClassVar[int]
+    COMMUNICATION_RANGE_FIELD_NUMBER: _ClassVar[int]
+    SLOTS_FIELD_NUMBER: _ClassVar[int]
+    BOUNDARY_FIELD_NUMBER: _ClassVar[int]
+    slot_seconds: float
+    speed: float
+    transmission_range: float
+    detection_range: float
+    communication_range: float
+    slots: int
+    boundary: Boundary
+    def __init__(self, slot_seconds: _Optional[float] = ..., speed: _Optional[float] = ..., transmission_range: _Optional[float] = ..., detection_range: _Optional[float] = ..., communication_range: _Optional[float] = ..., slots: _Optional[int] = ..., boundary: _Optional[_Union[Boundary, str]] = ...) -> None: ...
 
 class Graph(_message.Message):
     __slots__ = ("nodes",)
@@ -70,38 +170,46 @@ class Graph(_message.Message):
     def __init__(self, nodes: _Optional[_Iterable[_Union[Node, _Mapping]]] = ...) -> None: ...
 
 class Node(_message.Message):
-    __slots__ = ("id", "kind", "detections", "position", "aoi")
+    __slots__ = ("id", "kind", "detections", "position", "aoi", "speed", "endurance_seconds")
     ID_FIELD_NUMBER: _ClassVar[int]
     KIND_FIELD_NUMBER: _ClassVar[int]
     DETECTIONS_FIELD_NUMBER: _ClassVar[int]
     POSITION_FIELD_NUMBER: _ClassVar[int]
     AOI_FIELD_NUMBER: _ClassVar[int]
+    SPEED_FIELD_NUMBER: _ClassVar[int]
+    ENDURANCE_SECONDS_FIELD_NUMBER: _ClassVar[int]
     id: str
     kind: NodeKind
     detections: _containers.RepeatedCompositeFieldContainer[Detection]
     position: Position
     aoi: float
-    def __init__(self, id: _Optional[str] = ..., kind: _Optional[_Union[NodeKind, str]] = ..., detections: _Optional[_Iterable[_Union[Detection, _Mapping]]] = ..., position: _Optional[_Union[Position, _Mapping]] = ..., aoi: _Optional[float] = ...) -> None: ...
+    speed: float
+    endurance_seconds: float
+    def __init__(self, id: _Optional[str] = ..., kind: _Optional[_Union[NodeKind, str]] = ..., detections: _Optional[_Iterable[_Union[Detection, _Mapping]]] = ..., position: _Optional[_Union[Position, _Mapping]] = ..., aoi: _Optional[float] = ..., speed: _Optional[float] = ..., endurance_seconds: _Optional[float] = ...) -> None: ...
 
 class Detection(_message.Message):
-    __slots__ = ("target_id", "rel_x", "rel_y", "aoi")
+    __slots__ = ("target_id", "rel_x", "rel_y", "aoi", "rel_z")
     TARGET_ID_FIELD_NUMBER: _ClassVar[int]
     REL_X_FIELD_NUMBER: _ClassVar[int]
     REL_Y_FIELD_NUMBER: _ClassVar[int]
     AOI_FIELD_NUMBER: _ClassVar[int]
+    REL_Z_FIELD_NUMBER: _ClassVar[int]
     target_id: str
     rel_x: float
     rel_y: float
     aoi: float
-    def __init__(self, target_id: _Optional[str] = ..., rel_x: _Optional[float] = ..., rel_y: _Optional[float] = ..., aoi: _Optional[float] = ...) -> None: ...
+    rel_z: float
+    def __init__(self, target_id: _Optional[str] = ..., rel_x: _Optional[float] = ..., rel_y: _Optional[float] = ..., aoi: _Optional[float] = ..., rel_z: _Optional[float] = ...) -> None: ...
 
 class Position(_message.Message):
-    __slots__ = ("x", "y")
+    __slots__ = ("x", "y", "z")
     X_FIELD_NUMBER: _ClassVar[int]
     Y_FIELD_NUMBER: _ClassVar[int]
+    Z_FIELD_NUMBER: _ClassVar[int]
     x: float
     y: float
-    def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ...) -> None: ...
+    z: float
+    def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ..., z: _Optional[float] = ...) -> None: ...
 
 class Scene(_message.Message):
     __slots__ = ("uavs", "users")
@@ -112,26 +220,34 @@ class Scene(_message.Message):
     def __init__(self, uavs: _Optional[_Iterable[_Union[SceneUav, _Mapping]]] = ..., users: _Optional[_Iterable[_Union[SceneUser, _Mapping]]] = ...) -> None: ...
 
 class SceneUav(_message.Message):
-    __slots__ = ("id", "x", "y")
+    __slots__ = ("id", "x", "y", "z", "speed", "endurance_seconds")
     ID_FIELD_NUMBER: _ClassVar[int]
     X_FIELD_NUMBER: _ClassVar[int]
     Y_FIELD_NUMBER: _ClassVar[int]
+    Z_FIELD_NUMBER: _ClassVar[int]
+    SPEED_FIELD_NUMBER: _ClassVar[int]
+    ENDURANCE_SECONDS_FIELD_NUMBER: _ClassVar[int]
     id: str
     x: float
     y: float
-    def __init__(self, id: _Optional[str] = ..., x: _Optional[float] = ..., y: _Optional[float] = ...) -> None: ...
+    z: float
+    speed: float
+    endurance_seconds: float
+    def __init__(self, id: _Optional[str] = ..., x: _Optional[float] = ..., y: _Optional[float] = ..., z: _Optional[float] = ..., speed: _Optional[float] = ..., endurance_seconds: _Optional[float] = ...) -> None: ...
 
 class SceneUser(_message.Message):
-    __slots__ = ("id", "x", "y", "aoi")
+    __slots__ = ("id", "x", "y", "aoi", "z")
     ID_FIELD_NUMBER: _ClassVar[int]
     X_FIELD_NUMBER: _ClassVar[int]
     Y_FIELD_NUMBER: _ClassVar[int]
     AOI_FIELD_NUMBER: _ClassVar[int]
+    Z_FIELD_NUMBER: _ClassVar[int]
     id: str
     x: float
     y: float
     aoi: float
-    def __init__(self, id: _Optional[str] = ..., x: _Optional[float] = ..., y: _Optional[float] = ..., aoi: _Optional[float] = ...) -> None: ...
+    z: float
+    def __init__(self, id: _Optional[str] = ..., x: _Optional[float] = ..., y: _Optional[float] = ..., aoi: _Optional[float] = ..., z: _Optional[float] = ...) -> None: ...
 
 class ActResponse(_message.Message):
     __slots__ = ("actions", "policy", "step", "recurrent_state", "timings")
@@ -148,16 +264,30 @@ class ActResponse(_message.Message):
     def __init__(self, actions: _Optional[_Iterable[_Union[Action, _Mapping]]] = ..., policy: _Optional[_Union[PolicyRef, _Mapping]] = ..., step: _Optional[int] = ..., recurrent_state: _Optional[bytes] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ...) -> None: ...
 
 class Action(_message.Message):
-    __slots__ = ("uav_id", "heading_index", "heading_deg", "q_values")
+    __slots__ = ("uav_id", "heading_index", "heading_deg", "q_values", "velocity", "waypoint", "overruled")
     UAV_ID_FIELD_NUMBER: _ClassVar[int]
     HEADING_INDEX_FIELD_NUMBER: _ClassVar[int]
     HEADING_DEG_FIELD_NUMBER: _ClassVar[int]
     Q_VALUES_FIELD_NUMBER: _ClassVar[int]
+    VELOCITY_FIELD_NUMBER: _ClassVar[int]
+    WAYPOINT_FIELD_NUMBER: _ClassVar[int]
+    OVERRULED_FIELD_NUMBER: _ClassVar[int]
     uav_id: str
     heading_index: int
     heading_deg: float
     q_values: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, uav_id: _Optional[str] = ..., heading_index: _Optional[int] = ..., heading_deg: _Optional[float] = ..., q_values: _Optional[_Iterable[float]] = ...) -> None: ...
+    velocity: Velocity
+    waypoint: Position
+    overruled: Overruled
+    def __init__(self, uav_id: _Optional[str] = ..., heading_index: _Optional[int] = ..., heading_deg: _Optional[float] = ..., q_values: _Optional[_Iterable[float]] = ..., velocity: _Optional[_Union[Velocity, _Mapping]] = ..., waypoint: _Optional[_Union[Position, _Mapping]] = ..., overruled: _Optional[_Union[Overruled, _Mapping]] = ...) -> None: ...
+
+class Velocity(_message.Message):
+    __slots__ = ("x", "y")
+    X_FIELD_NUMBER: _ClassVar[int]
+    Y_FIELD_NUMBER: _ClassVar[int]
+    x: float
+    y: float
+    def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ...) -> None: ...
 
 class PolicyRef(_message.Message):
     __slots__ = ("name", "version", "digest")
@@ -212,16 +342,24 @@ class ActError(_message.Message):
     def __init__(self, status: _Optional[int] = ..., code: _Optional[str] = ..., message: _Optional[str] = ..., field: _Optional[str] = ...) -> None: ...
 
 class OpenSessionRequest(_message.Message):
-    __slots__ = ("policy", "session_id", "run_id", "seed")
+    __slots__ = ("policy", "session_id", "run_id", "seed", "symmetric", "frame", "world", "constraints")
     POLICY_FIELD_NUMBER: _ClassVar[int]
     SESSION_ID_FIELD_NUMBER: _ClassVar[int]
     RUN_ID_FIELD_NUMBER: _ClassVar[int]
     SEED_FIELD_NUMBER: _ClassVar[int]
+    SYMMETRIC_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    WORLD_FIELD_NUMBER: _ClassVar[int]
+    CONSTRAINTS_FIELD_NUMBER: _ClassVar[int]
     policy: str
     session_id: str
     run_id: str
     seed: int
-    def __init__(self, policy: _Optional[str] = ..., session_id: _Optional[str] = ..., run_id: _Optional[str] = ..., seed: _Optional[int] = ...) -> None: ...
+    symmetric: bool
+    frame: Frame
+    world: World
+    constraints: Constraints
+    def __init__(self, policy: _Optional[str] = ..., session_id: _Optional[str] = ..., run_id: _Optional[str] = ..., seed: _Optional[int] = ..., symmetric: bool = ..., frame: _Optional[_Union[Frame, _Mapping]] = ..., world: _Optional[_Union[World, _Mapping]] = ..., constraints: _Optional[_Union[Constraints, _Mapping]] = ...) -> None: ...
 
 class GetSessionRequest(_message.Message):
     __slots__ = ("session_id",)
@@ -252,20 +390,30 @@ class CloseSessionRequest(_message.Message):
     def __init__(self, session_id: _Optional[str] = ...) -> None: ...
 
 class Session(_message.Message):
-    __slots__ = ("session_id", "policy", "steps", "opened_at", "ttl", "owner")
+    __slots__ = ("session_id", "policy", "steps", "opened_at", "ttl", "owner", "warnings")
     SESSION_ID_FIELD_NUMBER: _ClassVar[int]
     POLICY_FIELD_NUMBER: _ClassVar[int]
     STEPS_FIELD_NUMBER: _ClassVar[int]
     OPENED_AT_FIELD_NUMBER: _ClassVar[int]
     TTL_FIELD_NUMBER: _ClassVar[int]
     OWNER_FIELD_NUMBER: _ClassVar[int]
+    WARNINGS_FIELD_NUMBER: _ClassVar[int]
     session_id: str
     policy: PolicyRef
     steps: int
     opened_at: _timestamp_pb2.Timestamp
     ttl: _duration_pb2.Duration
     owner: str
-    def __init__(self, session_id: _Optional[str] = ..., policy: _Optional[_Union[PolicyRef, _Mapping]] = ..., steps: _Optional[int] = ..., opened_at: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., ttl: _Optional[_Union[datetime.timedelta, _duration_pb2.Duration, _Mapping]] = ..., owner: _Optional[str] = ...) -> None: ...
+    warnings: _containers.RepeatedCompositeFieldContainer[Warning]
+    def __init__(self, session_id: _Optional[str] = ..., policy: _Optional[_Union[PolicyRef, _Mapping]] = ..., steps: _Optional[int] = ..., opened_at: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., ttl: _Optional[_Union[datetime.timedelta, _duration_pb2.Duration, _Mapping]] = ..., owner: _Optional[str] = ..., warnings: _Optional[_Iterable[_Union[Warning, _Mapping]]] = ...) -> None: ...
+
+class Warning(_message.Message):
+    __slots__ = ("field", "message")
+    FIELD_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_FIELD_NUMBER: _ClassVar[int]
+    field: str
+    message: str
+    def __init__(self, field: _Optional[str] = ..., message: _Optional[str] = ...) -> None: ...
 
 class ListPoliciesRequest(_message.Message):
     __slots__ = ("page_size", "page_token")
@@ -340,7 +488,7 @@ class DeletePolicyResponse(_message.Message):
     def __init__(self) -> None: ...
 
 class Policy(_message.Message):
-    __slots__ = ("ref", "kind", "description", "uavs", "users", "headings", "needs", "detection_range", "aliases", "versions", "config", "metrics", "created_at", "loaded", "loaded_versions", "version_count")
+    __slots__ = ("ref", "kind", "description", "uavs", "users", "headings", "needs", "detection_range", "aliases", "versions", "config", "metrics", "created_at", "loaded", "loaded_versions", "version_count", "world")
     REF_FIELD_NUMBER: _ClassVar[int]
     KIND_FIELD_NUMBER: _ClassVar[int]
     DESCRIPTION_FIELD_NUMBER: _ClassVar[int]
@@ -357,6 +505,7 @@ class Policy(_message.Message):
     LOADED_FIELD_NUMBER: _ClassVar[int]
     LOADED_VERSIONS_FIELD_NUMBER: _ClassVar[int]
     VERSION_COUNT_FIELD_NUMBER: _ClassVar[int]
+    WORLD_FIELD_NUMBER: _ClassVar[int]
     ref: PolicyRef
     kind: PolicyKind
     description: str
@@ -373,4 +522,5 @@ class Policy(_message.Message):
     loaded: bool
     loaded_versions: _containers.RepeatedScalarFieldContainer[int]
     version_count: int
-    def __init__(self, ref: _Optional[_Union[PolicyRef, _Mapping]] = ..., kind: _Optional[_Union[PolicyKind, str]] = ..., description: _Optional[str] = ..., uavs: _Optional[int] = ..., users: _Optional[int] = ..., headings: _Optional[int] = ..., needs: _Optional[_Union[Needs, str]] = ..., detection_range: _Optional[float] = ..., aliases: _Optional[_Iterable[str]] = ..., versions: _Optional[_Iterable[int]] = ..., config: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., metrics: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., created_at: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., loaded: bool = ..., loaded_versions: _Optional[_Iterable[int]] = ..., version_count: _Optional[int] = ...) -> None: ...
+    world: World
+    def __init__(self, ref: _Optional[_Union[PolicyRef, _Mapping]] = ..., kind: _Optional[_Union[PolicyKind, str]] = ..., description: _Optional[str] = ..., uavs: _Optional[int] = ..., users: _Optional[int] = ..., headings: _Optional[int] = ..., needs: _Optional[_Union[Needs, str]] = ..., detection_range: _Optional[float] = ..., aliases: _Optional[_Iterable[str]] = ..., versions: _Optional[_Iterable[int]] = ..., config: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., metrics: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., created_at: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., loaded: bool = ..., loaded_versions: _Optional[_Iterable[int]] = ..., version_count: _Optional[int] = ..., world: _Optional[_Union[World, _Mapping]] = ...) -> None: ...

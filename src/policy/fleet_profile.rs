@@ -1,0 +1,129 @@
+//! Fleets whose UAVs and users change during an episode (docs/model.md, "Changing fleets"): what a policy is told about a fleet
+//! that has changed or whose UAVs differ, and how memory follows its UAVs and users. `serving::Roster` decides who belongs to a fleet.
+
+use std::f64::consts::{PI, TAU};
+
+use super::EnvParams;
+use crate::env::Point;
+
+/// The place of a UAV among those of its fleet: a direction around the centre of the square. UAV i of M has the angle 2 pi i / M. When
+/// the fleet changes, every UAV keeps its angle.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Place {
+    /// In radians.
+    pub angle: f64,
+    /// Half the angles between this UAV and the neighbouring UAVs, clockwise and counter-clockwise.
+    half_gaps: [f64; 2],
+}
+
+impl Place {
+    /// The place of UAV `i` of `uavs` that fly together from slot 0.
+    pub fn of(i: usize, uavs: usize) -> Self {
+        Self { angle: TAU * i as f64 / uavs as f64, half_gaps: [PI / uavs as f64; 2] }
+    }
+
+    /// The places of UAVs with these angles, in radians.
+    pub fn at_angles(angles: &[f64]) -> Vec<Self> {
+        let mut order: Vec<usize> = (0..angles.len()).collect();
+        order.sort_by(|&a, &b| angles[a].total_cmp(&angles[b]).then(a.cmp(&b)));
+        let mut places: Vec<Self> = angles.iter().map(|&angle| Self { angle, half_gaps: [PI; 2] }).collect();
+        if order.len() > 1 {
+            for (k, &i) in order.iter().enumerate() {
+                let next = order[(k + 1) % order.len()];
+                let half = (angles[next] - angles[i]).rem_euclid(TAU) / 2.0;
+                places[i].half_gaps[1] = half;
+                places[next].half_gaps[0] = half;
+            }
+        }
+        places
+    }
+
+    /// Whether `p` is in the sector of this UAV: in its direction rather than in that of a neighbour. UAVs that start together search
+    /// different sectors.
+    pub fn owns(&self, p: Point) -> bool {
+        let off = ((p[1] - 0.5).atan2(p[0] - 0.5) - self.angle).rem_euclid(TAU);
+        off <= self.half_gaps[1] || TAU - off <= self.half_gaps[0]
+    }
+}
+
+/// How a fleet differs from one of equal UAVs that has not changed since slot 0 and whose users are all known.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct FleetProfile {
+    /// The place of each UAV. Empty: the UAVs are those of slot 0.
+    pub places: Vec<Place>,
+    /// Whether there may be more users than the fleet's input lists.
+    pub open: bool,
+    /// Speed of each UAV, per slot. Empty: all have that of the environment.
+    pub speeds: Vec<f64>,
+}
+
+impl FleetProfile {
+    /// The place of UAV `i` of `uavs`.
+    pub fn place(profile: Option<&Self>, i: usize, uavs: usize) -> Place {
+        profile.and_then(|profile| profile.places.get(i).copied()).unwrap_or_else(|| Place::of(i, uavs))
+    }
+
+    /// The environment of UAV `i`.
+    pub fn env(profile: Option<&Self>, env: &EnvParams, i: usize) -> EnvParams {
+        EnvParams { speed: profile.and_then(|profile| profile.speeds.get(i).copied()).unwrap_or(env.speed), ..*env }
+    }
+
+    /// Whether there may be more users than listed.
+    pub fn is_open(profile: Option<&Self>) -> bool {
+        profile.is_some_and(|profile| profile.open)
+    }
+}
+
+/// How the UAVs and users of one memory are found in another: pairs of an index in the first and an index in the second.
+#[derive(Clone, Copy, Debug)]
+pub struct Carry<'a> {
+    /// (M, N) of the first memory.
+    pub from: (usize, usize),
+    /// (M, N) of the second memory.
+    pub to: (usize, usize),
+    /// UAVs in both.
+    pub uavs: &'a [(u32, u32)],
+    /// Users in both.
+    pub users: &'a [(u32, u32)],
+}
+
+impl Carry<'_> {
+    /// Copies the `width` numbers of each UAV.
+    pub(super) fn uav_rows(&self, width: usize, from: &[f32], to: &mut [f32]) {
+        for &(a, b) in self.uavs {
+            to[b as usize * width..][..width].copy_from_slice(&from[a as usize * width..][..width]);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn regular_places_are_the_same_in_both_forms() {
+        for uavs in 1..9 {
+            let angles: Vec<f64> = (0..uavs).map(|i| Place::of(i, uavs).angle).collect();
+            for (i, place) in Place::at_angles(&angles).into_iter().enumerate() {
+                let regular = Place::of(i, uavs);
+                assert_eq!(place.angle.to_bits(), regular.angle.to_bits());
+                assert!(place.half_gaps.iter().all(|half| (half - PI / uavs as f64).abs() < 1e-12));
+                for k in 0..97 {
+                    let angle = TAU * (f64::from(k) + 0.37) / 97.0;
+                    let p = [0.5 + 0.3 * angle.cos(), 0.5 + 0.3 * angle.sin()];
+                    assert_eq!(place.owns(p), regular.owns(p), "{i} of {uavs}, {angle}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_sectors_of_irregular_places_cover_everything_once() {
+        let places = Place::at_angles(&[0.1, 5.0, 0.3, 3.0]);
+        for k in 0..360 {
+            let angle = f64::from(k).to_radians() + 1e-3;
+            let p = [0.5 + 0.3 * angle.cos(), 0.5 + 0.3 * angle.sin()];
+            assert_eq!(places.iter().filter(|place| place.owns(p)).count(), 1, "{k}");
+        }
+    }
+}
