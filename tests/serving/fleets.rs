@@ -139,8 +139,10 @@ impl Model {
     /// The expected Q-values of each UAV, without the angle.
     fn step(&mut self, scene: &v1::Scene) -> Vec<(String, [f32; 3])> {
         let step = self.step;
-        self.uavs.retain(|_, uav| step - uav.seen <= ABSENT_AFTER);
-        self.users.retain(|_, seen| step - *seen <= ABSENT_AFTER);
+        // A member may miss as many slots, and is forgotten in the next one that does not list it.
+        let missed = |listed: bool| ABSENT_AFTER + u64::from(listed);
+        self.uavs.retain(|id, uav| step - uav.seen <= missed(scene.uavs.iter().any(|listed| listed.id == *id)));
+        self.users.retain(|id, seen| step - *seen <= missed(scene.users.iter().any(|listed| listed.id == *id)));
         for user in &scene.users {
             self.users.insert(user.id.clone(), step);
         }
@@ -530,7 +532,7 @@ async fn coordinates_in_other_units_need_a_frame() {
     let (code, reason, _) = refused(client.open_session(open("sweep", "s")).await);
     assert_eq!((code, reason.as_str()), (Code::AlreadyExists, "already_exists"), "another world is another session");
     let framed = v1::ActRequest { symmetric: Some(true), ..in_session("s", None, scene(3, 5, 0)) };
-    assert_invalid(client.act(framed).await, "frame", "frame, world or symmetric");
+    assert_invalid(client.act(framed).await, "frame", "frame, world, symmetric or constraints");
     let policy = client.get_policy(v1::GetPolicyRequest { policy: "qedgix".into() }).await.unwrap().into_inner();
     let of = policy.world.unwrap();
     assert_eq!((of.speed, of.detection_range, of.slots, of.boundary()), (Some(0.04), Some(0.28), Some(80), v1::Boundary::Clamp));

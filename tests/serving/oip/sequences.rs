@@ -155,7 +155,7 @@ async fn a_start_starts_over_and_a_refused_one_does_not() {
     assert_eq!(fails(&mut client, state).await.2, "recurrent_state");
     assert_eq!(fails(&mut client, slot("count", 5).asking(&["recurrent_state"])).await.2, "outputs[0].name");
     let other_ids = || Ask::new("count", As::Raw, false).scene(&narrow(2, 1, 0)).int("sequence_id", 5);
-    let repeated = other_ids().int("step", 0);
+    let repeated = other_ids().int("step", 1);
     assert_eq!(
         fails(&mut client, repeated.byte_strings("uav_ids", &["a", "b"])).await.2,
         "uavs",
