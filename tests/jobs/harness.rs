@@ -119,6 +119,7 @@ impl Server {
             loads: Loads::default(),
             retention: Retention::default(),
             sessions: Sessions::new(limits, clock.clone()),
+            absent_after: config.absent_after,
             environments: Environments::new(limits, clock.clone()),
             engine: Engine::start(EngineConfig { threads: 1, queue: 1, max_batch: 1, max_batch_delay: Duration::ZERO }).unwrap(),
             keys: Keyring::new(None),

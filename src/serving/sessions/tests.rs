@@ -242,16 +242,12 @@ async fn memory_of_all_sessions_is_bounded_in_bytes() {
     assert_eq!(step_once(&session, Some(0), None).await, Ok((0, vec![session_seed("0", None) as f32 + 1.0; 2])));
     // The memory of a policy may grow. Refused, the step leaves the session as it was.
     taken.resize(taken.bytes() + (16 << 10) - sessions.memory_used()).unwrap();
-    let StepStart::Next(next) = session.begin_step(&fleet(["a", "b"]), Some(1), None).await.unwrap() else {
-        panic!("the next step")
-    };
+    let StepStart::Next(next) = begin(&session, ["a", "b"], Some(1), None).await.unwrap() else { panic!("the next step") };
     let decision = Decision { step: 1, headings: vec![0, 0], ..Decision::default() };
     let memory = FleetMemory::Plain(vec![0.0; 100]);
     assert_eq!(next.commit(TaskOutput { memory: memory.clone(), decision: decision.clone() }).map_err(|e| code(&e)), Err("busy"));
     drop(taken);
-    let StepStart::Next(next) = session.begin_step(&fleet(["a", "b"]), Some(1), None).await.unwrap() else {
-        panic!("the next step")
-    };
+    let StepStart::Next(next) = begin(&session, ["a", "b"], Some(1), None).await.unwrap() else { panic!("the next step") };
     assert!(next.memory.bytes() < 100);
     next.commit(TaskOutput { memory, decision }).unwrap();
     drop(session);
