@@ -12,7 +12,8 @@ use super::{act_client, ports, progress, report, run_args::all_cores, table};
 use crate::checkpoint::Checkpoint;
 use crate::env::{EnvConfig, LostUav, UserSlots};
 use crate::learner::{
-    Comparison, Disturbance, LayoutList, PolicyEvaluation, TracedEvaluation, Trajectory, evaluate_list, evaluate_traced, layout_list,
+    Comparison, Disturbance, LayoutList, PolicyEvaluation, TracedEvaluation, Trajectory, evaluate_list, evaluate_traced,
+    layout_list,
 };
 use crate::policy::{Policy, baselines};
 use crate::serving::bundled;
