@@ -26,6 +26,8 @@ class Scene:
         aoi: AoI of the users in slots: an array (N,) in the order of `users`, or a mapping from id. Default: 0.
         uav_ids: ids of the UAVs, if `uavs` is an array. Default: uav-0, uav-1, ... A UAV has the same id in every slot.
         user_ids: ids of the users, if `users` is an array. Default: user-0, user-1, ...
+        speeds: speed of each UAV per second: an array (M,), or a mapping from id. Default: that of the world.
+        endurance: time in seconds that each UAV can still fly: as `speeds`. For the constraint return_in_time.
 
     Raises:
         InvalidArgument: an array has another shape, or ids do not fit. The server checks the values.
@@ -35,7 +37,7 @@ class Scene:
         <Scene: 1 UAVs, 2 users>
     """
 
-    __slots__ = ("_aoi", "_uav_ids", "_uavs", "_user_ids", "_users")
+    __slots__ = ("_aoi", "_endurance", "_speeds", "_uav_ids", "_uavs", "_user_ids", "_users")
 
     def __init__(
         self,
@@ -45,10 +47,14 @@ class Scene:
         *,
         uav_ids: Sequence[str] | None = None,
         user_ids: Sequence[str] | None = None,
+        speeds: Numbers | None = None,
+        endurance: Numbers | None = None,
     ) -> None:
         self._uav_ids, self._uavs = _points("scene.uavs", uavs, uav_ids, "uav")
         self._user_ids, self._users = _points("scene.users", users, user_ids, "user")
         self._aoi = [0.0] * len(self._user_ids) if aoi is None else _numbers("scene.aoi", aoi, self._user_ids)
+        self._speeds = None if speeds is None else _numbers("scene.speeds", speeds, self._uav_ids)
+        self._endurance = None if endurance is None else _numbers("scene.endurance", endurance, self._uav_ids)
 
     def fill(self, scene: pb.Scene) -> None:
         """Writes the scene to a message."""
@@ -57,6 +63,12 @@ class Scene:
             add_uav(id=name, x=x, y=y)
         for name, (x, y), aoi in zip(self._user_ids, self._users, self._aoi):
             add_user(id=name, x=x, y=y, aoi=aoi)
+        if self._speeds is not None:
+            for uav, speed in zip(scene.uavs, self._speeds):
+                uav.speed = speed
+        if self._endurance is not None:
+            for uav, seconds in zip(scene.uavs, self._endurance):
+                uav.endurance_seconds = seconds
 
     def message(self) -> pb.Scene:
         """The message of the protocol."""
@@ -76,6 +88,8 @@ class Graph:
             relative to the UAV, (x, y) in units of the side of the square; (x, y, AoI) of a user, if UAVs know different AoI.
         aoi: AoI of the users of the fleet in slots, by id, also of users that no UAV detects.
         positions: position (x, y) of each UAV by id, for policies that need their own position. Default: none.
+        speeds: speed per second of UAVs by id. Default: that of the world.
+        endurance: time in seconds that UAVs can still fly, by id. For the constraint return_in_time.
 
     Raises:
         InvalidArgument: an id is unknown, or a position is not two numbers.
@@ -92,6 +106,9 @@ class Graph:
         detections: Mapping[str, Mapping[str, Sequence[float]]],
         aoi: Mapping[str, float] | None = None,
         positions: Mapping[str, Sequence[float]] | None = None,
+        *,
+        speeds: Mapping[str, float] | None = None,
+        endurance: Mapping[str, float] | None = None,
     ) -> None:
         message = pb.Graph()
         users = {} if aoi is None else dict(aoi)
@@ -101,6 +118,10 @@ class Graph:
             node = message.nodes.add(id=name, kind=pb.NODE_KIND_UAV)
             if positions is not None:
                 node.position.x, node.position.y = _pair(f"graph.positions[{name}]", positions.get(name))
+            if speeds is not None and name in speeds:
+                node.speed = _number(f"graph.speeds[{name}]", speeds[name])
+            if endurance is not None and name in endurance:
+                node.endurance_seconds = _number(f"graph.endurance[{name}]", endurance[name])
             _texts(f"graph.detections[{name}]", targets)
             for target, seen in targets.items():
                 field = f"graph.detections[{name}][{target}]"

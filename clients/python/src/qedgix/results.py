@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta, timezone
 from functools import cached_property
@@ -23,10 +23,12 @@ __all__ = [
     "JobEvent",
     "Metric",
     "Metrics",
+    "Overruled",
     "Policy",
     "PolicyRef",
     "PolicyVersion",
     "SessionInfo",
+    "SessionWarning",
     "Timings",
     "directions",
 ]
@@ -70,6 +72,27 @@ class Timings(NamedTuple):
     """Seconds of the forward pass."""
     batch_size: int
     """Number of fleets in the forward pass."""
+
+
+class Overruled(NamedTuple):
+    """What constraints did to the heading of a UAV. Constraints are named as the fields of `Constraints`."""
+
+    preferred_heading: int
+    """The heading that the policy prefers."""
+    because: tuple[str, ...]
+    """The constraints that it would break, given the headings of the other UAVs."""
+    violates: tuple[str, ...]
+    """The constraints that the heading of the decision breaks: no heading keeps all."""
+
+    @staticmethod
+    def of(overruled: policy_pb2.Overruled) -> Overruled:
+        """From a message."""
+
+        def names(constraints: Iterable[policy_pb2.Constraint]) -> tuple[str, ...]:
+            known = map(policy_pb2.Constraint.Name, constraints)
+            return tuple(name.removeprefix("CONSTRAINT_").lower() for name in known)
+
+        return Overruled(overruled.preferred_heading_index, names(overruled.because), names(overruled.violates))
 
 
 class Decision:
@@ -118,6 +141,31 @@ class Decision:
         return np.array(rows, np.float32) if rows and len(rows[0]) else None
 
     @property
+    def velocities(self) -> Floats | None:
+        """(M, 2) velocities along your axes, per second; None if they were not requested with `motion`."""
+        actions = self.message.actions
+        if not any(action.HasField("velocity") for action in actions):
+            return None
+        return np.array([(action.velocity.x, action.velocity.y) for action in actions])
+
+    @property
+    def waypoints(self) -> Floats | None:
+        """(M, 2) where the UAVs should be after the slot, in your coordinates; NaN for a UAV without a position in the
+        observation. None if they were not requested with `motion`."""
+        actions = self.message.actions
+        if not any(action.HasField("waypoint") for action in actions):
+            return None
+        known = [action.waypoint if action.HasField("waypoint") else None for action in actions]
+        return np.array([(np.nan, np.nan) if at is None else (at.x, at.y) for at in known])
+
+    @property
+    def overruled(self) -> dict[str, Overruled]:
+        """What constraints did, by id of the UAV; UAVs whose heading is that of the policy and breaks nothing are not in it."""
+        return {
+            action.uav_id: Overruled.of(action.overruled) for action in self.message.actions if action.HasField("overruled")
+        }
+
+    @property
     def policy(self) -> PolicyRef:
         """The version that decided."""
         return PolicyRef.of(self.message.policy)
@@ -142,6 +190,15 @@ class Decision:
         return f"<Decision: step {self.step}, headings {self.headings.tolist()}>"
 
 
+class SessionWarning(NamedTuple):
+    """Something that a caller should know about its session."""
+
+    field: str
+    """The field of the request, such as `world.speed`."""
+    message: str
+    """What it means."""
+
+
 @dataclass(frozen=True)
 class SessionInfo:
     """A session as the server knows it."""
@@ -155,10 +212,14 @@ class SessionInfo:
     """The session expires after this time without a request."""
     owner: str
     """Id of the API key that made it; empty: no key was required."""
+    warnings: tuple[SessionWarning, ...]
+    """How the world of the session differs from the one of the policy."""
 
     @staticmethod
     def of(session: policy_pb2.Session) -> SessionInfo:
         """From a message."""
+        # Tools for types take the name of the message for the class of Python.
+        warnings: Any = session.warnings
         return SessionInfo(
             session.session_id,
             PolicyRef.of(session.policy),
@@ -166,6 +227,7 @@ class SessionInfo:
             session.opened_at.ToDatetime(timezone.utc),
             session.ttl.ToTimedelta(),
             session.owner,
+            tuple(SessionWarning(warning.field, warning.message) for warning in warnings),
         )
 
 

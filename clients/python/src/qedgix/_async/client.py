@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 from .._settings import Retry, Settings
 from ..errors import QedgixError
-from ..observations import Observation, put
+from ..observations import Observation
 from ..results import Decision, SessionInfo
 from ..v1 import policy_pb2 as pb
+from ..world import Constraints, Frame, Surroundings, World
 from . import sessions
 from .environments import AsyncEnvironment, create_request
 from .jobs import AsyncJobs
@@ -97,6 +98,10 @@ class AsyncClient:
         session_id: str | None = None,
         run_id: str | None = None,
         seed: int | None = None,
+        frame: Frame | None = None,
+        world: World | None = None,
+        constraints: Constraints | None = None,
+        symmetric: bool = True,
     ) -> AsyncSession:
         """A session for `async with`, which opens it on the server and closes it at the end.
 
@@ -105,8 +110,13 @@ class AsyncClient:
             session_id: a name of your own. Default: a random one.
             run_id: name of the first run, see `restart`. With a new one, an open session of this id starts again at slot 0.
             seed: seed of the random choices of the policy. Default: derived from `session_id` and `run_id`.
+            frame: the area in your coordinates. Default: the unit square.
+            world: what differs from the world of the policy. `warnings` of the session tell what that means.
+            constraints: what no heading may break.
+            symmetric: whether, where only one of two nodes of a graph reports the other, both detect each other. Default: True.
         """
         request = pb.OpenSessionRequest(policy=policy, session_id=session_id or uuid.uuid4().hex, run_id=run_id, seed=seed)
+        Surroundings(frame, world, constraints, symmetric).put(request)
         return AsyncSession(self._transport, request)
 
     async def open_session(
@@ -116,10 +126,24 @@ class AsyncClient:
         session_id: str | None = None,
         run_id: str | None = None,
         seed: int | None = None,
+        frame: Frame | None = None,
+        world: World | None = None,
+        constraints: Constraints | None = None,
+        symmetric: bool = True,
         timeout: float | None = None,
     ) -> AsyncSession:
         """Opens a session, which you close yourself. Arguments and errors: as `session` and `AsyncSession.open`."""
-        return await self.session(policy, session_id=session_id, run_id=run_id, seed=seed).open(timeout)
+        session = self.session(
+            policy,
+            session_id=session_id,
+            run_id=run_id,
+            seed=seed,
+            frame=frame,
+            world=world,
+            constraints=constraints,
+            symmetric=symmetric,
+        )
+        return await session.open(timeout)
 
     async def get_session(self, session_id: str) -> AsyncSession:
         """An open session, to continue it.
@@ -145,17 +169,32 @@ class AsyncClient:
                 return found
 
     def local_session(
-        self, policy: str, *, seed: int | None = None, recurrent_state: bytes = b"", step: int = 0
+        self,
+        policy: str,
+        *,
+        seed: int | None = None,
+        frame: Frame | None = None,
+        world: World | None = None,
+        constraints: Constraints | None = None,
+        symmetric: bool = True,
+        recurrent_state: bytes = b"",
+        step: int = 0,
     ) -> AsyncLocalSession:
         """A fleet whose memory is kept here and not on the server. Nothing is sent before `act`.
 
         Args:
             policy: NAME (the newest version), NAME@ALIAS or NAME:VERSION. The episode keeps the version of its slot 0.
             seed: seed of the random choices of the policy. Default: 0.
+            frame: as for `session`.
+            world: as for `session`.
+            constraints: as for `session`.
+            symmetric: as for `session`.
             recurrent_state: that of an earlier object, to continue its episode.
             step: that of the earlier object.
         """
-        session = AsyncLocalSession(self._transport, policy, seed, recurrent_state)
+        common = pb.ActRequest(policy=policy)
+        Surroundings(frame, world, constraints, symmetric).put(common)
+        session = AsyncLocalSession(self._transport, common, seed, recurrent_state)
         session.step = step
         return session
 
@@ -165,17 +204,23 @@ class AsyncClient:
         *,
         policy: str,
         seed: int | None = None,
+        frame: Frame | None = None,
+        world: World | None = None,
+        constraints: Constraints | None = None,
+        symmetric: bool = True,
         q_values: bool = False,
+        motion: bool = False,
         timeout: float | None = None,
     ) -> Decision:
         """The headings for one observation of a fleet without a past. For more than one slot use a session.
 
+        The arguments are those of `local_session` and of its `act`.
+
         Raises:
             QedgixError: as `act` of a session.
         """
-        request = pb.ActRequest(policy=policy, seed=seed, return_q_values=q_values)
-        put(observation, request)
-        return Decision(await self._transport.call(sessions.ACT, request, timeout))
+        fleet = self.local_session(policy, seed=seed, frame=frame, world=world, constraints=constraints, symmetric=symmetric)
+        return await fleet.act(observation, q_values=q_values, motion=motion, timeout=timeout)
 
     async def act_batch(
         self,

@@ -20,7 +20,7 @@ from ..errors import (
     from_grpc,
 )
 from ..observations import Observation, put
-from ..results import Decision, PolicyRef, SessionInfo
+from ..results import Decision, PolicyRef, SessionInfo, SessionWarning
 from ..v1 import policy_pb2 as pb
 from ._platform import RawStream, sleep
 from .transport import AsyncTransport, Method
@@ -49,7 +49,14 @@ class AsyncFleet:
         self.step = 0
         """Index of the next slot, from 0."""
 
-    async def act(self, observation: Observation, *, q_values: bool = False, timeout: float | None = None) -> Decision:
+    async def act(
+        self,
+        observation: Observation,
+        *,
+        q_values: bool = False,
+        motion: bool = False,
+        timeout: float | None = None,
+    ) -> Decision:
         """Returns the headings for what the fleet observes in this slot, and goes on to the next slot.
 
         A lost answer is asked for again with the same step, which the server does not compute twice. If this raises, the
@@ -58,6 +65,7 @@ class AsyncFleet:
         Args:
             observation: a `Scene`, a `Graph`, their message or a dict.
             q_values: whether to return Q-values.
+            motion: whether to return velocities and waypoints.
             timeout: seconds for all attempts. Default: that of the client.
 
         Raises:
@@ -66,11 +74,22 @@ class AsyncFleet:
             NotFound: there is no such session or policy; a server that was restarted has no sessions.
             Unavailable, ResourceExhausted, DeadlineExceeded: no answer within the deadline.
         """
-        response = await self._transport.call(ACT, self.request(observation, q_values=q_values), timeout)
+        request = self.request(observation, q_values=q_values, motion=motion)
+        response = await self._transport.call(ACT, request, timeout)
         return self.accept(response)
 
-    def request(self, observation: Observation, *, q_values: bool = False) -> pb.ActRequest:
+    def request(self, observation: Observation, *, q_values: bool = False, motion: bool = False) -> pb.ActRequest:
         """The request of this slot."""
+        request = self._begin()
+        if q_values:
+            request.return_q_values = True
+        if motion:
+            request.return_velocity = request.return_waypoint = True
+        put(observation, request)
+        return request
+
+    def _begin(self) -> pb.ActRequest:
+        """The request of this slot without its observation."""
         raise NotImplementedError
 
     def accept(self, response: pb.ActResponse) -> Decision:
@@ -105,6 +124,17 @@ class AsyncSession(AsyncFleet):
             raise RuntimeError("the session is not open")
         return self.info.policy
 
+    @property
+    def warnings(self) -> tuple[SessionWarning, ...]:
+        """How the world of the session differs from the one of the policy.
+
+        Raises:
+            RuntimeError: the session is not open yet.
+        """
+        if self.info is None:
+            raise RuntimeError("the session is not open")
+        return self.info.warnings
+
     async def open(self, timeout: float | None = None) -> Self:
         """Opens the session; `async with` does this itself.
 
@@ -117,14 +147,10 @@ class AsyncSession(AsyncFleet):
         self.step = self.info.steps
         return self
 
-    def request(self, observation: Observation, *, q_values: bool = False) -> pb.ActRequest:
-        """The request of this slot."""
+    def _begin(self) -> pb.ActRequest:
         request = pb.ActRequest(session_id=self.id, step=self.step)
         if self._run_id is not None:
             request.run_id = self._run_id
-        if q_values:
-            request.return_q_values = True
-        put(observation, request)
         return request
 
     def restart(self, run_id: str | None = None) -> None:
@@ -167,21 +193,22 @@ class AsyncLocalSession(AsyncFleet):
     It survives a restart of the server. Save `recurrent_state` and `step` to continue in another process.
     """
 
-    def __init__(self, transport: AsyncTransport, policy: str, seed: int | None, recurrent_state: bytes) -> None:
+    def __init__(self, transport: AsyncTransport, common: pb.ActRequest, seed: int | None, recurrent_state: bytes) -> None:
         super().__init__(transport)
-        self.policy = policy
+        self._common = common
+        self.policy = common.policy
         """NAME, NAME@ALIAS or NAME:VERSION. The episode keeps the version of its slot 0."""
         self.seed = seed
         """Seed of the random choices of the policy."""
         self.recurrent_state = recurrent_state
         """The memory of the fleet after the last slot; empty before slot 0."""
 
-    def request(self, observation: Observation, *, q_values: bool = False) -> pb.ActRequest:
-        """The request of this slot."""
-        request = pb.ActRequest(policy=self.policy, recurrent_state=self.recurrent_state, return_q_values=q_values)
+    def _begin(self) -> pb.ActRequest:
+        request = pb.ActRequest()
+        request.CopyFrom(self._common)
+        request.recurrent_state = self.recurrent_state
         if not self.recurrent_state and self.seed is not None:
             request.seed = self.seed
-        put(observation, request)
         return request
 
     def accept(self, response: pb.ActResponse) -> Decision:
@@ -234,7 +261,9 @@ class AsyncActStream:
         """Number of requests without an answer."""
         return len(self._pending)
 
-    async def act(self, fleet: AsyncFleet, observation: Observation, *, q_values: bool = False) -> Decision:
+    async def act(
+        self, fleet: AsyncFleet, observation: Observation, *, q_values: bool = False, motion: bool = False
+    ) -> Decision:
         """Sends one slot and returns its answer. As `act` of the fleet.
 
         Raises:
@@ -242,10 +271,10 @@ class AsyncActStream:
         """
         if self._pending:
             raise RuntimeError("requests wait for their answers; receive them first")
-        await self.send(fleet, observation, q_values=q_values)
+        await self.send(fleet, observation, q_values=q_values, motion=motion)
         return await self.receive()
 
-    async def send(self, fleet: AsyncFleet, observation: Observation, *, q_values: bool = False) -> None:
+    async def send(self, fleet: AsyncFleet, observation: Observation, *, q_values: bool = False, motion: bool = False) -> None:
         """Sends the slot of a fleet without waiting for the answer.
 
         Raises:
@@ -253,7 +282,7 @@ class AsyncActStream:
         """
         if any(waiting is fleet for waiting, _ in self._pending):
             raise RuntimeError(f"{fleet!r} waits for an answer; receive it first")
-        request = fleet.request(observation, q_values=q_values)
+        request = fleet.request(observation, q_values=q_values, motion=motion)
         self._pending.append((fleet, request))
         if self._raw is None:
             self._raw = self._transport.open_stream(ACT_STREAM)
