@@ -40,7 +40,9 @@ def test_a_wheel_can_carry_the_server(tmp_path):
     told = subprocess.run([command, "--version"], check=True, capture_output=True, text=True).stdout
     assert told.startswith("qedgix ")
     assert list(prefix.rglob("qedgix/py.typed"))
-    missing = subprocess.run(pip + build, env={**os.environ, "QEDGIX_WHEEL_SERVER": "nowhere"}, capture_output=True, check=False)
+    missing = subprocess.run(
+        pip + build, env={**os.environ, "QEDGIX_WHEEL_SERVER": "nowhere"}, capture_output=True, check=False
+    )
     assert missing.returncode != 0
 
 
