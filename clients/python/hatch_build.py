@@ -21,7 +21,7 @@ class ServerHook(BuildHookInterface[Any]):
         path = Path(server).resolve()
         if not os.access(path, os.X_OK):
             raise FileNotFoundError(f"QEDGIX_WHEEL_SERVER: {server} is no program")
-        build_data["shared_scripts"][str(path)] = path.name
+        build_data["shared_scripts"][str(path)] = "qedgix" + path.suffix
         build_data["pure_python"] = False
         # The program needs no Python of a certain version, only the platform.
         build_data["tag"] = f"py3-none-{platform_tag()}"
