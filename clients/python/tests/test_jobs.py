@@ -144,6 +144,28 @@ def test_a_watcher_survives_the_death_of_the_server(make_server, connect, name):
     assert job.refresh().state == "cancelled"
 
 
+def test_an_evaluation_has_a_result(client, name):
+    job = client.jobs.submit(kind="evaluate", name=name, evaluation={"policies": ["sweep"], "episodes": 8})
+    job.edit(labels={"team": "b"}, notes="a note")
+    assert job.document["labels"] == {"team": "b"} and job.document["notes"] == "a note"
+    assert job.wait(progress=True).result()
+    with pytest.raises(qedgix.InvalidArgument) as refused:
+        job.edit(colour="red")
+    assert refused.value.field == "colour"
+    job.delete()
+
+
+def test_a_sweep_has_a_result(client, name):
+    fields = {key: value for key, value in SMALL.items() if key != "algorithm"}
+    job = client.jobs.submit(kind="sweep", name=name, sweep={"grid": {"algorithm": ["vdn", "iql"]}, "seeds": 1}, **fields)
+    assert job.wait(progress=True).result()
+    children = [one for one in client.jobs.list() if one.document.get("parent") == job.id]
+    assert [one.state for one in children] == ["succeeded"] * 2
+    for policy in {str(one.policy).partition(":")[0] for one in children}:
+        client.policies.delete(policy)
+    job.delete()
+
+
 def test_an_idempotency_key_names_a_job(client, name):
     first = client.jobs.submit(**SMALL, name=name, idempotency_key=name)
     assert client.jobs.submit(**SMALL, name=name, idempotency_key=name).id == first.id

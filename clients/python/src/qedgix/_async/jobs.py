@@ -141,6 +141,23 @@ class AsyncJob:
         """
         return await self._change("retry", ())
 
+    async def edit(self, **fields: Any) -> Self:
+        """Changes `name`, `labels`, `priority` or `notes` of the job. None: the default; a label that is None is removed.
+
+        Raises:
+            InvalidArgument: a field is not accepted.
+        """
+        self.document = await self._transport.json("PATCH", self._path, json=fields)
+        return self
+
+    async def result(self) -> dict[str, Any]:
+        """The result of an evaluation or a sweep, as JSON (docs/jobs.md of the server).
+
+        Raises:
+            FailedPrecondition: `wrong_state`: the job has no result, or none yet.
+        """
+        return await self._transport.json("GET", f"{self._path}/result")
+
     async def delete(self) -> None:
         """Deletes the job with its metrics and checkpoints. The policy that it has published stays.
 
@@ -329,7 +346,7 @@ class AsyncJobs:
             priority: -100 to 100; jobs with a higher one start first. Default: 0.
             labels: labels, which the server does not interpret.
             idempotency_key: a second submission with this key returns the same job. Default: a random key.
-            more: further fields of the body of `POST /v1/jobs`.
+            more: further fields of the body of `POST /v1/jobs`, such as `kind="evaluate"` or `kind="sweep"` and theirs.
 
         Raises:
             InvalidArgument: a field is not accepted; `field` says which.

@@ -142,6 +142,23 @@ class Job:
         """
         return self._change("retry", ())
 
+    def edit(self, **fields: Any) -> Self:
+        """Changes `name`, `labels`, `priority` or `notes` of the job. None: the default; a label that is None is removed.
+
+        Raises:
+            InvalidArgument: a field is not accepted.
+        """
+        self.document = self._transport.json("PATCH", self._path, json=fields)
+        return self
+
+    def result(self) -> dict[str, Any]:
+        """The result of an evaluation or a sweep, as JSON (docs/jobs.md of the server).
+
+        Raises:
+            FailedPrecondition: `wrong_state`: the job has no result, or none yet.
+        """
+        return self._transport.json("GET", f"{self._path}/result")
+
     def delete(self) -> None:
         """Deletes the job with its metrics and checkpoints. The policy that it has published stays.
 
@@ -330,7 +347,7 @@ class Jobs:
             priority: -100 to 100; jobs with a higher one start first. Default: 0.
             labels: labels, which the server does not interpret.
             idempotency_key: a second submission with this key returns the same job. Default: a random key.
-            more: further fields of the body of `POST /v1/jobs`.
+            more: further fields of the body of `POST /v1/jobs`, such as `kind="evaluate"` or `kind="sweep"` and theirs.
 
         Raises:
             InvalidArgument: a field is not accepted; `field` says which.
