@@ -51,7 +51,7 @@ pub async fn run(args: ServerArgs) -> anyhow::Result<()> {
         outln!("{budget:#}")?;
     } else {
         let number = |name: &str| budget[name].as_u64().map_or_else(|| Value::Null.to_string(), |n| n.to_string());
-        outln!("CPU budget: {} threads, {} used by running jobs", number("threads"), number("threads_busy"))?;
+        outln!("CPU budget: {} (used by running jobs: {})", number("threads"), number("threads_busy"))?;
     }
     Ok(())
 }

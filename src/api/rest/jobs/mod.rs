@@ -1,5 +1,6 @@
 //! `/v1/jobs` and `/v1/checkpoints`.
 
+mod request;
 mod types;
 
 use std::sync::Arc;
@@ -22,7 +23,8 @@ use crate::service::{App, Error, PageRequest, checkpoints, jobs};
 use crate::store::{JobAction, JobKind, JobState};
 use crate::train_config::Algorithm;
 pub(super) use types::MetricRow;
-use types::{Attempt, Checkpoint, Job, JobEdit, JobRequest, JobSummary, to_csv};
+use request::{JobEdit, JobRequest};
+use types::{Attempt, Checkpoint, Job, JobSummary, to_csv};
 
 type AppState = State<Arc<App>>;
 
@@ -101,7 +103,7 @@ struct ListQuery {
     #[param(nullable = false)]
     state: Option<JobState>,
     /// Only jobs of this kind.
-    #[param(schema_with = types::kind, required = false)]
+    #[param(schema_with = request::kind, required = false)]
     kind: Option<JobKind>,
     /// Only jobs with this algorithm.
     #[param(nullable = false)]
