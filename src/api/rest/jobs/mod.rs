@@ -22,8 +22,8 @@ use crate::service::keys::Caller;
 use crate::service::{App, Error, PageRequest, checkpoints, jobs};
 use crate::store::{JobAction, JobKind, JobState};
 use crate::train_config::Algorithm;
-pub(super) use types::MetricRow;
 use request::{JobEdit, JobRequest};
+pub(super) use types::MetricRow;
 use types::{Attempt, Checkpoint, Job, JobSummary, to_csv};
 
 type AppState = State<Arc<App>>;
