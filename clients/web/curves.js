@@ -102,7 +102,7 @@ function useFields(jobs) {
 
 /** What a curve of several jobs shares: the value of a field, or of all differing fields but the seed. */
 function groups(jobs, by, fields) {
-  if (!by) return jobs.map((job) => ({ label: jobLabel(job, jobs), jobs: [job] }));
+  if (!by) return jobs.map((job) => ({ label: jobLabel(job, jobs, fields), jobs: [job] }));
   const names = by === 'all' ? fields.differing.filter((name) => name !== 'seed') : [by];
   const grouped = new Map();
   for (const job of jobs) {
@@ -117,13 +117,18 @@ function groups(jobs, by, fields) {
   return [...grouped.values()].map((g) => ({ ...g, label: g.jobs.length > 1 ? `${g.label} (${g.jobs.length} jobs)` : g.label }));
 }
 
-/** A name for the curve of a job that no other job in the plot has. */
-function jobLabel(job, jobs) {
+/** Most fields in the name of a curve. */
+const NAMED = 3;
+
+/** A name for the curve of a job that no other job in the plot has: with what differs among the jobs of the same name. */
+function jobLabel(job, jobs, fields) {
   const name = job.name ?? job.algorithm ?? 'job';
   const same = jobs.filter((other) => (other.name ?? other.algorithm ?? 'job') === name);
   if (same.length === 1) return name;
-  const seeds = new Set(same.map((other) => other.seed));
-  return seeds.size === same.length ? `${name}, seed ${job.seed}` : `${name}, ${job.id.slice(-6)}`;
+  const value = (of, field) => fields.byJob.get(of.id)?.get(field);
+  const differing = fields.differing.filter((field) => field !== 'name' && new Set(same.map((other) => value(other, field))).size > 1).slice(0, NAMED);
+  const text = (of) => differing.map((field) => `${field.split('.').at(-1)} ${value(of, field)}`).join(', ');
+  return same.some((other) => other !== job && text(other) === text(job)) ? `${name}, ${job.id.slice(-6)}` : `${name}, ${text(job)}`;
 }
 
 /** Several jobs compared. `first`: the view that is shown if the address names none. */

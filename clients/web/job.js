@@ -83,7 +83,7 @@ export function JobPage({ id, options }) {
     if (verb === 'delete') go('#/jobs');
     else job.reload();
   };
-  const actions = html`${commands(now).map(([verb, label]) => html`<${Action} command=${() => act(verb)}>${label}<//>`)}${'notes' in now && html`<button type="button" onClick=${() => setEditing(true)}>Edit</button>`}<a class="button" href=${link(['submit'], { from: id })}>Clone</a>`;
+  const actions = html`${commands(now).map(([verb, label]) => html`<${Action} command=${() => act(verb)}>${label}<//>`)}<button type="button" onClick=${() => setEditing(true)}>Edit</button>${now.kind !== 'sweep' && html`<a class="button" href=${link(['submit'], { from: id })}>Clone</a>`}`;
   return html`
     <p class="crumbs"><a href="#/jobs">Jobs</a></p>
     <${Title} text=${name} actions=${actions}>${name} <${State} state=${now.state} wanted=${now.wanted} /><//>

@@ -3,11 +3,12 @@
 import { html, useMemo, useRef, useState } from './htm-preact-3.1.1.js';
 import { all, get, post, remove } from './api.js';
 import { Curves } from './curves.js';
-import { ago, clock, duration, short } from './format.js';
+import { ago, clock, duration, number, short } from './format.js';
 import { link, go, setOptions } from './route.js';
 import { Action, ask, Bar, Card, Choice, Empty, ErrorBox, Field, Loading, run, State, Title, useLoad } from './ui.js';
 
 const STATES = ['queued', 'running', 'paused', 'succeeded', 'failed', 'cancelled'];
+const KINDS = ['train', 'evaluate', 'sweep'];
 const PAGE = 100;
 /** Jobs that are selected when the reader has selected none. */
 const FIRST = 6;
@@ -40,8 +41,6 @@ const share = (job) => (job.progress.steps ? Math.min(job.progress.step / job.pr
 export function useTimeLeft() {
   const seen = useRef(new Map());
   return (job) => {
-    const told = job.seconds_left ?? job.time_left ?? job.progress.seconds_left;
-    if (told != null) return parseFloat(told);
     if (job.state !== 'running') {
       seen.current.delete(job.id);
       return null;
@@ -57,32 +56,32 @@ export function useTimeLeft() {
 }
 
 /** Why a job does not run, or why it ended. */
-export function why(job, ahead) {
-  const told = job.waiting_reason ?? job.waiting?.reason ?? job.waiting;
-  if (job.state === 'queued') {
-    if (typeof told === 'string' && told) return told;
-    if (job.reason) return job.reason;
-    return ahead > 0 ? `waits behind ${ahead} ${ahead === 1 ? 'job' : 'jobs'}` : `waits for ${job.threads} free ${job.threads === 1 ? 'thread' : 'threads'} of the budget`;
-  }
+export function why(job) {
+  if (job.state === 'queued') return job.waiting?.reason ?? job.reason ?? '';
   if (job.unreadable) return job.unreadable.reason;
   return job.state === 'failed' || job.state === 'paused' || job.state === 'cancelled' ? (job.reason ?? '') : '';
 }
 
-/** Which jobs the reader sees: the newest first, filtered by the server as far as it can, the rest here. */
-function useJobs(state, pages) {
+/** How jobs are sorted: [option of the address, name]. */
+const ORDERS = [['', 'newest first'], ['created', 'oldest first'], ['name', 'name'], ['best:eval/mean_aoi', 'best mean AoI'], ['last:eval/mean_aoi', 'last mean AoI']];
+
+/** Which jobs the reader sees: filtered and sorted by the server, searched here. */
+function useJobs(state, kind, order, pages) {
   return useLoad(async (signal) => {
-    const filter = state ? `&state=${state}` : '';
+    const filter = `${state && `&state=${state}`}${kind && `&kind=${kind}`}${order && `&sort=${encodeURIComponent(order)}`}&metrics=eval/mean_aoi`;
     if (pages > 1) return { jobs: await all(`/v1/jobs?page_size=1000${filter}`, 'jobs', pages * PAGE, signal), more: false };
     const page = await get(`/v1/jobs?page_size=${PAGE}${filter}`, signal);
     return { jobs: page.jobs, more: page.next_page_token !== '' };
-  }, [state, pages], 2);
+  }, [state, kind, order, pages], 2);
 }
 
 export function JobsPage({ options }) {
   const state = STATES.includes(options.get('state')) ? options.get('state') : '';
+  const kind = KINDS.includes(options.get('kind')) ? options.get('kind') : '';
+  const order = ORDERS.some(([id]) => id === options.get('order')) ? options.get('order') : '';
   const search = options.get('q') ?? '';
   const [pages, setPages] = useState(1);
-  const list = useJobs(state, pages);
+  const list = useJobs(state, kind, order, pages);
   const timeLeft = useTimeLeft();
   const jobs = list.value?.jobs ?? [];
   const shown = useMemo(() => jobs.filter((job) => matches(job, search)), [list.value, search]);
@@ -98,7 +97,7 @@ export function JobsPage({ options }) {
   if (!list.value) {
     return html`<${Title} text="Jobs" actions=${actions} />${list.error ? html`<${ErrorBox} error=${list.error} retry=${list.reload} />` : html`<${Loading} what="the jobs" />`}`;
   }
-  if (!jobs.length && !state) return html`<${Title} text="Jobs" actions=${actions} /><${ErrorBox} error=${list.error} /><${NoJobs} />`;
+  if (!jobs.length && !state && !kind) return html`<${Title} text="Jobs" actions=${actions} /><${ErrorBox} error=${list.error} /><${NoJobs} />`;
   return html`
     <${Title} text="Jobs" actions=${actions} />
     <${ErrorBox} error=${list.error} retry=${list.reload} />
@@ -106,15 +105,17 @@ export function JobsPage({ options }) {
     <${Card}>
       <div class="controls">
         <${Field} label="State"><${Choice} value=${state} options=${[['', 'all'], ...STATES]} onChange=${(v) => setOptions({ state: v })} /><//>
+        <${Field} label="Kind"><${Choice} value=${kind} options=${[['', 'all'], ...KINDS]} onChange=${(v) => setOptions({ kind: v })} /><//>
+        <${Field} label="Order"><${Choice} value=${order} options=${ORDERS} onChange=${(v) => setOptions({ order: v })} /><//>
         <${Field} label="Search"><input type="search" value=${search} placeholder="name, algorithm, label=value, seed…" onInput=${(e) => setOptions({ q: e.target.value })} /><//>
         <span class="spacer"></span>
         <button type="button" onClick=${() => selectAll(true)}>Draw all</button><button type="button" onClick=${() => selectAll(false)}>Draw none</button>
         ${chosen && html`<button type="button" onClick=${() => setOptions({ jobs: '' })}>Draw the newest</button>`}
       </div>
       ${shown.length ? html`<div class="scroll"><table class="jobs stack">
-        <thead><tr><th scope="col"><span class="hidden">Draw</span></th><th scope="col">Job</th><th scope="col">State</th><th scope="col">Progress</th><th scope="col">Submitted</th><th scope="col"><span class="hidden">Commands</span></th></tr></thead>
-        <tbody>${shown.map((job) => html`<${Row} key=${job.id} job=${job} ahead=${ahead(job, jobs)} left=${timeLeft(job)} selected=${ids.has(job.id)} select=${select} reload=${list.reload} />`)}</tbody></table></div>`
-      : html`<${Empty} title="No job matches."><p><button type="button" onClick=${() => setOptions({ q: '', state: '' })}>Show all jobs</button></p><//>`}
+        <thead><tr><th scope="col"><span class="hidden">Draw</span></th><th scope="col">Job</th><th scope="col">State</th><th scope="col">Progress</th><th scope="col" class="number">Best mean AoI</th><th scope="col">Submitted</th><th scope="col"><span class="hidden">Commands</span></th></tr></thead>
+        <tbody>${shown.map((job) => html`<${Row} key=${job.id} job=${job} left=${timeLeft(job)} selected=${ids.has(job.id)} select=${select} reload=${list.reload} />`)}</tbody></table></div>`
+      : html`<${Empty} title="No job matches."><p><button type="button" onClick=${() => setOptions({ q: '', state: '', kind: '' })}>Show all jobs</button></p><//>`}
       ${list.value.more && html`<p class="more"><button type="button" onClick=${() => setPages(pages + 9)}>Show older jobs</button></p>`}
     <//>`;
 }
@@ -133,15 +134,9 @@ function matches(job, search) {
   return words.every((word) => text.includes(word));
 }
 
-/** Number of waiting jobs that start before a job. */
-function ahead(job, jobs) {
-  if (job.state !== 'queued') return 0;
-  return jobs.filter((other) => other.state === 'queued' && (other.priority > job.priority || (other.priority === job.priority && other.id < job.id))).length;
-}
-
-function Row({ job, ahead: before, left, selected, select, reload }) {
+function Row({ job, left, selected, select, reload }) {
   const name = job.name ?? `job ${job.id.slice(-6)}`;
-  const reason = why(job, before);
+  const reason = why(job);
   const about = [job.kind && job.kind !== 'train' ? job.kind : null, job.algorithm, job.preset, job.seed == null ? null : `seed ${job.seed}`].filter(Boolean).join(' · ');
   return html`<tr>
     <td class="pick"><input type="checkbox" checked=${selected} onChange=${(e) => select(job.id, e.target.checked)} aria-label=${`Draw ${name}`} /></td>
@@ -150,8 +145,9 @@ function Row({ job, ahead: before, left, selected, select, reload }) {
     <td data-name="State"><${State} state=${job.state} wanted=${job.wanted} />${reason && html`<div class="faint small reason">${reason}</div>`}</td>
     <td data-name="Progress" class="progress"><${Bar} value=${share(job)} label=${`Progress of ${name}`} />
       <div class="faint small">${Math.floor(100 * share(job))} % of ${short(job.progress.steps)} steps${left != null ? html`, <strong>${duration(left)} left</strong>` : ''}${job.policy ? html`, <a href=${link(['policies', job.policy.split(':')[0]])}>${job.policy}</a>` : ''}</div></td>
+    <td class="number" data-name="Best mean AoI">${number(job.metrics['eval/mean_aoi']?.best)}</td>
     <td data-name="Submitted" title=${clock(job.created_at)} class="nowrap">${ago(job.created_at)}</td>
     <td class="row-actions">${commands(job).map(([verb, label]) => html`<${Action} class="small" command=${() => command(job, verb).then(reload)} aria-label=${`${label} ${name}`}>${label}<//>`)}
-      <button type="button" class="small" onClick=${() => go(link(['submit'], { from: job.id }))} aria-label=${`Clone ${name}`}>Clone</button></td>
+      ${job.kind !== 'sweep' && html`<button type="button" class="small" onClick=${() => go(link(['submit'], { from: job.id }))} aria-label=${`Clone ${name}`}>Clone</button>`}</td>
   </tr>`;
 }

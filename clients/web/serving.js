@@ -1,7 +1,7 @@
 // Who is served: sessions, hosted environments, and the load of the server.
 
-import { html, useRef } from './htm-preact-3.1.1.js';
-import { all, remove, text } from './api.js';
+import { html, useRef, useState } from './htm-preact-3.1.1.js';
+import { all, get, put, remove, text } from './api.js';
 import { ago, bytes, clock, number } from './format.js';
 import { link } from './route.js';
 import { Action, ask, Card, Empty, Loaded, run, Title, useLoad } from './ui.js';
@@ -18,7 +18,7 @@ const sum = (all, name, filter = () => true) => all.filter(([n, labels]) => n ==
 const isAct = (labels) => /grpc_method="(Act|ActBatch|ActStream)"|route="\/v1\/act"|grpc_method="ModelInfer"|route="\/v2\/models\/[^"]*\/infer"/.test(labels);
 
 async function loadServing(signal, before) {
-  const [metrics, sessions, environments] = await Promise.all([text('/metrics'), all('/v1/sessions?page_size=200', 'sessions', 200, signal), all('/v1/environments?page_size=200', 'environments', 200, signal)]);
+  const [metrics, budget, sessions, environments] = await Promise.all([text('/metrics'), get('/v1/server/budget', signal), all('/v1/sessions?page_size=200', 'sessions', 200, signal), all('/v1/environments?page_size=200', 'environments', 200, signal)]);
   const found = samples(metrics);
   const now = {
     at: Date.now(),
@@ -32,7 +32,7 @@ async function loadServing(signal, before) {
   const rate = (name) => (old ? Math.max(0, ((now[name] - old[name]) * 1000) / (now.at - old.at)) : null);
   const recent = old && now.handled > old.handled ? (now.seconds - old.seconds) / (now.handled - old.handled) : now.handled ? now.seconds / now.handled : null;
   before.current = now;
-  return { found, sessions, environments, now, actRate: rate('acts'), requestRate: rate('requests'), actTime: recent };
+  return { found, budget, sessions, environments, now, actRate: rate('acts'), requestRate: rate('requests'), actTime: recent };
 }
 
 const Tile = ({ name, value, text: about }) => html`<div class="tile"><div class="tile-name">${name}</div><div class="tile-value">${value}</div>${about && html`<div class="faint small">${about}</div>`}</div>`;
@@ -43,7 +43,6 @@ export function ServingPage() {
   return html`<${Title} text="Serving" />
     <${Loaded} of=${serving} what="the load">${(s) => {
       const value = (name) => sum(s.found, name);
-      const [busy, budget] = [value('qedgix_training_threads_busy'), value('qedgix_training_threads')];
       return html`
         <div class="tiles">
           <${Tile} name="Act per second" value=${s.actRate == null ? '…' : number(s.actRate, 3)} text=${`${number(s.now.acts)} since the start`} />
@@ -52,7 +51,7 @@ export function ServingPage() {
           <${Tile} name="Sessions" value=${number(value('qedgix_sessions'))} text=${bytes(value('qedgix_session_memory_bytes'))} />
           <${Tile} name="Environments" value=${number(value('qedgix_environments'))} text="hosted" />
           <${Tile} name="Queue of the engine" value=${number(value('qedgix_engine_queue_depth'))} text="fleets that wait" />
-          <${Tile} name="Training threads" value=${`${busy} of ${budget}`} text="of the CPU budget" />
+          <${Tile} name="Training threads" value=${`${s.budget.threads_busy} of ${s.budget.threads}`} text=${html`<${Budget} threads=${s.budget.threads} reload=${serving.reload} />`} />
           <${Tile} name="Policies in memory" value=${bytes(value('qedgix_policy_memory_bytes'))} text=${`${number(value('qedgix_policy_versions'))} versions`} />
           <${Tile} name="Connections" value=${number(value('qedgix_connections'))} text=${`${bytes(value('qedgix_inflight_bytes'))} in flight`} />
         </div>
@@ -66,6 +65,18 @@ export function ServingPage() {
             <td class="row-actions"><${Action} class="small" command=${() => close('environment', `/v1/environments/${encodeURIComponent(e.environment_id)}`, e.environment_id).then(serving.reload)}>Delete<//></td></tr>`)}</tbody></table></div>`
         : html`<${Empty} title="No hosted environment."><p>External learners make them with <code>POST /v1/environments</code>; the <a href="#/player">player</a> uses them, too.</p><//>`}<//>`;
     }}<//>`;
+}
+
+/** Changes the CPU budget of training. */
+function Budget({ threads, reload }) {
+  const [value, set] = useState(null);
+  if (value == null) return html`CPU budget <button type="button" class="small" onClick=${() => set(String(threads))}>Change</button>`;
+  const save = async (event) => {
+    event.preventDefault();
+    if (await run(() => put('/v1/server/budget', { threads: Number(value) }), `The CPU budget is ${value}, until the server stops.`)) set(null);
+    reload();
+  };
+  return html`<form class="budget" onSubmit=${save}><input type="number" min="1" max="4096" required value=${value} aria-label="Threads of the CPU budget" onInput=${(e) => set(e.target.value)} /><button class="small">Set</button></form>`;
 }
 
 async function close(what, path, id) {

@@ -131,6 +131,56 @@ const tests = {
     if (pictures) await page.getByRole('button', { name: 'Show all jobs' }).click();
   },
 
+  async 'a waiting job says why, is edited, and is found by kind, label and best value'() {
+    const long = await main.submit('web-first', { steps: 50_000_000 });
+    await main.reaches(long, 'running');
+    const waiting = await main.submit('web-waits');
+    const page = await open(`${main.url}/#/jobs/${waiting}`);
+    await state(page, 'queued');
+    await page.getByText('Waiting:').waitFor();
+    await page.getByRole('button', { name: 'Edit' }).click();
+    const dialog = page.getByRole('dialog');
+    await dialog.getByLabel('Labels').fill('team=web');
+    await dialog.getByLabel('Notes').fill('of a test');
+    await dialog.getByRole('button', { name: 'Save' }).click();
+    await page.locator('.label', { hasText: 'team=web' }).waitFor();
+    await page.getByText('of a test').waitFor();
+    await main.call('POST', `/v1/jobs/${waiting}/cancel`);
+    await main.call('POST', `/v1/jobs/${long}/cancel`);
+    await page.goto(`${main.url}/#/jobs?q=team=web&kind=train`);
+    await page.getByRole('link', { name: 'web-waits' }).waitFor();
+    await page.getByLabel('Search').fill('web-seeds');
+    await page.getByLabel('Order').selectOption('best:eval/mean_aoi');
+    await until('jobs are sorted by their best value', async () => {
+      const best = (await page.locator('td[data-name="Best mean AoI"]').allTextContents()).map(Number);
+      return best.length === 3 && best.every((value, i) => i === 0 || value >= best[i - 1]);
+    });
+  },
+
+  async 'policies are evaluated by a job, and its report compares them'() {
+    const page = await open(`${main.url}/#/submit?kind=evaluate&policies=qedgix,sweep`);
+    await page.getByLabel('Number of layouts').fill('8');
+    await page.getByRole('button', { name: 'Submit' }).click();
+    await state(page, 'succeeded');
+    await page.locator('table.report tbody tr').nth(1).waitFor();
+    await page.getByText('Differences on the same layouts').waitFor();
+  },
+
+  async 'a sweep compares its jobs'() {
+    const page = await open(`${main.url}/#/submit?kind=sweep`);
+    await page.getByLabel('Name', { exact: false }).first().fill('web-sweep');
+    await page.getByLabel('Algorithm').selectOption('qmix');
+    await page.getByLabel('What varies').fill('training.learning_rate: 0.0003, 0.003');
+    for (const [name, value] of [['steps', '1500'], ['eval_every', '500'], ['eval_episodes', '8']]) {
+      await page.getByLabel(`training.${name}`, { exact: true }).fill(value);
+    }
+    await page.getByRole('button', { name: 'Submit' }).click();
+    await state(page, 'succeeded');
+    await until('a line per job', async () => (await page.locator('.parallel polyline').count()) === 2);
+    await page.getByRole('button', { name: 'Table' }).click();
+    await page.locator('.results th', { hasText: 'training.learning_rate' }).waitFor();
+  },
+
   async 'a version is promoted, and the history shows it'() {
     await until('three versions are published', async () => (await main.call('GET', '/v1/policies/web-seeds')).version_count === 3);
     const page = await open(`${main.url}/#/policies/web-seeds`);

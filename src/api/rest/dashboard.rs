@@ -3,7 +3,6 @@
 
 use std::sync::{Arc, LazyLock};
 
-use axum::extract::State;
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
@@ -145,7 +144,7 @@ async fn index(headers: HeaderMap, Extension(description): Extension<Description
         BadRequest, NotFound
     )
 )]
-async fn file(State(_): State<Arc<App>>, Path(name): Path<String>, headers: HeaderMap) -> Result<Response, Error> {
+async fn file(Path(name): Path<String>, headers: HeaderMap) -> Result<Response, Error> {
     let file = find(&name).ok_or_else(|| Error::not_found("file", name))?;
     Ok(file.respond(&headers))
 }
