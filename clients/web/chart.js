@@ -70,7 +70,7 @@ function options(curves, { label, height, width, xName, head }) {
     scales: { x: { time: false } },
     axes: [
       { ...axis, label: xName, values: (_, all) => all.map((v) => short(v)), size: 34 },
-      { ...axis, label: label, size: 58, values: (_, all) => all.map((v) => (Math.abs(v) >= 1e4 ? short(v) : number(v, 3).replace(/(\.\d*?)0+$/, '$1').replace(/\.$/, ''))) },
+      { ...axis, label: label, size: 58, values: (_, all, i, space, step) => all.map((v) => (v == null ? null : step >= 1000 ? short(v) : v.toFixed(places(step)))) },
     ],
     cursor: { y: false, focus: { prox: 24 }, drag: { x: true, y: false } },
     focus: { alpha: 0.35 },
@@ -78,6 +78,9 @@ function options(curves, { label, height, width, xName, head }) {
     hooks: { draw: [(u) => drawHead(u, head.current, ink)] },
   };
 }
+
+/** Decimal places that tell marks apart which are `step` apart. */
+const places = (step) => Math.min(Math.max(0, Math.ceil(-Math.log10(step) - 1e-9)), 9);
 
 function drawHead(u, x, ink) {
   if (x == null) return;
