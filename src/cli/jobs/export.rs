@@ -63,9 +63,27 @@ pub(super) async fn run(client: &Client, args: ExportArgs, print_json: bool) -> 
     Ok(())
 }
 
-/// What to submit to run the same job again.
+/// What to submit to run the same job again. What it came after is left out, because that has ended.
 fn config(job: &Value) -> Value {
-    let fields = ["kind", "name", "labels", "threads", "priority", "algorithm", "preset", "environment", "training", "seed"];
+    let fields = [
+        "kind",
+        "name",
+        "labels",
+        "notes",
+        "threads",
+        "priority",
+        "max_attempts",
+        "timeout",
+        "backoff",
+        "stop",
+        "algorithm",
+        "preset",
+        "environment",
+        "training",
+        "evaluation",
+        "sweep",
+        "seed",
+    ];
     let given = fields.iter().filter(|field| !job[**field].is_null());
     given.map(|field| ((*field).to_owned(), job[*field].clone())).collect::<Map<_, _>>().into()
 }
