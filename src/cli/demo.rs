@@ -28,7 +28,7 @@ pub struct DemoArgs {
     #[arg(long)]
     keep: bool,
     /// Environment steps of the training job
-    #[arg(long, env = "QEDGIX_STEPS", default_value_t = 100_000, value_name = "STEPS", value_parser = count)]
+    #[arg(long, env = "QEDGIX_STEPS", default_value_t = 160_000, value_name = "STEPS", value_parser = count)]
     steps: u64,
     /// Number of layouts of eval-v1 on which policies are compared
     #[arg(long, env = "QEDGIX_EPISODES", default_value_t = 32, value_name = "LAYOUTS")]
@@ -96,7 +96,11 @@ async fn run_in(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
         "algorithm": Algorithm::Qmix,
         "preset": "practical",
         "environment": {},
-        "training": {"steps": args.steps, "eval_every": (args.steps / 12).max(1)},
+        "training": {
+            "steps": args.steps,
+            "eval_every": (args.steps / 12).max(1),
+            "epsilon_anneal": (args.steps / 3).max(1),
+        },
         "threads": all_cores(),
     });
     outln!("\n2. A training job over REST: POST /v1/jobs {job}")?;

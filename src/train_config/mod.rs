@@ -121,21 +121,24 @@ pub struct Training {
     /// Whether replayed episodes are rotated and mirrored at random, by the eight symmetries of the square.
     #[serde(default)]
     pub augment: bool,
-    /// Baseline that flies some of the UAVs while episodes are collected, so that they show the policy what the rule does. Absent: the
-    /// policy explores by random headings only, as in the paper.
+    /// Baseline that flies some of the UAVs while episodes are collected, so that they show the policy what the rule does. Absent, or `none`
+    /// where a preset has a teacher: the policy explores by random headings only, as in the paper.
     #[serde(default)]
     pub teacher: Option<String>,
     /// With a teacher: smallest probability that it flies a UAV for an episode. The probability is epsilon while that is larger.
     #[serde(default = "default_teacher_share")]
     pub teacher_share: f64,
     /// Ranges from which environments are drawn, one per iteration. The policy then flies fleets of many sizes.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "vary::from_object")]
     pub vary: Vary,
     /// Environment steps between evaluations.
     pub eval_every: u64,
     /// Layouts per evaluation.
     pub eval_episodes: usize,
 }
+
+/// The value of `teacher` that removes the teacher of a preset.
+const NO_TEACHER: &str = "none";
 
 /// The resolved configuration of a training run. With the code and the kind of processor, it fixes every metric and weight bit for
 /// bit.
@@ -215,6 +218,8 @@ impl TrainConfig {
             Preset::Practical => {
                 training.observation = ObservationKind::Set;
                 training.identity = Identity::Phase;
+                training.memory = Memory::Shared;
+                training.teacher = Some("sweep-shared".to_owned());
                 training.self_position = true;
                 training.learning_rate = 1e-3;
                 training.learning_rate_decay = 0.1;
@@ -248,6 +253,9 @@ impl TrainConfig {
         seed: u64,
     ) -> Result<Self, Invalid> {
         let mut config = Self { seed, ..Self::preset(algorithm, preset).with_fields(environment, training)? };
+        if config.training.teacher.as_deref() == Some(NO_TEACHER) {
+            config.training.teacher = None;
+        }
         if config.environment.reward_scale.is_none() {
             let env = &config.environment;
             let scale = if preset == Preset::Authors { env.users as f64 } else { env.effective_reward_scale() };
@@ -526,6 +534,6 @@ mod tests {
             }
             checked += 1;
         }
-        assert_eq!(checked, 18, "rows of the table with the name of a field");
+        assert_eq!(checked, 20, "rows of the table with the name of a field");
     }
 }

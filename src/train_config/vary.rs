@@ -2,7 +2,8 @@
 //! fly fleets of many sizes.
 
 use rand::{Rng, RngExt};
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, de::Error};
+use serde_json::{Map, Value};
 
 use crate::env::{EnvConfig, Layout, Start};
 use crate::invalid::Invalid;
@@ -24,6 +25,12 @@ pub struct Vary {
     pub detection_range: Option<[f64; 2]>,
     /// Range within which UAVs exchange messages. A drawn value below d counts as d: radios reach at least as far as cameras.
     pub communication_range: Option<[f64; 2]>,
+}
+
+/// Reads an object; a list of the fields' values, which serde would accept as well, is refused.
+pub(super) fn from_object<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vary, D::Error> {
+    let fields = Map::<String, Value>::deserialize(deserializer)?;
+    Vary::deserialize(Value::Object(fields)).map_err(D::Error::custom)
 }
 
 impl Vary {

@@ -184,7 +184,7 @@ fn training() -> Map<String, Value> {
         (
             "teacher",
             json!({"type": ["string", "null"]}),
-            "Baseline that flies some of the UAVs while episodes are collected; absent: none.",
+            "Baseline that flies some of the UAVs while episodes are collected; null or `none`: no teacher.",
         ),
         ("teacher_share", number(0.0, 1.0), "Smallest probability that the teacher flies a UAV for an episode."),
         ("vary", vary(), "Ranges [lowest, highest] from which environments are drawn, one per iteration; absent: not drawn."),
