@@ -7,7 +7,7 @@ use jiff::Timestamp;
 use qedgix::checkpoint::{Checkpoint, digest};
 use qedgix::service::policies::{IndexEntry, index};
 use qedgix::store::{
-    CheckpointKind, EndedAttempt, JobId, JobKind, JobSpec, NewCheckpoint, NewJob, Store, SubmitResult, WorkerResult,
+    CheckpointKind, EndedAttempt, JobId, JobSpec, NewCheckpoint, NewJob, Store, SubmitResult, WorkerResult,
 };
 use qedgix::train_config::{Algorithm, Preset};
 use qedgix::wire::v1;
