@@ -7,6 +7,7 @@ mod browser;
 pub mod convert;
 mod errors;
 pub mod grpc;
+pub(crate) mod json;
 mod media_type;
 mod oip;
 mod request_log;

@@ -42,7 +42,9 @@ mod tests {
         assert_eq!(backfill_limit(4, &[3], 4), 0);
         // If the job with two threads ends first, the head fits beside the other, and nothing else does.
         assert_eq!(backfill_limit(4, &[2, 1], 3), 0);
-        assert_eq!(backfill_limit(8, &[4, 1], 4), 3);
+        assert_eq!(backfill_limit(8, &[4, 1], 4), 0);
+        // Whatever ends first, the head and one thread more fit beside the other job.
+        assert_eq!(backfill_limit(8, &[5, 1], 4), 2);
         assert_eq!(backfill_limit(8, &[4, 2], 6), 0);
         // Budgets can have shrunk below what runs.
         assert_eq!(backfill_limit(2, &[4], 2), 0);
@@ -133,7 +135,13 @@ mod tests {
                 }
                 let before = model.clone();
                 let head = before.queue.first().copied();
-                for job in model.start(&jobs, budget, now, true) {
+                let begun = model.start(&jobs, budget, now, true);
+                // A job that comes before the head, of a higher priority, may take its place.
+                let before_head = |&job: &usize, head: usize| (-jobs[job].priority, job) < (-jobs[head].priority, head);
+                if promise.is_some_and(|(head, _)| begun.iter().any(|job| before_head(job, head))) {
+                    promise = None;
+                }
+                for job in begun {
                     started[job] = Some(now);
                     // Nobody of a higher priority, or earlier with the same, waits while it would have fitted.
                     let overtaken = model.queue.iter().filter(|&&i| (-jobs[i].priority, i) < (-jobs[job].priority, job));

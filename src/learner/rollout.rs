@@ -173,6 +173,7 @@ fn place<T: Copy>(all: &mut [T], now: &[T], episodes: usize, slot: usize) {
 mod tests {
     use super::*;
     use crate::env::{Layout, Start};
+    use crate::policy::Memory;
     use crate::train_config::{Algorithm, Preset};
 
     fn config(envs: usize, user_speed: f64) -> TrainConfig {
@@ -181,6 +182,8 @@ mod tests {
         config.environment.user_speed = user_speed;
         config.training.envs = envs;
         config.training.shaping = false;
+        config.training.memory = Memory::None;
+        config.training.teacher = None;
         config
     }
 

@@ -6,9 +6,7 @@ use bytes::Bytes;
 use jiff::Timestamp;
 use qedgix::checkpoint::{Checkpoint, digest};
 use qedgix::service::policies::{IndexEntry, index};
-use qedgix::store::{
-    CheckpointKind, EndedAttempt, JobId, JobSpec, NewCheckpoint, NewJob, Store, SubmitResult, WorkerResult,
-};
+use qedgix::store::{CheckpointKind, EndedAttempt, JobId, JobSpec, NewCheckpoint, NewJob, Store, SubmitResult, WorkerResult};
 use qedgix::train_config::{Algorithm, Preset};
 use qedgix::wire::v1;
 use reqwest::{Client, Method, Response, StatusCode};

@@ -135,6 +135,7 @@ impl Policies {
 struct Reference {
     policy: Arc<LearnedPolicy>,
     digest: String,
+    step: u64,
     memory: Vec<f32>,
 }
 
@@ -143,7 +144,7 @@ impl Reference {
         let policy = policies.by_digest[digest].clone();
         let mut memory = vec![0.0; policy.memory_len(uavs, users)];
         policy.start(uavs, users, seed, &mut memory);
-        Self { policy, digest: digest.to_owned(), memory }
+        Self { policy, digest: digest.to_owned(), step: 0, memory }
     }
 
     /// The expected heading and Q-values of every UAV in the next slot.
@@ -161,11 +162,12 @@ impl Reference {
             env: self.policy.env(),
             graph: &slot,
             profile: None,
-            step: 0,
+            step: self.step,
             memory,
             headings: headings_out,
             q_values,
         }]);
+        self.step += 1;
         let decisions = headings.iter().zip(values.chunks_exact(actions)).map(|(&heading, q)| (u32::from(heading), q.to_vec()));
         ids.into_iter().zip(decisions).collect()
     }

@@ -5,7 +5,7 @@ use std::time::Duration;
 use serde::de::DeserializeOwned;
 
 use crate::api::convert::flight::FlightFields;
-use crate::api::rest::extract::parse;
+use crate::api::json::parse;
 use crate::api::rest::flight::{Constraints, Frame, World, constraints};
 use crate::invalid::Invalid;
 use crate::service::Error;

@@ -12,13 +12,13 @@ use utoipa_axum::routes;
 
 use super::extract;
 use super::flight::{self, Constraints, Frame, Overruled, World};
-use super::json;
 use super::openapi::{BadBody, Conflict, Draining, NotFound};
 use super::policies::PolicyRef;
 use super::scene_graph::{Graph, Scene};
 use super::schemas::{self, Base64, Seconds};
 use crate::api::convert::request::ActFields;
 use crate::api::convert::response::{self, Wanted, actions};
+use crate::api::json;
 use crate::env::Point;
 use crate::invalid::Invalid;
 use crate::service::keys::Caller;

@@ -17,12 +17,12 @@ use utoipa_axum::routes;
 
 use super::config_schemas::schema;
 use super::extract::{self, Path, Query};
-use super::json::{self, objects_only};
 use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
 use super::policies::Paging;
 use super::scene_graph::{Graph, Scene};
 use super::schemas::Seconds;
 use crate::api::convert::environments::{create_environment, is_large};
+use crate::api::json::{self, objects_only};
 use crate::api::offload;
 use crate::env::{self, EnvConfig};
 use crate::service::keys::Caller;

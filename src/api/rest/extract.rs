@@ -10,8 +10,8 @@ use bytes::Bytes;
 use futures::StreamExt;
 use serde::de::DeserializeOwned;
 
-use super::json::ObjectOnly;
 use crate::api::body::Exchange;
+pub use crate::api::json::parse;
 pub use crate::api::media_type::{media_type, unsupported};
 use crate::api::offload;
 use crate::invalid::Invalid;
@@ -120,25 +120,6 @@ async fn discard(mut parts: BodyDataStream) {
             None => return,
         }
     }
-}
-
-/// Reads a JSON document.
-///
-/// # Errors
-/// [`Error::Invalid`] where the body is not JSON or does not match the schema of `T`.
-pub fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, Error> {
-    let mut deserializer = serde_json::Deserializer::from_slice(body);
-    let document = serde_path_to_error::deserialize(ObjectOnly(&mut deserializer)).map_err(|e| {
-        let path = e.path().to_string();
-        let e = e.into_inner();
-        if e.is_data() {
-            Invalid::from_parser(if path == "." { "" } else { &path }, &e)
-        } else {
-            Invalid::new("body", format!("{} bytes that are not JSON ({e})", body.len()), "a JSON document")
-        }
-    })?;
-    deserializer.end().map_err(|e| Invalid::new("body", format!("more than one document ({e})"), "one JSON document"))?;
-    Ok(document)
 }
 
 /// The parameters of a path.

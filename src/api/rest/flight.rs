@@ -3,8 +3,8 @@
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::json::{self, objects_only};
 use crate::api::convert::flight::{self, FlightFields};
+use crate::api::json::{self, objects_only};
 use crate::env::Boundary;
 use crate::invalid::Invalid;
 use crate::serving::{Constraint, ConstraintOptions};

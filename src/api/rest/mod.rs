@@ -9,7 +9,6 @@ mod events;
 pub mod extract;
 pub mod flight;
 mod jobs;
-mod json;
 mod middleware;
 mod openapi;
 mod ops;

@@ -12,9 +12,9 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::extract::{Json as Body, Path};
-use super::json;
 use super::openapi::{BadBody, BadRequest, Description, Draining, Fault, NotFound};
 use super::schemas;
+use crate::api::json;
 use crate::service::{App, Error, operations};
 
 /// The routes.

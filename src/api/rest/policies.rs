@@ -14,10 +14,10 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::extract::{self, MaxBody, Path, Query};
-use super::json;
 use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
 use super::schemas;
 use crate::api::convert::response::environment;
+use crate::api::json;
 use crate::env::{Boundary, EnvConfig};
 use crate::policy::RequiredInput;
 use crate::service::keys::Caller;
@@ -416,7 +416,7 @@ async fn upload(
             policies::CheckpointSource::Bytes(extract::read(request, MAX_CHECKPOINT.max(limit)).await?.into(), permit)
         }
         Some(kind) if kind == "application/json" => {
-            let CheckpointOfJob { checkpoint_id } = extract::parse(&extract::read(request, limit).await?)?;
+            let CheckpointOfJob { checkpoint_id } = json::parse(&extract::read(request, limit).await?)?;
             policies::CheckpointSource::Job(checkpoint_id)
         }
         kind => return Err(extract::unsupported(kind, "application/octet-stream, or application/json with a checkpoint_id")),

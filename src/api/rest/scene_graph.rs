@@ -7,8 +7,8 @@ use utoipa::openapi::RefOr;
 use utoipa::openapi::schema::Schema;
 
 use super::config_schemas::schema;
-use super::json::objects_only;
 use crate::api::convert::scene_graph::{nodes, uavs, users};
+use crate::api::json::objects_only;
 use crate::env::Point;
 use crate::invalid::Invalid;
 use crate::serving::{self, CopyObservation, FleetInput};

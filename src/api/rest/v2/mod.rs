@@ -14,10 +14,11 @@ use axum::{Json, Router};
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
-use super::extract::{Path, Raw, parse};
-use super::json::object;
+use super::extract::{Path, Raw};
 use crate::api::convert::tensors::TensorShape;
 use crate::api::errors::Problem;
+use crate::api::json::object;
+use crate::api::json::parse;
 use crate::api::oip;
 use crate::service::keys::Caller;
 use crate::service::{App, Error, act};

@@ -8,9 +8,9 @@ use serde_json::{Map, Value};
 use super::HEADER_LENGTH;
 use super::values::Values;
 use crate::api::convert::tensors::{Data, Tensor};
+use crate::api::json;
+use crate::api::json::parse;
 use crate::api::oip::{InferRequest, Parameter, check_tensor_parameters};
-use crate::api::rest::extract::parse;
-use crate::api::rest::json;
 use crate::invalid::Invalid;
 use crate::service::Error;
 

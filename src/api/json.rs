@@ -5,9 +5,12 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::marker::PhantomData;
 
-use serde::de::{Deserializer, Error, MapAccess, SeqAccess, Unexpected, Visitor};
+use serde::de::{DeserializeOwned, Deserializer, Error, MapAccess, SeqAccess, Unexpected, Visitor};
 use serde::{Deserialize, forward_to_deserialize_any};
 use serde_json::{Map, Value};
+
+use crate::invalid::Invalid;
+use crate::service;
 
 /// A deserializer that reads structs from objects only, not from arrays of their fields.
 pub(super) struct ObjectOnly<D>(pub(super) D);
@@ -36,7 +39,7 @@ impl<'de, D: Deserializer<'de>> Deserializer<'de> for ObjectOnly<D> {
 /// `#[serde(remote = "Self")]`. Write `Serialize +` for types that also derive `Serialize`.
 macro_rules! objects_only {
     (Serialize + $($type:ty),+) => {
-        crate::api::rest::json::objects_only!($($type),+);
+        crate::api::json::objects_only!($($type),+);
         $(impl serde::Serialize for $type {
             fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
                 <$type>::serialize(self, serializer)
@@ -46,7 +49,7 @@ macro_rules! objects_only {
     ($($type:ty),+) => {
         $(impl<'de> serde::Deserialize<'de> for $type {
             fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-                <$type>::deserialize(crate::api::rest::json::ObjectOnly(deserializer))
+                <$type>::deserialize(crate::api::json::ObjectOnly(deserializer))
             }
         })+
     };
@@ -233,6 +236,25 @@ where
     D: Deserializer<'de>,
 {
     Option::deserialize(deserializer).map(|object| Some(object.map(|Object(entries)| entries)))
+}
+
+/// Reads a JSON document.
+///
+/// # Errors
+/// [`service::Error::Invalid`] where the body is not JSON or does not match the schema of `T`.
+pub fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, service::Error> {
+    let mut deserializer = serde_json::Deserializer::from_slice(body);
+    let document = serde_path_to_error::deserialize(ObjectOnly(&mut deserializer)).map_err(|e| {
+        let path = e.path().to_string();
+        let e = e.into_inner();
+        if e.is_data() {
+            Invalid::from_parser(if path == "." { "" } else { &path }, &e)
+        } else {
+            Invalid::new("body", format!("{} bytes that are not JSON ({e})", body.len()), "a JSON document")
+        }
+    })?;
+    deserializer.end().map_err(|e| Invalid::new("body", format!("more than one document ({e})"), "one JSON document"))?;
+    Ok(document)
 }
 
 #[cfg(test)]

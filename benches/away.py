@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Compares policies away from the environment that they were trained in: other fleets, ranges, horizons, and disturbances.
 
-    experiments/away.py --qedgix target/release/qedgix --policy qedgix --reference sweep-shared
+    benches/away.py --qedgix target/release/qedgix --policy qedgix --reference sweep-shared
 
 Prints one row per condition: the mean AoI of every policy, and the paired difference of the first policy from the reference with
 its 95 % interval, also in percent of the reference's mean AoI. Every row is one call of `qedgix evaluate`."""
