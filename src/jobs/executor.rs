@@ -129,7 +129,7 @@ mod tests {
         assert_eq!(log.text_after(4, false), ("two\n".into(), 8));
         assert_eq!(log.text_after(8, false), (String::new(), 8));
         assert_eq!(log.text_after(8, true), ("three".into(), 13));
-        log.push(&[b'x'; LogTail::LIMIT]);
+        log.push(&vec![b'x'; LogTail::LIMIT]);
         log.push(b"\nlast\n");
         assert_eq!(log.text_after(8, false).0, "last\n");
     }

@@ -12,6 +12,7 @@ use tonic::Code;
 use super::harness::{Server, Worker, expect, named, signed, tiny, with};
 use super::process::PROGRAM;
 
+#[allow(clippy::unnecessary_wraps, reason = "the form that the harness takes")]
 fn processes() -> Option<Arc<dyn Executor>> {
     Some(Arc::new(LocalProcess { program: PROGRAM.into() }))
 }

@@ -512,7 +512,7 @@ async fn coordinates_in_other_units_need_a_frame() {
         (v1::Frame { side: Some(3000.0), rotation_deg: 1e9, ..Default::default() }, "frame.rotation_deg"),
         (v1::Frame { side: Some(30.0), ..Default::default() }, "frame"),
     ] {
-        let (code, _, found) = refused(client.act(framed(frame.clone())).await);
+        let (code, _, found) = refused(client.act(framed(frame)).await);
         assert_eq!((code, found.as_str()), (Code::InvalidArgument, field), "{frame:?}");
     }
     let world = |world: v1::World| v1::OpenSessionRequest { world: Some(world), ..open("sweep", "s") };

@@ -158,7 +158,7 @@ async fn a_deletion_among_requests_is_before_or_after_each() {
                 }
             }
         };
-        with_timeout(async { tokio::join!(fly(one), fly(two), delete) }).await;
+        Box::pin(with_timeout(async { tokio::join!(fly(one), fly(two), delete) })).await;
         assert_eq!(rest.get(&format!("/v1/policies/{policy}")).await.0, StatusCode::NOT_FOUND);
     }
 }

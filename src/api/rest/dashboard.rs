@@ -123,12 +123,11 @@ const BY_ACCEPT: (HeaderName, HeaderValue) = (header::VARY, HeaderValue::from_st
 )]
 async fn index(headers: HeaderMap, Extension(description): Extension<Description>) -> Response {
     let mut accepted = headers.get_all(header::ACCEPT).iter().filter_map(|kinds| kinds.to_str().ok());
-    match find("index.html").filter(|_| accepted.any(|kinds| kinds.contains("text/html"))) {
-        Some(page) => ([BY_ACCEPT], page.respond(&headers)).into_response(),
-        None => {
-            let index = Index { name: "qedgix", version: env!("CARGO_PKG_VERSION"), endpoints: description.operations };
-            ([BY_ACCEPT], Json(index)).into_response()
-        }
+    if let Some(page) = find("index.html").filter(|_| accepted.any(|kinds| kinds.contains("text/html"))) {
+        ([BY_ACCEPT], page.respond(&headers)).into_response()
+    } else {
+        let index = Index { name: "qedgix", version: env!("CARGO_PKG_VERSION"), endpoints: description.operations };
+        ([BY_ACCEPT], Json(index)).into_response()
     }
 }
 

@@ -122,7 +122,7 @@ async fn curve(client: &Client, id: &str, metric: &str) -> anyhow::Result<Vec<[f
         let page = [("name", Some(metric.to_owned())), ("page_size", Some("100000".to_owned())), ("page_token", Some(token))];
         let page = client.get(&format!("/v1/jobs/{id}/metrics{}", query(&page))).await?;
         points.extend(items(&page, "metrics").filter_map(|row| Some([row["step"].as_u64()? as f64, row["value"].as_f64()?])));
-        token = page["next_page_token"].as_str().unwrap_or_default().to_owned();
+        token = String::from(page["next_page_token"].as_str().unwrap_or_default());
         if token.is_empty() {
             return Ok(points);
         }

@@ -119,7 +119,7 @@ pub async fn list(
         request.push(("page_token", Some(token)));
         let mut page = client.get(&format!("/v1/jobs{}", query(&request))).await?;
         jobs.extend(page["jobs"].as_array_mut().map(std::mem::take).unwrap_or_default());
-        token = page["next_page_token"].as_str().unwrap_or_default().to_owned();
+        token = String::from(page["next_page_token"].as_str().unwrap_or_default());
         if token.is_empty() || jobs.len() >= limit {
             jobs.truncate(limit);
             return Ok(jobs);

@@ -1,5 +1,6 @@
 //! A followed job on the terminal: redrawn in place on a terminal, one line per change elsewhere.
 
+use std::fmt::Write as _;
 use std::io::IsTerminal;
 use std::time::Duration;
 
@@ -131,14 +132,14 @@ fn line(view: &JobView, news: &News) -> String {
 fn status(view: &JobView) -> String {
     let mut text = format!("job {}", view.id);
     if !view.name.is_empty() {
-        text += &format!(" ({})", view.name);
+        let _ = write!(text, " ({})", view.name);
     }
-    text += &format!(": {}", if view.state.is_empty() { "waiting for the server" } else { &view.state });
+    let _ = write!(text, ": {}", if view.state.is_empty() { "waiting for the server" } else { &view.state });
     if view.attempt > 1 {
-        text += &format!(", attempt {}", view.attempt);
+        let _ = write!(text, ", attempt {}", view.attempt);
     }
     if let Some(reason) = &view.reason {
-        text += &format!(": {reason}");
+        let _ = write!(text, ": {reason}");
     }
     text
 }

@@ -160,7 +160,8 @@ mod tests {
         let attempts = [1, 2].map(|n| (n, time(10 * n).parse().unwrap()));
         // The second attempt computed the loss at step 20 again.
         let rows = [("loss", 10, "0", 11), ("loss", 20, "0.25", 21), ("q", 10, "", 11), ("q", 20, "3", 12), ("q", 30, "4", 22)];
-        let csv: String = rows.iter().map(|(name, step, value, at)| format!("{name},{step},{value},{}\n", time(*at))).collect();
+        let lines = rows.map(|(name, step, value, at)| format!("{name},{step},{value},{}\n", time(at)));
+        let csv = lines.concat();
         for _ in 0..2 {
             let files = write(dir.path(), format!("name,step,value,at\n{csv}").as_bytes(), &attempts).unwrap();
             assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 2);

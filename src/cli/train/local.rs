@@ -1,5 +1,6 @@
 //! A training run in this process: its files, and what happens when one of them cannot be written or the run is stopped.
 
+use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -314,7 +315,7 @@ impl Run {
         self.write_snapshot().with_context(|| format!("stopped at step {step}, but its last snapshot is an older one"))?;
         let mut command = format!("qedgix train --resume {} --out {}", self.snapshot.path.display(), self.out.path.display());
         if let Some((file, _)) = &self.curve {
-            command.push_str(&format!(" --metrics {}", file.path.display()));
+            let _ = write!(command, " --metrics {}", file.path.display());
         }
         Ok(Exit::new(code, format!("stopped at step {step}; to continue: {command}")))
     }

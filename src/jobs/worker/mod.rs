@@ -180,6 +180,7 @@ async fn send_heartbeats(client: &Client, stop: &StopSignal) -> ClientError {
 }
 
 /// What the thread of the worker does.
+#[allow(clippy::large_enum_variant, reason = "one value, moved once")]
 enum Work {
     Train(TrainingTask),
     Evaluate(EvaluationTask),

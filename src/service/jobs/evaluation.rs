@@ -44,14 +44,11 @@ pub async fn result(app: &App, caller: &Caller, id: &str) -> Result<Value, Error
     if job.spec.kind.as_deref() == Some(JobKind::Sweep.as_str()) {
         return super::sweep::result(app, &job).await;
     }
-    match app.store.job_result(job.id).await? {
-        Some(result) => serde_json::from_str(&result).map_err(Error::internal),
-        None => {
-            let message = format!(
-                "job {id} is {} and has no result; only a sweep, or an evaluation that has succeeded, has one",
-                job.state
-            );
-            Err(Error::Precondition { code: ErrorCode::WrongState, message })
-        }
+    if let Some(result) = app.store.job_result(job.id).await? {
+        serde_json::from_str(&result).map_err(Error::internal)
+    } else {
+        let message =
+            format!("job {id} is {} and has no result; only a sweep, or an evaluation that has succeeded, has one", job.state);
+        Err(Error::Precondition { code: ErrorCode::WrongState, message })
     }
 }

@@ -118,19 +118,16 @@ impl Follower {
 
     /// The output that was not sent; `None`: there is none.
     async fn read(&mut self, job: &Job, over: bool) -> Result<Option<String>, Error> {
-        let (text, total) = match &mut self.output {
-            Some((log, total)) => {
-                total.borrow_and_update();
-                log.text_after(self.sent, over)
-            }
+        let (text, total) = if let Some((log, total)) = &mut self.output {
+            total.borrow_and_update();
+            log.text_after(self.sent, over)
+        } else {
             // The worker has ended, or it belongs to an earlier run of the server.
-            None => {
-                let attempts = self.app.store.attempts(job.id).await?;
-                let log = attempts.into_iter().find(|attempt| attempt.number == self.attempt && attempt.ended_at.is_some());
-                let text = log.map(|attempt| attempt.log).unwrap_or_default();
-                let total = text.len() as u64;
-                (if self.sent == 0 { text } else { String::new() }, total)
-            }
+            let attempts = self.app.store.attempts(job.id).await?;
+            let log = attempts.into_iter().find(|attempt| attempt.number == self.attempt && attempt.ended_at.is_some());
+            let text = log.map(|attempt| attempt.log).unwrap_or_default();
+            let total = text.len() as u64;
+            (if self.sent == 0 { text } else { String::new() }, total)
         };
         self.sent = self.sent.max(total);
         Ok(Some(text).filter(|text| !text.is_empty()))

@@ -1,6 +1,7 @@
 //! A job as callers see it: its record, why it waits, and how its metrics stand.
 
 use std::collections::BTreeMap;
+use std::fmt::Write as _;
 
 use jiff::Timestamp;
 
@@ -39,7 +40,7 @@ impl Waiting {
         let plural = |n: u64, what: &str| format!("{n} {what}{}", if n == 1 { "" } else { "s" });
         let mut reason = format!("needs {}, {threads_free} free", plural(threads as u64, "thread"));
         if jobs_before > 0 {
-            reason += &format!("; {} before it", plural(jobs_before, "job"));
+            let _ = write!(reason, "; {} before it", plural(jobs_before, "job"));
         }
         if let Some(time) = not_before {
             reason = format!("waits until {time:.0} after a failed attempt");
