@@ -155,7 +155,7 @@ async fn the_table_of_errors() {
         (with(&["scene", "users", "2", "aoi"], json!(-1.0)), 400, "invalid_argument", "scene.users[2].aoi"),
         (with(&["scene", "uavs", "1", "x"], json!("east")), 422, "invalid_schema", "scene.uavs[1].x"),
         (with(&["scene", "uavs", "1", "x"], Value::Null), 422, "invalid_schema", "scene.uavs[1].x"),
-        (with(&["scene", "uavs", "1", "z"], json!(1)), 422, "invalid_schema", "scene.uavs[1].z"),
+        (with(&["scene", "uavs", "1", "w"], json!(1)), 422, "invalid_schema", "scene.uavs[1].w"),
         (with(&["scene", "uavs", "0"], json!({"id": "a", "x": 0})), 422, "invalid_schema", "scene.uavs[0].y"),
         (with(&["graph"], json!({"nodes": []})), 422, "invalid_schema", "graph"),
         (with(&["recurrent_state"], json!("")), 422, "invalid_schema", "session_id"),

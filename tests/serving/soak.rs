@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use qedgix::checkpoint::{Checkpoint, digest, parameter_layout};
-use qedgix::policy::{FleetStep, LearnedPolicy, Policy};
+use qedgix::policy::{FleetProfile, FleetStep, LearnedPolicy, Policy};
 use qedgix::serving::FleetInput;
 use qedgix::train_config::{Algorithm, Preset, TrainConfig};
 use qedgix::wire::v1;
@@ -136,6 +136,8 @@ struct Reference {
     policy: Arc<LearnedPolicy>,
     digest: String,
     step: u64,
+    /// Users may be missing: the first graph listed only users that a UAV detected.
+    profile: Option<FleetProfile>,
     memory: Vec<f32>,
 }
 
@@ -144,7 +146,7 @@ impl Reference {
         let policy = policies.by_digest[digest].clone();
         let mut memory = vec![0.0; policy.memory_len(uavs, users)];
         policy.start(uavs, users, seed, &mut memory);
-        Self { policy, digest: digest.to_owned(), step: 0, memory }
+        Self { policy, digest: digest.to_owned(), step: 0, profile: None, memory }
     }
 
     /// The expected heading and Q-values of every UAV in the next slot.
@@ -153,6 +155,9 @@ impl Reference {
             WireObservation::Scene(scene) => FleetInput::try_from(scene).unwrap(),
             WireObservation::Graph(graph) => FleetInput::try_from(graph).unwrap(),
         };
+        if self.step == 0 && observation.content.lists_only_detected() {
+            self.profile = Some(FleetProfile { open: true, ..FleetProfile::default() });
+        }
         let ids = observation.fleet.uavs.clone();
         let slot = observation.into_fleet_graph(&*self.policy).unwrap();
         let actions = self.policy.actions();
@@ -161,7 +166,7 @@ impl Reference {
         self.policy.act(&mut [FleetStep {
             env: self.policy.env(),
             graph: &slot,
-            profile: None,
+            profile: self.profile.as_ref(),
             step: self.step,
             memory,
             headings: headings_out,

@@ -5,8 +5,8 @@ use std::time::Duration;
 use serde::de::DeserializeOwned;
 
 use crate::api::convert::flight::FlightFields;
+use crate::api::flight::{Constraints, Frame, World, constraints};
 use crate::api::json::parse;
-use crate::api::rest::flight::{Constraints, Frame, World, constraints};
 use crate::invalid::Invalid;
 use crate::service::Error;
 use crate::service::act::{Sequence, SequenceId};

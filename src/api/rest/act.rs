@@ -11,13 +11,13 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::extract;
-use super::flight::{self, Constraints, Frame, Overruled, World};
 use super::openapi::{BadBody, Conflict, Draining, NotFound};
 use super::policies::PolicyRef;
 use super::scene_graph::{Graph, Scene};
 use super::schemas::{self, Base64, Seconds};
 use crate::api::convert::request::ActFields;
 use crate::api::convert::response::{self, Wanted, actions};
+use crate::api::flight::{self, Constraints, Frame, Overruled, World};
 use crate::api::json;
 use crate::env::Point;
 use crate::invalid::Invalid;

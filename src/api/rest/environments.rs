@@ -15,12 +15,12 @@ use utoipa::{IntoParams, ToSchema};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::config_schemas::schema;
 use super::extract::{self, Path, Query};
 use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
 use super::policies::Paging;
 use super::scene_graph::{Graph, Scene};
 use super::schemas::Seconds;
+use crate::api::config_schemas::schema;
 use crate::api::convert::environments::{create_environment, is_large};
 use crate::api::json::{self, objects_only};
 use crate::api::offload;

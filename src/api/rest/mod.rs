@@ -2,12 +2,10 @@
 //! unknown paths and methods; under `/v2` errors have the form of that protocol.
 
 mod act;
-mod config_schemas;
 mod dashboard;
 mod environments;
 mod events;
 pub mod extract;
-pub mod flight;
 mod jobs;
 mod middleware;
 mod openapi;

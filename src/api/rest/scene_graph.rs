@@ -6,7 +6,7 @@ use utoipa::ToSchema;
 use utoipa::openapi::RefOr;
 use utoipa::openapi::schema::Schema;
 
-use super::config_schemas::schema;
+use crate::api::config_schemas::schema;
 use crate::api::convert::scene_graph::{nodes, uavs, users};
 use crate::api::json::objects_only;
 use crate::env::Point;

@@ -12,7 +12,7 @@ use utoipa::openapi::RefOr;
 use utoipa::openapi::schema::Schema;
 use utoipa::{PartialSchema, ToSchema};
 
-use super::config_schemas::schema;
+use crate::api::config_schemas::schema;
 
 /// Name of a policy or an alias.
 macro_rules! name {

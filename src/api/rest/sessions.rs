@@ -13,11 +13,11 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::extract::{self, Path, Query};
-use super::flight::{self, Constraints, Frame, Warning, World};
 use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
 use super::policies::{Paging, PolicyRef};
 use super::schemas::{self, Seconds};
 use crate::api::convert::request::open_session;
+use crate::api::flight::{self, Constraints, Frame, Warning, World};
 use crate::api::json;
 use crate::service::keys::Caller;
 use crate::service::{App, Error, sessions};
