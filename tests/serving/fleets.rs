@@ -507,7 +507,6 @@ async fn coordinates_in_other_units_need_a_frame() {
     for (frame, field) in [
         (v1::Frame::default(), "frame.side"),
         (v1::Frame { width: Some(1.0), ..Default::default() }, "frame.height"),
-        (v1::Frame { side: Some(1.0), width: Some(1.0), ..Default::default() }, "frame.side"),
         (v1::Frame { side: Some(f64::NAN), ..Default::default() }, "frame.width"),
         (v1::Frame { side: Some(3000.0), rotation_deg: 1e9, ..Default::default() }, "frame.rotation_deg"),
         (v1::Frame { side: Some(30.0), ..Default::default() }, "frame"),

@@ -52,11 +52,8 @@ impl FlightFields {
 impl FrameFields {
     fn options(self) -> Result<FrameOptions, Invalid> {
         let (width, height) = match (self.side, self.width, self.height) {
-            (Some(side), None, None) => (side, side),
+            (Some(side), width, height) => (width.unwrap_or(side), height.unwrap_or(side)),
             (None, Some(width), Some(height)) => (width, height),
-            (Some(side), ..) => {
-                return Err(Invalid::new("frame.side", side, "side, or width and height"));
-            }
             (None, Some(_), None) => return Err(Invalid::missing("frame.height", "the length of the area along its y axis")),
             (None, None, Some(_)) => return Err(Invalid::missing("frame.width", "the length of the area along its x axis")),
             (None, None, None) => return Err(Invalid::missing("frame.side", "side, or width and height")),

@@ -117,9 +117,8 @@ struct ListQuery {
     #[param(schema_with = schemas::label_filter, required = false, example = "team=a,urgent")]
     labels: String,
     /// Only jobs that the job with this id has made.
-    #[serde(default)]
-    #[param(value_type = Option<Uuid>, nullable = false)]
-    parent: String,
+    #[param(nullable = false)]
+    parent: Option<uuid::Uuid>,
     /// Only jobs that were submitted at or after this time.
     #[param(nullable = false, example = "2026-01-31T00:00:00Z")]
     created_after: Option<Timestamp>,
@@ -149,6 +148,7 @@ struct ListQuery {
 impl From<ListQuery> for (jobs::ListRequest, PageRequest) {
     fn from(query: ListQuery) -> Self {
         let ListQuery { state, kind, algorithm, name, labels, parent, created_after, created_before, .. } = query;
+        let parent = parent.map(|id| id.to_string()).unwrap_or_default();
         let ListQuery { sort, metrics, page_size: size, page_token: token, .. } = query;
         let request =
             jobs::ListRequest { state, kind, algorithm, name, labels, parent, created_after, created_before, sort, metrics };
