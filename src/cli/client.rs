@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use axum::http::{HeaderMap, Method, Uri, header};
+use clap::Args;
 use reqwest::Response;
 use reqwest::redirect::Policy;
 use serde_json::Value;
@@ -18,6 +19,26 @@ const TIMEOUT: Duration = Duration::from_secs(60);
 const TRANSFER_TIMEOUT: Duration = Duration::from_secs(600);
 /// Timeout for opening a connection.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(20);
+
+/// The REST address of a server, and how to connect to it.
+#[derive(Args, Debug)]
+pub struct RestArgs {
+    /// REST address of the server
+    #[arg(long, global = true, env = "QEDGIX_SERVER", default_value = "127.0.0.1:8080", value_name = "HOST:PORT")]
+    server: String,
+    #[command(flatten)]
+    connect: ConnectArgs,
+}
+
+impl RestArgs {
+    /// A client of the server.
+    ///
+    /// # Errors
+    /// As [`Client::new`].
+    pub fn client(&self) -> anyhow::Result<Client> {
+        Client::new(&self.server, &self.connect)
+    }
+}
 
 /// A client of one server.
 #[derive(Clone, Debug)]

@@ -6,8 +6,7 @@ use anyhow::{Context, bail, ensure};
 use clap::{Args, Subcommand};
 use serde_json::{Value, json};
 
-use super::client::Client;
-use super::connect::ConnectArgs;
+use super::client::{Client, RestArgs};
 use super::files::write_atomic;
 use super::output::outln;
 use super::rest::{self, items, query, text};
@@ -29,11 +28,8 @@ use crate::checkpoint::digest;
 pub struct PoliciesArgs {
     #[command(subcommand)]
     command: Command,
-    /// REST address of the server
-    #[arg(long, global = true, env = "QEDGIX_SERVER", default_value = "127.0.0.1:8080", value_name = "HOST:PORT")]
-    server: String,
     #[command(flatten)]
-    connect: ConnectArgs,
+    server: RestArgs,
     /// Print the response of the server as JSON
     #[arg(long, global = true)]
     json: bool,
@@ -148,7 +144,7 @@ enum Alias {
 /// # Errors
 /// The server cannot be reached or refuses the request, or a file cannot be read or written.
 pub async fn run(args: PoliciesArgs) -> anyhow::Result<()> {
-    let client = Client::new(&args.server, &args.connect)?;
+    let client = args.server.client()?;
     let (response, text) = match args.command {
         Command::List => list(&client).await?,
         Command::Get { policy } => details(client.get(&path(&[&policy])).await?),

@@ -3,8 +3,7 @@
 use clap::{Args, Subcommand};
 use serde_json::{Value, json};
 
-use super::client::Client;
-use super::connect::ConnectArgs;
+use super::client::RestArgs;
 use super::output::outln;
 
 /// Flags of `server`.
@@ -16,11 +15,8 @@ use super::output::outln;
 pub struct ServerArgs {
     #[command(subcommand)]
     command: Command,
-    /// REST address of the server
-    #[arg(long, global = true, env = "QEDGIX_SERVER", default_value = "127.0.0.1:8080", value_name = "HOST:PORT")]
-    server: String,
     #[command(flatten)]
-    connect: ConnectArgs,
+    server: RestArgs,
     /// Print the response of the server as JSON
     #[arg(long, global = true)]
     json: bool,
@@ -41,7 +37,7 @@ enum Command {
 /// # Errors
 /// The server cannot be reached or refuses the request.
 pub async fn run(args: ServerArgs) -> anyhow::Result<()> {
-    let client = Client::new(&args.server, &args.connect)?;
+    let client = args.server.client()?;
     let Command::Budget { threads } = args.command;
     let budget = match threads {
         None => client.get("/v1/server/budget").await?,

@@ -56,6 +56,14 @@ pub fn evaluate_until(
     Ok((!stopped).then(|| parts.into_iter().flat_map(|(metrics, _)| metrics).collect()))
 }
 
+/// Layouts to evaluate together, `least` to 64, so that a part of an evaluation takes seconds at most. Layouts are independent, so the
+/// parts change no bit; in training their number determines the events, so it does not depend on the threads.
+pub fn layouts_per_part(env: &EnvConfig, least: usize) -> usize {
+    /// Pairs of a UAV and another node, over all slots and layouts of a part.
+    const PAIRS: usize = 1 << 22;
+    (PAIRS / (env.slots * env.uavs * (env.uavs + env.users))).clamp(least, 64)
+}
+
 /// Metrics of a policy on layouts, with the curve and the trajectory that a report shows.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TracedEvaluation {

@@ -6,8 +6,9 @@
 //! loss = mean over episodes, slots and joint values of (Q_tot - G)^2 / 2
 //! ```
 //!
-//! A batch is one group of episodes or several, which may differ in size. Groups are split into chunks of episodes; their number depends on sizes only. Each chunk has its own gradient, and the gradients
-//! are summed in a fixed order. The number of threads therefore changes no bit.
+//! A batch is one group of episodes or several, which may differ in size. Groups are split into chunks of episodes;
+//! their number depends on sizes only. Each chunk has its own gradient, and the gradients are summed in a fixed order. The number of
+//! threads therefore changes no bit.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -158,7 +159,9 @@ impl<T: Real> Loss<T> {
     ) -> LossMetrics {
         assert!(groups.iter().any(|group| group.len > 0), "a batch of at least one episode");
         for group in groups {
-            self.agent.check_fleet(group.uavs, group.users).expect("the networks fit the fleet");
+            self.agent.check_fleet(group.uavs, group.users).expect("the agents fit the fleet");
+            let Dims { uavs, users, .. } = *self.agent.dims();
+            assert!(self.mixer.fits_any_fleet() || (group.uavs, group.users) == (uavs, users), "the mixer fits the fleet");
         }
         let [prepared_online, prepared_target] = &mut self.prepared;
         for (params, prepared) in [(online, &mut *prepared_online), (target, &mut *prepared_target)] {

@@ -21,7 +21,7 @@ pub use crate::env::LostUav;
 pub use comparison::{Comparison, Pair, PolicyEvaluation};
 pub use disturbance::Disturbance;
 pub use episodes::{Episodes, Symmetry};
-pub use evaluation::{TracedEvaluation, Trajectory, evaluate, evaluate_list, evaluate_traced, evaluate_until};
+pub use evaluation::{TracedEvaluation, Trajectory, evaluate, evaluate_list, evaluate_traced, evaluate_until, layouts_per_part};
 pub use event::{Evaluation, Event, Iteration};
 pub use layouts::{LAYOUT_LISTS, LayoutList, layout_list};
 pub use loss::LossMetrics;

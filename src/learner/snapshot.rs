@@ -7,7 +7,7 @@
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use super::replay::{Replay, RingArrays};
+use super::replay::{Replay, Ring, RingArrays};
 use super::state::{Counters, RunState};
 use super::{Evaluation, LearnerState, TrainConfig};
 use crate::checkpoint;
@@ -89,16 +89,15 @@ pub(super) fn encode(config: &TrainConfig, run: &RunState, learner: &LearnerStat
     push_section(&mut bytes, &serde_json::to_vec(&head).expect("plain data with string keys"));
     let best = run.best.as_ref().map_or(&[][..], |(_, parameters)| parameters);
     for array in [&learner.online, &learner.target, &learner.adam_m, &learner.adam_v, &learner.average, best] {
-        push_floats(&mut bytes, array);
+        push_numbers(&mut bytes, array.iter().map(|x| x.to_le_bytes()));
     }
-    let mut arrays = RingArrays::default();
-    replay.rings().for_each(|ring| arrays.append(ring.arrays()));
-    for array in arrays.floats() {
-        push_floats(&mut bytes, array);
+    let rings = || replay.rings().map(Ring::arrays);
+    let floats: [fn(&RingArrays) -> &Vec<f32>; 4] = [|a| &a.uav_xy, |a| &a.user_xy, |a| &a.reward, |a| &a.identity_token];
+    for array in floats {
+        push_numbers(&mut bytes, rings().flat_map(array).map(|x| x.to_le_bytes()));
     }
-    let aoi: Vec<u8> = arrays.aoi.iter().flat_map(|a| a.to_le_bytes()).collect();
-    push_section(&mut bytes, &aoi);
-    push_section(&mut bytes, &arrays.actions);
+    push_numbers(&mut bytes, rings().flat_map(|a| &a.aoi).map(|x| x.to_le_bytes()));
+    push_numbers(&mut bytes, rings().flat_map(|a| &a.actions).map(|x| [*x]));
     let checksum = Sha256::digest(&bytes);
     bytes.extend(checksum);
     bytes
@@ -169,9 +168,13 @@ fn push_section(bytes: &mut Vec<u8>, content: &[u8]) {
     bytes.extend(content);
 }
 
-fn push_floats(bytes: &mut Vec<u8>, values: &[f32]) {
-    bytes.extend((4 * values.len() as u64).to_le_bytes());
-    bytes.extend(values.iter().flat_map(|x| x.to_le_bytes()));
+/// A section of numbers in their little-endian bytes.
+fn push_numbers<const N: usize>(bytes: &mut Vec<u8>, numbers: impl Iterator<Item = [u8; N]>) {
+    let start = bytes.len();
+    bytes.extend([0; 8]);
+    bytes.extend(numbers.flatten());
+    let len = (bytes.len() - start - 8) as u64;
+    bytes[start..start + 8].copy_from_slice(&len.to_le_bytes());
 }
 
 /// The bytes of the sections that are not read yet.

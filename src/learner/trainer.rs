@@ -14,7 +14,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use rand::RngExt;
 
 use super::episodes::Symmetry;
-use super::evaluation::evaluate_until;
+use super::evaluation::{evaluate_until, layouts_per_part};
 use super::replay::{Replay, group_environment};
 use super::rollout::Rollout;
 use super::snapshot::{self, SnapshotError};
@@ -155,7 +155,7 @@ impl Trainer {
         let list = layout_list(if reporting { "eval-v1" } else { "valid-v1" }).expect("both lists exist");
         let seeds = list.seeds(config.training.eval_episodes);
         let rest = &seeds[run.layouts.len().min(seeds.len())..];
-        let part = &rest[..rest.len().min(layouts_per_part(config))];
+        let part = &rest[..rest.len().min(layouts_per_part(&config.environment, 8))];
         let agent_parameters = parameters[..self.learner.agent().layout().len()].to_vec();
         let policy = LearnedPolicy::new(config.agent(), config.dims(), agent_parameters)
             .expect("the parameters have the length of the agent's layout");
@@ -262,15 +262,6 @@ impl Iterator for Trainer {
             Phase::Done => None,
         }
     }
-}
-
-/// Layouts that an evaluation computes together, so that a part of it takes seconds at most. The number does not depend on the
-/// threads, because it determines the events.
-fn layouts_per_part(config: &TrainConfig) -> usize {
-    /// Pairs of a UAV and another node, over all slots and layouts of a part.
-    const PAIRS: usize = 1 << 22;
-    let env = &config.environment;
-    (PAIRS / (env.slots * env.uavs * (env.uavs + env.users))).clamp(8, 64)
 }
 
 /// The learning rate after `env_steps` environment steps. It falls linearly to `learning_rate_decay` of its start value.

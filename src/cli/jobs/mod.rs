@@ -21,8 +21,7 @@ use self::reference::{resolve, resolve_all};
 use self::screen::{Lines, Screen};
 use self::view::JobView;
 use self::watch::OnSignal;
-use super::client::Client;
-use super::connect::ConnectArgs;
+use super::client::{Client, RestArgs};
 use super::output::{errln, outln};
 
 pub use self::export::{checkpoint, write_verified};
@@ -46,11 +45,8 @@ or 143 ctrl-c or SIGTERM ended the command, and the job goes on.")]
 pub struct JobsArgs {
     #[command(subcommand)]
     command: Command,
-    /// REST address of the server
-    #[arg(long, global = true, env = "QEDGIX_SERVER", default_value = "127.0.0.1:8080", value_name = "HOST:PORT")]
-    server: String,
     #[command(flatten)]
-    connect: ConnectArgs,
+    server: RestArgs,
     /// Print JSON; watch prints a line per event
     #[arg(long, global = true)]
     json: bool,
@@ -104,7 +100,7 @@ struct Jobs {
 /// # Errors
 /// The server cannot be reached or refuses the request, a job is not found, or a job that is followed does not succeed.
 pub async fn run(args: JobsArgs) -> anyhow::Result<()> {
-    let client = Client::new(&args.server, &args.connect)?;
+    let client = args.server.client()?;
     let json = args.json;
     match args.command {
         Command::Submit(args) => submit::run(&client, args, json).await,

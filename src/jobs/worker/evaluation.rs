@@ -8,7 +8,7 @@ use crate::checkpoint::Checkpoint;
 use crate::env::EnvConfig;
 use crate::invalid::Invalid;
 use crate::jobs::evaluation::EvaluationSpec;
-use crate::learner::{Comparison, PolicyEvaluation, TracedEvaluation, Trajectory, evaluate_until, layout_list};
+use crate::learner::{Comparison, PolicyEvaluation, TracedEvaluation, Trajectory, evaluate_until, layout_list, layouts_per_part};
 use crate::policy::{Policy, baselines};
 use crate::store::WorkerResult;
 
@@ -40,7 +40,7 @@ fn try_evaluate(task: &EvaluationTask, reports: &ReportQueue, stop: &StopSignal)
         let env = EnvConfig { hover: policy.actions() > EnvConfig::COMPASS, ..environment.clone() };
         let mut metrics = Vec::with_capacity(layouts);
         for (env, seeds) in list.environments(&env, *episodes) {
-            for part in seeds.chunks(layouts_per_part(&env)) {
+            for part in seeds.chunks(layouts_per_part(&env, 1)) {
                 let part = evaluate_until(policy.as_ref(), &env, part, task.threads, disturbance, &stop).map_err(failed)?;
                 let Some(part) = part else { return Ok(None) };
                 metrics.extend(part);
@@ -53,13 +53,6 @@ fn try_evaluate(task: &EvaluationTask, reports: &ReportQueue, stop: &StopSignal)
     let comparison =
         Comparison { layouts: list, episodes: layouts, env: environment.clone(), disturbance: *disturbance, policies };
     Ok(Some(comparison.json().map_err(|e| e.to_string())?.to_string()))
-}
-
-/// Layouts that are evaluated together, so that a part takes seconds at most. Layouts are independent, so this changes no bit.
-fn layouts_per_part(env: &EnvConfig) -> usize {
-    /// Pairs of a UAV and another node, over all slots and layouts of a part.
-    const PAIRS: usize = 1 << 22;
-    (PAIRS / (env.slots * env.uavs * (env.uavs + env.users))).clamp(1, 64)
 }
 
 impl EvaluationTask {

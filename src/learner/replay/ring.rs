@@ -83,17 +83,14 @@ impl EpisodeShape {
 }
 
 impl RingArrays {
-    /// The arrays in a fixed order, except actions and AoI.
-    pub fn floats(&self) -> [&Vec<f32>; 4] {
-        [&self.uav_xy, &self.user_xy, &self.reward, &self.identity_token]
-    }
-
     /// Whether all arrays are empty.
     pub fn is_empty(&self) -> bool {
-        self.floats().into_iter().all(Vec::is_empty) && self.aoi.is_empty() && self.actions.is_empty()
+        let floats = [&self.uav_xy, &self.user_xy, &self.reward, &self.identity_token];
+        floats.into_iter().all(Vec::is_empty) && self.aoi.is_empty() && self.actions.is_empty()
     }
 
     /// Adds `other` at the end.
+    #[cfg(test)]
     pub fn append(&mut self, other: &Self) {
         self.uav_xy.extend_from_slice(&other.uav_xy);
         self.user_xy.extend_from_slice(&other.user_xy);

@@ -62,6 +62,11 @@ impl Mixer {
         Self { net }
     }
 
+    /// Whether it mixes fleets of any size, and not only of the size that it was made for.
+    pub fn fits_any_fleet(&self) -> bool {
+        !matches!(self.net, Net::Qmix(_))
+    }
+
     /// Number of joint values per slot of a fleet of `uavs` UAVs: 1, or M with [`MixerKind::None`].
     pub fn joint_values_per_slot(&self, uavs: usize) -> usize {
         if matches!(self.net, Net::None) { uavs } else { 1 }
