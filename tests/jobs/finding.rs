@@ -71,12 +71,12 @@ async fn jobs_are_filtered_by_what_they_are() {
         assert_eq!(list(&server, query).await.iter().collect::<Vec<_>>(), expected, "{query}");
     }
     for (query, field) in [
-        ("kind=dance", "query"),
-        ("algorithm=dqn", "query"),
+        ("kind=dance", "kind"),
+        ("algorithm=dqn", "algorithm"),
         ("name=a b", "name"),
         ("labels=%3Da", "labels"),
         ("parent=me", "parent"),
-        ("created_after=yesterday", "query"),
+        ("created_after=yesterday", "created_after"),
         ("sort=age", "sort"),
         ("metrics=a%20b", "metrics"),
         ("sort=name&page_token=7", "page_token"),

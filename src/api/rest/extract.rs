@@ -1,8 +1,11 @@
 //! Extractors of bodies, paths and queries whose rejections are errors of the service.
 
+use std::error::Error as _;
+use std::iter;
 use std::sync::Arc;
 
 use axum::body::BodyDataStream;
+use axum::extract::rejection::QueryRejection;
 use axum::extract::{FromRequest, FromRequestParts, Request};
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, header};
@@ -149,9 +152,22 @@ impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for Query<T> {
         let read = axum::extract::Query::<T>::from_request_parts(parts, state).await;
         match read {
             Ok(query) => Ok(Self(query.0)),
-            Err(e) => Err(Invalid::new("query", parts.uri.query().unwrap_or(""), e.body_text()).into()),
+            Err(e) => Err(invalid_query(&e, parts.uri.query().unwrap_or("")).into()),
         }
     }
+}
+
+/// What is wrong with `query`: the parameter that cannot be read, or the query where it has a parameter that does not exist or
+/// misses one.
+fn invalid_query(rejection: &QueryRejection, query: &str) -> Invalid {
+    type Unreadable = serde_path_to_error::Error<serde::de::value::Error>;
+    let unreadable = iter::successors(rejection.source(), |&e| e.source()).find_map(|e| e.downcast_ref::<Unreadable>());
+    let named = unreadable.and_then(|e| {
+        let name = e.path().to_string();
+        let (_, value) = query.split('&').filter_map(|pair| pair.split_once('=')).find(|(key, _)| *key == name)?;
+        Some(Invalid::new(name, value, e.inner().to_string()))
+    });
+    named.unwrap_or_else(|| Invalid::new("query", query, rejection.body_text()))
 }
 
 #[cfg(test)]
