@@ -182,6 +182,12 @@ fn messages() -> Vec<(&'static str, Vec<u8>)> {
         ..Default::default()
     };
     let environment = v1::CreateEnvironmentRequest { environment_id: "e".into(), environment: config, ..Default::default() };
+    let observation = graph().nodes.into_iter().find(|node| node.kind == i32::from(v1::NodeKind::Uav));
+    let of_kind = |kind: v1::NodeKind| {
+        graph().nodes.into_iter().filter(|node| node.kind == i32::from(kind)).map(|node| node.id).collect()
+    };
+    let (uav_ids, user_ids) = (of_kind(v1::NodeKind::Uav), of_kind(v1::NodeKind::User));
+    let alone = v1::EncodeRequest { policy: "qedgix".into(), uav_ids, user_ids, observation, ..Default::default() };
     let step = v1::StepRequest { environment_id: "e".into(), ..Default::default() };
     vec![
         ("qedgix.v1.PolicyService/Act", scene_act.encode_to_vec()),
@@ -193,6 +199,7 @@ fn messages() -> Vec<(&'static str, Vec<u8>)> {
         ("inference.GRPCInferenceService/ModelStreamInfer", infer(true)),
         ("qedgix.v1.PolicyService/ActStream", scene_act.encode_to_vec()),
         ("qedgix.v1.PolicyService/ActBatch", batch.encode_to_vec()),
+        ("qedgix.v1.PolicyService/Encode", alone.encode_to_vec()),
         ("qedgix.v1.PolicyService/OpenSession", open.encode_to_vec()),
         (
             "qedgix.v1.PolicyService/ListSessions",
@@ -274,6 +281,12 @@ fn documents() -> Vec<(&'static str, &'static str, &'static str, Vec<u8>)> {
         ("POST", "/v1/act", JSON, json(json!({"policy": "qedgix", "scene": scene, "return_q_values": true, "seed": 5}))),
         ("POST", "/v1/act", JSON, json(json!({"policy": "sweep", "graph": {"nodes": nodes}}))),
         ("POST", "/v1/act", JSON, json(json!({"session_id": "t", "scene": scene, "step": 0, "run_id": "r"}))),
+        (
+            "POST",
+            "/v1/encode",
+            JSON,
+            json(json!({"policy": "qedgix", "uav_ids": ["a"], "user_ids": ["u"], "observation": nodes[0]})),
+        ),
         ("POST", "/v1/sessions", JSON, json(json!({"policy": "qedgix", "session_id": "t", "seed": 1}))),
         ("POST", "/v2/models/qedgix/infer", JSON, tensors(false).0.into_bytes()),
         ("POST", "/v2/models/sweep/versions/1/infer", JSON, tensors(false).0.into_bytes()),

@@ -26,7 +26,7 @@ const ADMIN: Requirement = Requirement::Scope(Scope::Admin);
 
 /// Service, methods (`*`: all) and their requirement.
 const GRPC: &[(&str, &str, Requirement)] = &[
-    ("qedgix.v1.PolicyService", "Act ActBatch ActStream OpenSession CloseSession", ACT),
+    ("qedgix.v1.PolicyService", "Act ActBatch ActStream Encode Decide OpenSession CloseSession", ACT),
     ("qedgix.v1.PolicyService", "GetSession ListSessions GetPolicy ListPolicies ListPolicyVersions", READ),
     ("qedgix.v1.PolicyService", "DeletePolicy DeletePolicyVersion", ADMIN),
     ("qedgix.v1.EnvironmentService", "CreateEnvironment Reset Step DeleteEnvironment", ACT),
@@ -56,7 +56,7 @@ const REST: &[(&str, &str, Requirement)] = &[
     ("GET", "/metrics", READ),
     ("GET", "/v1/server/budget", READ),
     ("PUT", "/v1/server/budget", ADMIN),
-    ("POST", "/v1/act /v1/sessions", ACT),
+    ("POST", "/v1/act /v1/encode /v1/decide /v1/sessions", ACT),
     ("GET", "/v1/sessions /v1/sessions/{id}", READ),
     ("DELETE", "/v1/sessions/{id}", ACT),
     ("GET", "/v1/environments /v1/environments/{id}", READ),

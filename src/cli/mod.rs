@@ -1,6 +1,7 @@
 //! The command line. Each command has its own file. Most flags are also environment variables `QEDGIX_*`; `--help` shows them.
 
 mod act_client;
+mod audit;
 mod backup;
 mod bench;
 mod client;
@@ -52,6 +53,8 @@ enum Command {
     Jobs(jobs::JobsArgs),
     /// Compare policies on fixed layouts
     Evaluate(evaluate::EvaluateArgs),
+    /// Check whether UAVs can decide alone by a policy, and what they need for it
+    Audit(audit::AuditArgs),
     /// List, upload, export, load and unload policies of a server, and move aliases
     Policies(policies::PoliciesArgs),
     /// Show or change a running server: its CPU budget
@@ -82,6 +85,7 @@ pub fn run() -> ExitCode {
         Command::Train(args) => block_on(train::run(args)),
         Command::Jobs(args) => block_on(jobs::run(args)),
         Command::Evaluate(args) => block_on(evaluate::run(args)),
+        Command::Audit(args) => block_on(audit::run(args)),
         Command::Policies(args) => block_on(policies::run(args)),
         Command::Server(args) => block_on(server::run(args)),
         Command::Experiment(args) => block_on(experiment::run(args)),

@@ -13,7 +13,7 @@ use super::features::{Inputs, NO_ACTION};
 use super::geometry::Geometry;
 use super::goals::Goals;
 use super::memory::{self, memories, uav_memory_len};
-use super::{Carry, EnvParams, FleetStep, Policy, RequiredInput};
+use super::{Carry, EnvParams, FleetStep, Policy, Reach, RequiredInput};
 use crate::invalid::Invalid;
 use crate::nn::{HIDDEN, Weights, argmax};
 use crate::rng;
@@ -140,6 +140,16 @@ impl Policy for LearnedPolicy {
 
     fn remembers_users(&self) -> bool {
         !self.agent.config().memory.is_none()
+    }
+
+    fn reach(&self) -> Reach {
+        let config = self.agent.config();
+        let layers = self.agent.geometry_config(&self.env()).layers;
+        // What a user detects, the UAVs know that detect the user: one link more than to the user.
+        let graph = if layers > 0 { layers + 1 } else { 0 };
+        let hops = if config.hops > 1 { config.hops } else { 0 };
+        let shared = usize::from(config.memory.sharing() == Some(memory::Sharing::Shared));
+        Reach::Links(graph.max(hops).max(shared))
     }
 
     fn is_cheap(&self) -> bool {

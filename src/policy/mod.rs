@@ -49,6 +49,30 @@ pub enum RequiredInput {
     FullScene,
 }
 
+/// Whose messages a UAV needs to decide alone as it would be told by [`Policy::act`] (docs/model.md, "Deciding alone"). A message has what
+/// its UAV observes in the slot and remembers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reach {
+    /// Those of the UAVs within so many links. 0: none, its own sensors are enough.
+    Links(usize),
+    /// Those of all UAVs, wherever they are.
+    Fleet,
+}
+
+impl Reach {
+    /// Distance within which all these UAVs are, in units of the square's side; `None`: any distance.
+    pub fn range(self, env: &EnvParams) -> Option<f64> {
+        // The last link of several is one between a user and a UAV.
+        let (first, last) = (env.communication_range, env.detection_range);
+        match self {
+            Self::Links(0) => Some(0.0),
+            Self::Links(1) => Some(first),
+            Self::Links(links) => Some((links - 1) as f64 * first.max(last) + last),
+            Self::Fleet => None,
+        }
+    }
+}
+
 /// One fleet in one slot, as an item of a batch: input, memory and output.
 pub struct FleetStep<'a> {
     /// The environment that the fleet flies in.
@@ -110,6 +134,11 @@ pub trait Policy: Send + Sync {
     /// Whether the memory holds something about each user, that is carried when users come and go.
     fn remembers_users(&self) -> bool {
         false
+    }
+
+    /// Whose messages a UAV needs to decide alone.
+    fn reach(&self) -> Reach {
+        Reach::Fleet
     }
 
     /// Number of nodes, of the first ones (UAVs, then users), whose detections the policy reads. Others need not be computed.

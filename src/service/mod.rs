@@ -3,6 +3,7 @@
 pub mod act;
 pub mod backup;
 pub mod checkpoints;
+pub mod decentral;
 pub mod environments;
 mod error;
 pub mod events;

@@ -333,6 +333,16 @@ impl Flight {
         own.iter().map(speed).collect()
     }
 
+    /// A length in the square, in units of the caller.
+    pub fn length(&self, length: f64) -> f64 {
+        length * self.frame.map_or(1.0, |frame| frame.scale)
+    }
+
+    /// A speed in sides of the square per slot, in units of the caller per second.
+    pub fn speed_out(&self, speed: f64) -> f64 {
+        self.length(speed) / self.slot_seconds
+    }
+
     /// The slots that each UAV can still fly, where the caller says so.
     pub fn endurance(&self, seconds: &[Option<f64>]) -> Vec<f64> {
         seconds.iter().map(|seconds| seconds.map_or(f64::INFINITY, |seconds| (seconds / self.slot_seconds).floor())).collect()

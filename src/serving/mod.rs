@@ -3,6 +3,7 @@
 //! This layer has no wire formats and no SQL: `service` loads policies from the store and assembles responses.
 
 pub mod bundled;
+pub mod decentral;
 mod engine;
 mod environments;
 mod error;

@@ -7,6 +7,7 @@ mod binary;
 #[path = "../certificates/mod.rs"]
 mod certificates;
 mod conversion;
+mod decentral;
 mod environments;
 mod fleets;
 mod guard;

@@ -43,6 +43,12 @@ def test_metric_simulator(server, tmp_path):
         assert mean < 320, policy
 
 
+@pytest.mark.parametrize("policy", ["qedgix", "qmix", "qedgix-paper", "sweep-shared"])
+def test_decentral(server, tmp_path, policy):
+    arguments = [server.grpc, "--policy", policy, "--layouts", "2", "--slots", "30", "--kill"]
+    assert run("decentral.py", *arguments, cwd=tmp_path).startswith("60 of 60 slots as the joint Act, bit for bit; 6 processes")
+
+
 def test_training_job(server, tmp_path):
     arguments = [server.grpc, server.http, "--name", "example", "--steps", "4000"]
     told = run("training_job.py", *arguments, cwd=tmp_path)

@@ -1,6 +1,7 @@
 //! Converts wire types to domain types and back. Every check of a request that does not depend on the policy is made here and reports
 //! the path of the field.
 
+pub mod decentral;
 pub mod environments;
 pub mod flight;
 pub mod jobs;

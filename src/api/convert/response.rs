@@ -75,16 +75,7 @@ pub fn actions(response: &mut act::Response, wanted: Wanted) -> impl Iterator<It
 
 /// The response, with what is wanted.
 pub fn act_response(mut response: act::Response, wanted: Wanted) -> v1::ActResponse {
-    let action = |action: Action| v1::Action {
-        heading_index: action.heading.into(),
-        heading_deg: action.degrees,
-        uav_id: action.uav_id,
-        q_values: action.q_values,
-        velocity: action.velocity.map(|[x, y]| v1::Velocity { x, y }),
-        waypoint: action.waypoint.map(|[x, y]| v1::Position { x, y, z: None }),
-        overruled: action.overruled.map(Into::into),
-    };
-    let actions = actions(&mut response, wanted).map(action).collect();
+    let actions = actions(&mut response, wanted).map(Into::into).collect();
     let act::Response { policy, decision: Decision { step, timings, .. }, recurrent_state, .. } = response;
     v1::ActResponse {
         actions,
@@ -96,6 +87,20 @@ pub fn act_response(mut response: act::Response, wanted: Wanted) -> v1::ActRespo
             compute: Some(duration(timings.compute)),
             batch_size: timings.batch_size,
         }),
+    }
+}
+
+impl From<Action> for v1::Action {
+    fn from(action: Action) -> Self {
+        Self {
+            heading_index: action.heading.into(),
+            heading_deg: action.degrees,
+            uav_id: action.uav_id,
+            q_values: action.q_values,
+            velocity: action.velocity.map(|[x, y]| v1::Velocity { x, y }),
+            waypoint: action.waypoint.map(|[x, y]| v1::Position { x, y, z: None }),
+            overruled: action.overruled.map(Into::into),
+        }
     }
 }
 

@@ -9,13 +9,13 @@ use tonic::{Request, Response, Status, Streaming};
 
 use super::{deadline, stream};
 use crate::api::auth::{caller, count_message};
-use crate::api::convert::flight;
+use crate::api::convert::{decentral, flight};
 use crate::api::convert::request::open_session;
 use crate::api::convert::response::{Wanted, act_response};
 use crate::api::errors::act_error;
 use crate::invalid::in_range;
 use crate::service::keys::Caller;
-use crate::service::{App, Error, PageRequest, act, policies, sessions};
+use crate::service::{App, Error, PageRequest, act, decentral as alone, policies, sessions};
 use crate::serving::PolicySpec;
 use crate::wire::v1;
 use crate::wire::v1::policy_service_server::{PolicyService, PolicyServiceServer};
@@ -98,6 +98,21 @@ impl PolicyService for Handlers {
             }
         });
         Ok(Response::new(results.buffered(MAX_IN_FLIGHT).boxed()))
+    }
+
+    async fn encode(&self, request: Request<v1::EncodeRequest>) -> Result<Response<v1::EncodeResponse>, Status> {
+        let (deadline, caller) = (deadline(request.extensions()), caller(request.extensions()));
+        let request = alone::EncodeRequest::try_from(request.into_inner()).map_err(Error::from)?;
+        Ok(Response::new(alone::encode(&self.0, &caller, request, deadline).await?.into()))
+    }
+
+    async fn decide(&self, request: Request<v1::DecideRequest>) -> Result<Response<v1::DecideResponse>, Status> {
+        let (deadline, caller) = (deadline(request.extensions()), caller(request.extensions()));
+        let request = request.into_inner();
+        let (q_values, velocity, waypoint) = (request.return_q_values, request.return_velocity, request.return_waypoint);
+        let request = alone::DecideRequest::try_from(request).map_err(Error::from)?;
+        let decided = alone::decide(&self.0, &caller, request, deadline).await?;
+        Ok(Response::new(decentral::decide_response(decided, Wanted { q_values, velocity, waypoint })))
     }
 
     async fn open_session(&self, request: Request<v1::OpenSessionRequest>) -> Result<Response<v1::Session>, Status> {

@@ -147,7 +147,7 @@ struct ActResponse {
 }
 
 #[derive(Debug, Serialize, ToSchema)]
-struct Action {
+pub(super) struct Action {
     uav_id: String,
     /// Heading index h: direction 45*h degrees counter-clockwise from the x axis of the area; 8 = hover, if the policy supports it.
     #[schema(maximum = 8)]
@@ -171,6 +171,20 @@ struct Action {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
     overruled: Option<Overruled>,
+}
+
+impl From<response::Action> for Action {
+    fn from(action: response::Action) -> Self {
+        Self {
+            heading_index: action.heading,
+            heading_deg: action.degrees,
+            uav_id: action.uav_id,
+            q_values: action.q_values,
+            velocity: action.velocity.map(Into::into),
+            waypoint: action.waypoint.map(Into::into),
+            overruled: action.overruled.map(Into::into),
+        }
+    }
 }
 
 /// A velocity or a position, along the axes of the caller.
@@ -198,16 +212,7 @@ struct Timings {
 
 impl ActResponse {
     fn new(mut response: act::Response, wanted: Wanted) -> Self {
-        let action = |action: response::Action| Action {
-            heading_index: action.heading,
-            heading_deg: action.degrees,
-            uav_id: action.uav_id,
-            q_values: action.q_values,
-            velocity: action.velocity.map(Into::into),
-            waypoint: action.waypoint.map(Into::into),
-            overruled: action.overruled.map(Into::into),
-        };
-        let actions = actions(&mut response, wanted).map(action).collect();
+        let actions = actions(&mut response, wanted).map(Into::into).collect();
         let Decision { step, timings: serving::Timings { queue, compute, batch_size, .. }, .. } = response.decision;
         Self {
             actions,

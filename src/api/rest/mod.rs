@@ -3,6 +3,7 @@
 
 mod act;
 mod dashboard;
+mod decentral;
 mod environments;
 mod events;
 pub mod extract;
@@ -41,6 +42,7 @@ pub fn router(app: Arc<App>, metrics: fn() -> String, max_body: usize, hosts: Al
         .merge(ops::router())
         .merge(dashboard::router())
         .merge(act::router())
+        .merge(decentral::router())
         .merge(sessions::router())
         .merge(policies::router())
         .merge(environments::router())

@@ -24,7 +24,7 @@ pub(super) struct Graph {
 
 #[derive(Debug, Deserialize, Serialize, ToSchema)]
 #[serde(deny_unknown_fields, remote = "Self")]
-struct Node {
+pub(super) struct Node {
     /// Unique in the graph, the same for the same node in every slot.
     #[schema(min_length = 1, max_length = 128)]
     id: String,
@@ -155,20 +155,28 @@ impl TryFrom<Graph> for FleetInput {
     type Error = Invalid;
 
     fn try_from(graph: Graph) -> Result<Self, Invalid> {
-        let node = |node: Node| serving::Node {
-            id: node.id,
-            is_uav: matches!(node.kind, NodeKind::Uav),
-            detections: node.detections.into_iter().map(|d| serving::NodeDetection {
-                target_id: d.target_id,
-                rel: [d.rel_x, d.rel_y],
-                aoi: d.aoi,
-            }),
-            position: node.position.map(|p| [p.x, p.y]),
-            aoi: node.aoi,
-            speed: node.speed,
-            endurance: node.endurance_seconds,
+        let node = |node: Node| {
+            let serving::Node { id, is_uav, detections, position, aoi, speed, endurance } = node.into_domain();
+            serving::Node { id, is_uav, detections: detections.into_iter(), position, aoi, speed, endurance }
         };
         Self::from_nodes(graph.nodes.into_iter().map(node).collect())
+    }
+}
+
+impl Node {
+    /// The node, not checked yet.
+    pub(super) fn into_domain(self) -> serving::Node<Vec<serving::NodeDetection>> {
+        let detection =
+            |d: Detection| serving::NodeDetection { target_id: d.target_id, rel: [d.rel_x, d.rel_y], aoi: d.aoi };
+        serving::Node {
+            id: self.id,
+            is_uav: matches!(self.kind, NodeKind::Uav),
+            detections: self.detections.into_iter().map(detection).collect(),
+            position: self.position.map(|p| [p.x, p.y]),
+            aoi: self.aoi,
+            speed: self.speed,
+            endurance: self.endurance_seconds,
+        }
     }
 }
 

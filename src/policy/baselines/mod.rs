@@ -17,7 +17,7 @@ use std::sync::Arc;
 
 use self::rule::{Rule, Slot};
 use self::search::Search;
-use super::{Carry, EnvParams, FleetStep, Policy, RequiredInput};
+use super::{Carry, EnvParams, FleetStep, Policy, Reach, RequiredInput};
 use crate::invalid::{Invalid, in_range};
 
 /// A baseline in the list of policies.
@@ -92,6 +92,10 @@ impl<R: Rule> Policy for Baseline<R> {
             // `random` looks at nothing; rules with the full scene compute what they need.
             RequiredInput::Detections | RequiredInput::FullScene => 0,
         }
+    }
+
+    fn reach(&self) -> Reach {
+        R::REACH
     }
 
     fn work(&self, uavs: usize, users: usize, detections: usize) -> usize {

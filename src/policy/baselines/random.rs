@@ -3,7 +3,7 @@
 use rand::RngExt;
 
 use super::rule::{Rule, SEED_LEN, Slot, slot_rng, store_seed};
-use crate::policy::{Carry, RequiredInput};
+use crate::policy::{Carry, Reach, RequiredInput};
 
 #[derive(Default)]
 pub(super) struct Random;
@@ -12,6 +12,7 @@ impl Rule for Random {
     const NAME: &'static str = "random";
     const DESCRIPTION: &'static str = "Every UAV draws a heading in every slot.";
     const NEEDS: RequiredInput = RequiredInput::Detections;
+    const REACH: Reach = Reach::Links(0);
 
     fn memory_len(&self, _uavs: usize, _users: usize) -> usize {
         SEED_LEN

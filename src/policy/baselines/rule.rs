@@ -3,7 +3,7 @@
 use rand_chacha::ChaCha8Rng;
 
 use crate::env::Point;
-use crate::policy::{Carry, EnvParams, FleetGraph, FleetProfile, RequiredInput};
+use crate::policy::{Carry, EnvParams, FleetGraph, FleetProfile, Reach, RequiredInput};
 use crate::rng;
 
 /// One fleet in one slot.
@@ -21,6 +21,8 @@ pub(super) trait Rule: Default + Send + Sync {
     /// One sentence on what the rule does.
     const DESCRIPTION: &'static str;
     const NEEDS: RequiredInput;
+    /// As [`Policy::reach`](crate::policy::Policy::reach).
+    const REACH: Reach = Reach::Fleet;
 
     /// Length of a fleet's memory.
     fn memory_len(&self, uavs: usize, users: usize) -> usize;

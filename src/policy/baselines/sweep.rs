@@ -9,7 +9,7 @@ use super::rule::{Rule, Slot};
 use crate::env::Point;
 use crate::policy::flight::{distance, heading_toward, travel_slots};
 use crate::policy::memory::{self, GRID, RememberedUser, Sharing, UavMemory, remember, uav_memory_len};
-use crate::policy::{Carry, EnvParams, FleetProfile, Place, RequiredInput};
+use crate::policy::{Carry, EnvParams, FleetProfile, Place, Reach, RequiredInput};
 
 /// With or without shared memories. The memory is that of `policy::memory`.
 #[derive(Default)]
@@ -43,6 +43,7 @@ impl<const SHARED: bool> Rule for Sweep<SHARED> {
         "No prior knowledge: UAVs fan out, search, and serve the users that each found itself."
     };
     const NEEDS: RequiredInput = RequiredInput::OwnPositions;
+    const REACH: Reach = Reach::Links(if SHARED { 1 } else { 0 });
 
     fn memory_len(&self, uavs: usize, users: usize) -> usize {
         uavs * uav_memory_len(users)

@@ -11,8 +11,7 @@ use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::service::{App, Error, policies};
 use crate::serving::{
-    FleetMemory, Flight, LoadedPolicy, Members, OutputBuffers, Owner, PolicySpec, RecurrentState, Roster, RosterRules, Task,
-    UserMemory,
+    FleetMemory, Flight, Members, OutputBuffers, Owner, RecurrentState, Roster, RosterRules, Task, UserMemory,
 };
 
 pub(super) async fn act(
@@ -28,7 +27,7 @@ pub(super) async fn act(
     let state = if state.is_empty() { None } else { Some(RecurrentState::decode(state)?) };
     let policy = match &state {
         None => policies::resolve(app, spec).await?,
-        Some(state) => pinned_version(app, spec, state).await?,
+        Some(state) => policies::pinned(app, spec, &state.digest, "recurrent_state").await?,
     };
     let implementation = &*policy.implementation;
     let flight = request.flight.map(|options| Flight::new(&options, implementation).map(Arc::new)).transpose()?;
@@ -71,14 +70,4 @@ pub(super) async fn act(
     }
     let (uavs, decision, recurrent_state) = (fleet.uavs, output.decision, Some(next));
     Ok(Response { policy, uavs, canonical_of_request, decision, recurrent_state, flight, motion })
-}
-
-/// The version that wrote `state`: an episode stays on its version even if an alias has moved or a newer version has been
-/// published.
-async fn pinned_version(app: &App, spec: &PolicySpec, state: &RecurrentState) -> Result<Arc<LoadedPolicy>, Error> {
-    let found = app.registry.find_by_digest(spec, &state.digest)?.ok_or_else(|| {
-        let expected = format!("the recurrent_state of an earlier response of {spec}");
-        Error::from(Invalid::new("recurrent_state", "the state of another policy or version", expected))
-    })?;
-    policies::in_memory(app, found).await
 }

@@ -108,7 +108,7 @@ async fn load(app: &App, reference: PolicyRef) -> Result<Arc<LoadedPolicy>, Erro
 }
 
 /// The version that a look-up in the registry found, in memory.
-pub(in crate::service) async fn in_memory(app: &App, found: Resolved) -> Result<Arc<LoadedPolicy>, Error> {
+async fn in_memory(app: &App, found: Resolved) -> Result<Arc<LoadedPolicy>, Error> {
     match found {
         Resolved::InMemory(policy) => Ok(policy),
         // In a box, because it is rare and would make the futures of all requests larger.
@@ -123,6 +123,24 @@ pub(in crate::service) async fn in_memory(app: &App, found: Resolved) -> Result<
 /// [`Error::Internal`] if its checkpoint is damaged.
 pub(in crate::service) async fn resolve(app: &App, spec: &PolicySpec) -> Result<Arc<LoadedPolicy>, Error> {
     in_memory(app, app.registry.resolve(spec)?).await
+}
+
+/// The version with this digest that wrote a state of the caller, in memory: an episode stays on its version even if an alias has moved
+/// or a newer version has been published. `field` holds the state.
+///
+/// # Errors
+/// [`Error::Invalid`] if `spec` has no such version; otherwise as [`resolve`].
+pub(in crate::service) async fn pinned(
+    app: &App,
+    spec: &PolicySpec,
+    digest: &[u8; 32],
+    field: &'static str,
+) -> Result<Arc<LoadedPolicy>, Error> {
+    let found = app.registry.find_by_digest(spec, digest)?.ok_or_else(|| {
+        let expected = format!("the {field} of an earlier response of {spec}");
+        Error::from(Invalid::new(field, "the state of another policy or version", expected))
+    })?;
+    in_memory(app, found).await
 }
 
 /// A version and whether it is loaded.

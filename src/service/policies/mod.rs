@@ -18,7 +18,7 @@ pub use aliases::{AliasChange, aliases, delete_alias, history, set_alias};
 pub use deletion::{Retention, delete, delete_excess_checkpoints, delete_excess_versions};
 pub use info::PolicyDetails;
 pub use loading::{IndexEntry, Loads, fill_registry, index, load_policy, unload_policy};
-pub(super) use loading::{in_memory, resolve};
+pub(super) use loading::{pinned, resolve};
 pub use publish::{CheckpointSource, PublishRequest, Publisher, check_owner, check_publishable, publish, publish_bytes};
 pub(super) use publish::{NewVersion, publish_and_end};
 pub use upload_limit::{UploadLimit, UploadPermit};

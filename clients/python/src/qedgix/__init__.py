@@ -16,12 +16,14 @@ from ._async.environments import AsyncEnvironment
 from ._async.jobs import AsyncJob, AsyncJobs
 from ._async.policies import AsyncPolicies
 from ._async.sessions import AsyncActStream, AsyncFleet, AsyncLocalSession, AsyncSession
+from ._async.uavs import AsyncUav
 from ._settings import Retry
 from ._sync.client import Client
 from ._sync.environments import Environment
 from ._sync.jobs import Job, Jobs
 from ._sync.policies import Policies
 from ._sync.sessions import ActStream, Fleet, LocalSession, Session
+from ._sync.uavs import Uav
 from .environments import fleet_env, parallel_env, vector_env
 from .errors import (
     AlreadyExists,
@@ -78,6 +80,7 @@ __all__ = [
     "AsyncLocalSession",
     "AsyncPolicies",
     "AsyncSession",
+    "AsyncUav",
     "Attempt",
     "Checkpoint",
     "Client",
@@ -117,6 +120,7 @@ __all__ = [
     "SessionWarning",
     "Timings",
     "TooLarge",
+    "Uav",
     "Unauthenticated",
     "Unavailable",
     "World",

@@ -157,6 +157,14 @@ impl PolicyService for FixedResponse {
         unimplemented()
     }
 
+    async fn encode(&self, _: Request<v1::EncodeRequest>) -> Result<Response<v1::EncodeResponse>, Status> {
+        unimplemented()
+    }
+
+    async fn decide(&self, _: Request<v1::DecideRequest>) -> Result<Response<v1::DecideResponse>, Status> {
+        unimplemented()
+    }
+
     async fn open_session(&self, _: Request<v1::OpenSessionRequest>) -> Result<Response<v1::Session>, Status> {
         unimplemented()
     }

@@ -22,6 +22,7 @@ from .jobs import AsyncJobs
 from .policies import AsyncPolicies
 from .sessions import AsyncActStream, AsyncFleet, AsyncLocalSession, AsyncSession
 from .transport import AsyncTransport
+from .uavs import AsyncUav
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -197,6 +198,35 @@ class AsyncClient:
         session = AsyncLocalSession(self._transport, common, seed, recurrent_state)
         session.step = step
         return session
+
+    def uav(
+        self,
+        policy: str,
+        uav_id: str,
+        *,
+        uav_ids: Iterable[str],
+        user_ids: Iterable[str],
+        seed: int | None = None,
+        frame: Frame | None = None,
+        world: World | None = None,
+        state: bytes = b"",
+    ) -> AsyncUav:
+        """One UAV that decides alone. Nothing is sent before `encode`. All arguments but `uav_id` and `state` are the same for all
+        UAVs of the fleet.
+
+        Args:
+            policy: NAME (the newest version), NAME@ALIAS or NAME:VERSION. Not one that needs a scene.
+            uav_id: this UAV.
+            uav_ids: all UAVs of the fleet.
+            user_ids: all users; their positions need not be known.
+            seed: seed of the random choices of the policy. Default: 0.
+            frame: as for `session`.
+            world: as for `session`.
+            state: that of an earlier object, to continue.
+        """
+        first = pb.EncodeRequest(policy=policy, uav_ids=uav_ids, user_ids=user_ids, seed=seed)
+        Surroundings(frame, world).put(first)
+        return AsyncUav(self._transport, first, uav_id, state)
 
     async def act(
         self,

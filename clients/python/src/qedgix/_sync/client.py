@@ -23,6 +23,7 @@ from .jobs import Jobs
 from .policies import Policies
 from .sessions import ActStream, Fleet, LocalSession, Session
 from .transport import Transport
+from .uavs import Uav
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -198,6 +199,35 @@ class Client:
         session = LocalSession(self._transport, common, seed, recurrent_state)
         session.step = step
         return session
+
+    def uav(
+        self,
+        policy: str,
+        uav_id: str,
+        *,
+        uav_ids: Iterable[str],
+        user_ids: Iterable[str],
+        seed: int | None = None,
+        frame: Frame | None = None,
+        world: World | None = None,
+        state: bytes = b"",
+    ) -> Uav:
+        """One UAV that decides alone. Nothing is sent before `encode`. All arguments but `uav_id` and `state` are the same for all
+        UAVs of the fleet.
+
+        Args:
+            policy: NAME (the newest version), NAME@ALIAS or NAME:VERSION. Not one that needs a scene.
+            uav_id: this UAV.
+            uav_ids: all UAVs of the fleet.
+            user_ids: all users; their positions need not be known.
+            seed: seed of the random choices of the policy. Default: 0.
+            frame: as for `session`.
+            world: as for `session`.
+            state: that of an earlier object, to continue.
+        """
+        first = pb.EncodeRequest(policy=policy, uav_ids=uav_ids, user_ids=user_ids, seed=seed)
+        Surroundings(frame, world).put(first)
+        return Uav(self._transport, first, uav_id, state)
 
     def act(
         self,

@@ -97,6 +97,78 @@ class ActRequest(_message.Message):
     constraints: Constraints
     def __init__(self, policy: _Optional[str] = ..., graph: _Optional[_Union[Graph, _Mapping]] = ..., scene: _Optional[_Union[Scene, _Mapping]] = ..., session_id: _Optional[str] = ..., recurrent_state: _Optional[bytes] = ..., step: _Optional[int] = ..., run_id: _Optional[str] = ..., return_q_values: bool = ..., seed: _Optional[int] = ..., symmetric: bool = ..., frame: _Optional[_Union[Frame, _Mapping]] = ..., world: _Optional[_Union[World, _Mapping]] = ..., return_velocity: bool = ..., return_waypoint: bool = ..., constraints: _Optional[_Union[Constraints, _Mapping]] = ...) -> None: ...
 
+class EncodeRequest(_message.Message):
+    __slots__ = ("policy", "uav_ids", "user_ids", "observation", "state", "seed", "step", "frame", "world")
+    POLICY_FIELD_NUMBER: _ClassVar[int]
+    UAV_IDS_FIELD_NUMBER: _ClassVar[int]
+    USER_IDS_FIELD_NUMBER: _ClassVar[int]
+    OBSERVATION_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    SEED_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    WORLD_FIELD_NUMBER: _ClassVar[int]
+    policy: str
+    uav_ids: _containers.RepeatedScalarFieldContainer[str]
+    user_ids: _containers.RepeatedScalarFieldContainer[str]
+    observation: Node
+    state: bytes
+    seed: int
+    step: int
+    frame: Frame
+    world: World
+    def __init__(self, policy: _Optional[str] = ..., uav_ids: _Optional[_Iterable[str]] = ..., user_ids: _Optional[_Iterable[str]] = ..., observation: _Optional[_Union[Node, _Mapping]] = ..., state: _Optional[bytes] = ..., seed: _Optional[int] = ..., step: _Optional[int] = ..., frame: _Optional[_Union[Frame, _Mapping]] = ..., world: _Optional[_Union[World, _Mapping]] = ...) -> None: ...
+
+class EncodeResponse(_message.Message):
+    __slots__ = ("state", "message", "policy", "step", "message_links", "message_range")
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_FIELD_NUMBER: _ClassVar[int]
+    POLICY_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_LINKS_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_RANGE_FIELD_NUMBER: _ClassVar[int]
+    state: bytes
+    message: bytes
+    policy: PolicyRef
+    step: int
+    message_links: int
+    message_range: float
+    def __init__(self, state: _Optional[bytes] = ..., message: _Optional[bytes] = ..., policy: _Optional[_Union[PolicyRef, _Mapping]] = ..., step: _Optional[int] = ..., message_links: _Optional[int] = ..., message_range: _Optional[float] = ...) -> None: ...
+
+class DecideRequest(_message.Message):
+    __slots__ = ("policy", "state", "messages", "return_q_values", "return_velocity", "return_waypoint", "frame", "world")
+    POLICY_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    MESSAGES_FIELD_NUMBER: _ClassVar[int]
+    RETURN_Q_VALUES_FIELD_NUMBER: _ClassVar[int]
+    RETURN_VELOCITY_FIELD_NUMBER: _ClassVar[int]
+    RETURN_WAYPOINT_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    WORLD_FIELD_NUMBER: _ClassVar[int]
+    policy: str
+    state: bytes
+    messages: _containers.RepeatedScalarFieldContainer[bytes]
+    return_q_values: bool
+    return_velocity: bool
+    return_waypoint: bool
+    frame: Frame
+    world: World
+    def __init__(self, policy: _Optional[str] = ..., state: _Optional[bytes] = ..., messages: _Optional[_Iterable[bytes]] = ..., return_q_values: bool = ..., return_velocity: bool = ..., return_waypoint: bool = ..., frame: _Optional[_Union[Frame, _Mapping]] = ..., world: _Optional[_Union[World, _Mapping]] = ...) -> None: ...
+
+class DecideResponse(_message.Message):
+    __slots__ = ("action", "state", "policy", "step", "missing_uav_ids")
+    ACTION_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    POLICY_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    MISSING_UAV_IDS_FIELD_NUMBER: _ClassVar[int]
+    action: Action
+    state: bytes
+    policy: PolicyRef
+    step: int
+    missing_uav_ids: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, action: _Optional[_Union[Action, _Mapping]] = ..., state: _Optional[bytes] = ..., policy: _Optional[_Union[PolicyRef, _Mapping]] = ..., step: _Optional[int] = ..., missing_uav_ids: _Optional[_Iterable[str]] = ...) -> None: ...
+
 class Constraints(_message.Message):
     __slots__ = ("no_fly", "min_separation", "home", "max_distance", "return_in_time")
     NO_FLY_FIELD_NUMBER: _ClassVar[int]
