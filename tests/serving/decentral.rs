@@ -52,18 +52,13 @@ fn larger_fleets_and_rules_pass_or_fail_by_what_they_need() {
     }
 }
 
-/// One UAV: what it keeps between calls is its state.
-struct Uav {
-    id: String,
-    state: Bytes,
-}
-
 /// A fleet that flies over gRPC.
 struct Fleet {
     client: PolicyServiceClient<Channel>,
     policy: &'static str,
     env: BatchEnv,
-    uavs: Vec<Uav>,
+    /// What each UAV keeps between calls.
+    states: Vec<Bytes>,
 }
 
 impl Fleet {
@@ -71,8 +66,7 @@ impl Fleet {
         let config = EnvConfig::default();
         let mut env = BatchEnv::new(&config, 1).unwrap();
         env.reset(&[seed]);
-        let uavs = (0..config.uavs).map(|i| Uav { id: format!("uav-{i}"), state: Bytes::new() }).collect();
-        Self { client: server.grpc().await, policy, env, uavs }
+        Self { client: server.grpc().await, policy, env, states: vec![Bytes::new(); config.uavs] }
     }
 
     fn graph(&self) -> v1::Graph {
@@ -95,7 +89,7 @@ impl Fleet {
 
     fn encode(&self, i: usize) -> v1::EncodeRequest {
         let graph = self.graph();
-        let begins = self.uavs[i].state.is_empty();
+        let begins = self.states[i].is_empty();
         let ids = |kind: v1::NodeKind| {
             let of_kind = graph.nodes.iter().filter(|node| begins && node.kind == i32::from(kind));
             of_kind.map(|node| node.id.clone()).collect()
@@ -105,7 +99,7 @@ impl Fleet {
             uav_ids: ids(v1::NodeKind::Uav),
             user_ids: ids(v1::NodeKind::User),
             observation: Some(graph.nodes[i].clone()),
-            state: self.uavs[i].state.clone(),
+            state: self.states[i].clone(),
             seed: begins.then_some(5),
             ..Default::default()
         }
@@ -124,7 +118,7 @@ impl Fleet {
     /// One slot, in which every UAV hears those within the range that it asks for.
     async fn slot(&mut self) -> Vec<v1::Action> {
         let mut encoded = Vec::new();
-        for i in 0..self.uavs.len() {
+        for i in 0..self.states.len() {
             let request = self.encode(i);
             let first = self.client.encode(request.clone()).await.unwrap().into_inner();
             // A UAV that restarts before it has decided gets the same again.
@@ -133,7 +127,7 @@ impl Fleet {
         }
         let at: Vec<Point> = points(self.env.uav_xy()).collect();
         let mut actions = Vec::new();
-        for i in 0..self.uavs.len() {
+        for i in 0..self.states.len() {
             let range = encoded[i].message_range.unwrap();
             let near = |k: &usize| (at[*k][0] - at[i][0]).hypot(at[*k][1] - at[i][1]) <= range;
             // The own message and repeated ones have no effect, and neither has the order.
@@ -145,7 +139,7 @@ impl Fleet {
             assert_eq!(self.client.decide(request).await.unwrap().into_inner(), decided);
             assert!(decided.missing_uav_ids.is_empty());
             actions.push(decided.action.unwrap());
-            self.uavs[i].state = decided.state;
+            self.states[i] = decided.state;
         }
         actions
     }
@@ -188,8 +182,9 @@ async fn lost_messages_are_named_and_wrong_ones_refused() {
     let mut client = fleet.client.clone();
     let mut damaged = other.message.to_vec();
     damaged[30] ^= 1;
-    assert_invalid(client.decide(fleet.decide(&encoded.state, vec![damaged.into()])).await, "messages[0]", "");
-    fleet.uavs[0].state = decided.state.clone();
+    let size = format!("{} bytes", damaged.len());
+    assert_invalid(client.decide(fleet.decide(&encoded.state, vec![damaged.into()])).await, "messages[0]", &size);
+    fleet.states[0] = decided.state.clone();
     let next = client.encode(fleet.encode(0)).await.unwrap().into_inner();
     assert_invalid(client.decide(fleet.decide(&next.state, vec![other.message.clone()])).await, "messages[0]", "a message of step 0");
     let foreign = v1::EncodeRequest { seed: Some(6), ..Fleet::start(&server, "qedgix", 20_000).await.encode(1) };

@@ -13,8 +13,11 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 import qedgix
+
+Floats = NDArray[np.float64]
 
 SPEED, TRANSMISSION_RANGE, DETECTION_RANGE = 0.04, 0.12, 0.28
 UAVS, USERS = [f"uav-{i}" for i in range(3)], [f"user-{j}" for j in range(5)]
@@ -68,13 +71,13 @@ class Process:
         self.process.join()
 
 
-def observe(uavs: np.ndarray, users: np.ndarray, aoi: np.ndarray) -> list[dict[str, tuple[float, ...]]]:
+def observe(uavs: Floats, users: Floats, aoi: Floats) -> list[dict[str, tuple[float, ...]]]:
     """What each UAV detects."""
     seen: list[dict[str, tuple[float, ...]]] = []
     for own, at in zip(UAVS, uavs):
         near: dict[str, tuple[float, ...]] = {name: (*(to - at),) for name, to in zip(UAVS, uavs) if name != own}
         near |= {name: (*(to - at), age) for name, to, age in zip(USERS, users, aoi)}
-        seen.append({name: to for name, to in near.items() if np.hypot(*to[:2]) <= DETECTION_RANGE})
+        seen.append({name: to for name, to in near.items() if np.hypot(to[0], to[1]) <= DETECTION_RANGE})
     return seen
 
 
@@ -91,7 +94,8 @@ def main() -> None:
         processes = [Process(arguments.address, arguments.policy, name, Path(memory)) for name in UAVS]
         for episode in range(arguments.layouts):
             draw = np.random.default_rng(episode)
-            uavs, users, aoi = np.full((3, 2), 0.5), draw.random((5, 2)), np.zeros(5)
+            uavs: Floats = np.full((3, 2), 0.5)
+            users, aoi = draw.random((5, 2)), np.asarray([0.0] * 5)
             with client.session(arguments.policy, seed=episode) as joint:
                 for step in range(arguments.slots):
                     seen = observe(uavs, users, aoi)
