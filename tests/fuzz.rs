@@ -183,9 +183,8 @@ fn messages() -> Vec<(&'static str, Vec<u8>)> {
     };
     let environment = v1::CreateEnvironmentRequest { environment_id: "e".into(), environment: config, ..Default::default() };
     let observation = graph().nodes.into_iter().find(|node| node.kind == i32::from(v1::NodeKind::Uav));
-    let of_kind = |kind: v1::NodeKind| {
-        graph().nodes.into_iter().filter(|node| node.kind == i32::from(kind)).map(|node| node.id).collect()
-    };
+    let of_kind =
+        |kind: v1::NodeKind| graph().nodes.into_iter().filter(|node| node.kind == i32::from(kind)).map(|node| node.id).collect();
     let (uav_ids, user_ids) = (of_kind(v1::NodeKind::Uav), of_kind(v1::NodeKind::User));
     let alone = v1::EncodeRequest { policy: "qedgix".into(), uav_ids, user_ids, observation, ..Default::default() };
     let step = v1::StepRequest { environment_id: "e".into(), ..Default::default() };

@@ -15,12 +15,14 @@ use crate::serving::decentral::audit::{Audit, Trial, audit};
 
 /// Flags of `audit`.
 #[derive(Args, Debug)]
-#[command(after_help = "Exit status: 0 if each UAV, alone with its sensors and the messages that the policy needs, takes the same actions; 1 if not.
+#[command(
+    after_help = "Exit status: 0 if each UAV, alone with its sensors and the messages that the policy needs, takes the same actions; 1 if not.
 
 Examples:
   qedgix audit --policy qedgix
   qedgix audit --policy my-policy.safetensors --uavs 6 --users 12
-  qedgix audit --policy tour          # fails: needs all positions")]
+  qedgix audit --policy tour          # fails: needs all positions"
+)]
 pub struct AuditArgs {
     /// A checkpoint file, a bundled policy or a baseline
     #[arg(long, env = "QEDGIX_POLICY")]
@@ -81,8 +83,7 @@ pub async fn run(args: AuditArgs) -> anyhow::Result<()> {
         return Err(Exit::new(1, format!("{} fails: {why}", args.policy)).into());
     }
     let threads = args.threads.unwrap_or_else(all_cores);
-    let result =
-        audit(&*policy, &env, &list.seeds(args.episodes), threads).with_context(|| format!("policy {}", args.policy))?;
+    let result = audit(&*policy, &env, &list.seeds(args.episodes), threads).with_context(|| format!("policy {}", args.policy))?;
     let why = failure(&result);
     if args.json {
         outln!("{:#}", report(&args.policy, &*policy, &result, why))?;
@@ -101,7 +102,9 @@ fn failure(audit: &Audit) -> Option<&'static str> {
     match audit.reach {
         _ if audit.passed() => None,
         Reach::Fleet => Some("the decision of a UAV depends on all UAVs, also on those that no message over a few links reaches"),
-        Reach::Links(_) => Some("with the messages that it declares to need, a UAV alone decides otherwise than the joint policy"),
+        Reach::Links(_) => {
+            Some("with the messages that it declares to need, a UAV alone decides otherwise than the joint policy")
+        }
     }
 }
 

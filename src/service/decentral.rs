@@ -12,8 +12,7 @@ use crate::invalid::Invalid;
 use crate::policy::Reach;
 use crate::service::keys::Caller;
 use crate::serving::decentral::{self, DecidedAlone, Member, Message, Observation, Slot, UavState};
-use crate::serving::{
-    FleetIds, FleetMemory, Flight, FlightOptions, LoadedPolicy, Node, NodeDetection, PolicySpec};
+use crate::serving::{FleetIds, FleetMemory, Flight, FlightOptions, LoadedPolicy, Node, NodeDetection, PolicySpec};
 
 /// A request for the first half of a slot.
 #[derive(Clone, Debug)]
@@ -100,7 +99,10 @@ pub async fn encode(app: &App, caller: &Caller, request: EncodeRequest, deadline
     let policy = resolve(app, &request.policy, state.as_ref()).await?;
     let (uavs, users) = state.as_ref().map_or((request.uav_ids.len(), request.user_ids.len()), |state| state.ids.size());
     let cost = super::act::decoding_cost(uavs + users, request.observation.detections.len());
-    let work = { let policy = policy.clone(); move || encode_with(policy, state, request) };
+    let work = {
+        let policy = policy.clone();
+        move || encode_with(policy, state, request)
+    };
     let encoded = super::act::decode(app, caller, cost, deadline, work).await??;
     check_size(app, encoded.state.len())?;
     Ok(encoded)
@@ -172,7 +174,10 @@ pub async fn decide(app: &App, caller: &Caller, request: DecideRequest, deadline
     }
     let bytes: usize = request.messages.iter().map(Bytes::len).sum();
     let cost = policy.implementation.work(uavs, users, bytes / 20);
-    let work = { let policy = policy.clone(); move || decide_with(policy, state, request) };
+    let work = {
+        let policy = policy.clone();
+        move || decide_with(policy, state, request)
+    };
     let decided = app.engine.call(caller.owner(), cost, deadline, work).await??;
     check_size(app, decided.state.len())?;
     Ok(decided)
@@ -252,6 +257,7 @@ fn check_size(app: &App, bytes: usize) -> Result<(), Error> {
     if bytes <= limit {
         return Ok(());
     }
-    let message = format!("the state of this UAV has {bytes} bytes, and a request can return at most {limit} (5/8 of --max-message-size)");
+    let message =
+        format!("the state of this UAV has {bytes} bytes, and a request can return at most {limit} (5/8 of --max-message-size)");
     Err(Error::TooLarge { message, limit: Some(limit as u64) })
 }

@@ -186,10 +186,18 @@ async fn lost_messages_are_named_and_wrong_ones_refused() {
     assert_invalid(client.decide(fleet.decide(&encoded.state, vec![damaged.into()])).await, "messages[0]", &size);
     fleet.states[0] = decided.state.clone();
     let next = client.encode(fleet.encode(0)).await.unwrap().into_inner();
-    assert_invalid(client.decide(fleet.decide(&next.state, vec![other.message.clone()])).await, "messages[0]", "a message of step 0");
+    assert_invalid(
+        client.decide(fleet.decide(&next.state, vec![other.message.clone()])).await,
+        "messages[0]",
+        "a message of step 0",
+    );
     let foreign = v1::EncodeRequest { seed: Some(6), ..Fleet::start(&server, "qedgix", 20_000).await.encode(1) };
     let foreign = client.encode(foreign).await.unwrap().into_inner();
-    assert_invalid(client.decide(fleet.decide(&encoded.state, vec![foreign.message])).await, "messages[0]", "a message of another");
+    assert_invalid(
+        client.decide(fleet.decide(&encoded.state, vec![foreign.message])).await,
+        "messages[0]",
+        "a message of another",
+    );
 
     // States of the wrong half of a slot, of another UAV, step or policy.
     assert_invalid(client.decide(fleet.decide(&decided.state, vec![])).await, "state", "a state after Decide");
@@ -230,7 +238,8 @@ async fn forged_states_and_messages_are_refused_or_used_and_never_panic() {
         sealed(body)
     };
     for _ in 0..400 {
-        for request in [fleet.decide(&forge(&encoded.state), vec![message.clone()]), fleet.decide(&encoded.state, vec![forge(&message)])]
+        for request in
+            [fleet.decide(&forge(&encoded.state), vec![message.clone()]), fleet.decide(&encoded.state, vec![forge(&message)])]
         {
             if let Err(status) = client.decide(request).await {
                 assert_eq!(status.code(), Code::InvalidArgument, "{status:?}");

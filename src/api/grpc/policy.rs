@@ -9,9 +9,9 @@ use tonic::{Request, Response, Status, Streaming};
 
 use super::{deadline, stream};
 use crate::api::auth::{caller, count_message};
-use crate::api::convert::{decentral, flight};
 use crate::api::convert::request::open_session;
 use crate::api::convert::response::{Wanted, act_response};
+use crate::api::convert::{decentral, flight};
 use crate::api::errors::act_error;
 use crate::invalid::in_range;
 use crate::service::keys::Caller;

@@ -166,8 +166,7 @@ impl TryFrom<Graph> for FleetInput {
 impl Node {
     /// The node, not checked yet.
     pub(super) fn into_domain(self) -> serving::Node<Vec<serving::NodeDetection>> {
-        let detection =
-            |d: Detection| serving::NodeDetection { target_id: d.target_id, rel: [d.rel_x, d.rel_y], aoi: d.aoi };
+        let detection = |d: Detection| serving::NodeDetection { target_id: d.target_id, rel: [d.rel_x, d.rel_y], aoi: d.aoi };
         serving::Node {
             id: self.id,
             is_uav: matches!(self.kind, NodeKind::Uav),

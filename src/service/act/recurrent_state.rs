@@ -10,9 +10,7 @@ use super::request::{Placed, Request, Response};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::service::{App, Error, policies};
-use crate::serving::{
-    FleetMemory, Flight, Members, OutputBuffers, Owner, RecurrentState, Roster, RosterRules, Task, UserMemory,
-};
+use crate::serving::{FleetMemory, Flight, Members, OutputBuffers, Owner, RecurrentState, Roster, RosterRules, Task, UserMemory};
 
 pub(super) async fn act(
     app: &App,

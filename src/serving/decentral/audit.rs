@@ -146,8 +146,7 @@ impl<'a> Flight<'a> {
 
     /// Decides and flies one slot. Returns the bytes of all messages.
     fn slot(&mut self) -> Result<usize, Invalid> {
-        let (uavs, users): (Vec<Point>, Vec<Point>) =
-            (points(self.env.uav_xy()).collect(), points(self.env.user_xy()).collect());
+        let (uavs, users): (Vec<Point>, Vec<Point>) = (points(self.env.uav_xy()).collect(), points(self.env.user_xy()).collect());
         let aoi = self.env.aoi().to_vec();
         let scene = FleetGraph::from_scene(&uavs, &users, &aoi, self.params.ranges());
         let reported = self.reported(&scene, &uavs, &aoi)?;
@@ -212,7 +211,11 @@ impl<'a> Flight<'a> {
                 .iter()
                 .map(|d| {
                     let target = d.target as usize;
-                    NodeDetection { target_id: id(target), rel: d.rel.map(f64::from), aoi: target.checked_sub(m).map(|j| aoi[j].into()) }
+                    NodeDetection {
+                        target_id: id(target),
+                        rel: d.rel.map(f64::from),
+                        aoi: target.checked_sub(m).map(|j| aoi[j].into()),
+                    }
                 })
                 .collect::<Vec<_>>()
                 .into_iter(),
