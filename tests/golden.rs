@@ -3,15 +3,16 @@
 //!
 //! Checks every `*.safetensors` in `tests/golden`, or in the directory `QEDGIX_GOLDEN_DIR` if that variable is set. Prints each
 //! file with the tensor that comes closest to its tolerance. A file fails if a tensor is missing, unexpected or of another shape.
+//! Repeats all with every vector width of the processor, in a process of its own, unless `QEDGIX_VECTOR_WIDTH` is set.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
+use std::process::{Command, ExitCode};
 use std::str::FromStr;
 
 use qedgix::learner::Episodes;
 use qedgix::learner::loss::{Loss, TdLambda, Trace};
-use qedgix::nn::Adam;
+use qedgix::nn::{Adam, VECTOR_WIDTH_VARIABLE, VectorWidth};
 use qedgix::policy::mixer::MixerKind;
 use qedgix::policy::{
     AgentConfig, Aggregation, Dims, EnvParams, Geometry, GeometryConfig, Gnn, HopSearch, Identity, Memory, ObservationKind,
@@ -27,6 +28,24 @@ const TOLERANCE_AFTER: f64 = 2e-3;
 type Checked<T> = Result<T, String>;
 
 fn main() -> ExitCode {
+    if std::env::var_os(VECTOR_WIDTH_VARIABLE).is_some() { check_all() } else { check_widths() }
+}
+
+/// Runs this program with each vector width.
+fn check_widths() -> ExitCode {
+    let program = std::env::current_exe().expect("the path of this program");
+    let mut code = ExitCode::SUCCESS;
+    for width in VectorWidth::available() {
+        println!("vector width {}", width.name());
+        let status = Command::new(&program).env(VECTOR_WIDTH_VARIABLE, width.name()).status().expect("this program runs");
+        if !status.success() {
+            code = ExitCode::FAILURE;
+        }
+    }
+    code
+}
+
+fn check_all() -> ExitCode {
     let own = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden");
     let dir = std::env::var_os("QEDGIX_GOLDEN_DIR").map_or(own, PathBuf::from);
     let files = match golden_files(&dir) {

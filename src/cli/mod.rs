@@ -30,11 +30,16 @@ mod worker;
 use std::process::ExitCode;
 
 use anyhow::Context;
-use clap::{Parser, Subcommand};
+use clap::error::ErrorKind;
+use clap::{CommandFactory, Parser, Subcommand};
+
+use crate::nn::{VECTOR_WIDTH_VARIABLE, VectorWidth};
 
 /// Trains and serves policies that steer UAV fleets to keep data fresh (Age of Information)
 #[derive(Debug, Parser)]
 #[command(name = "qedgix", version, arg_required_else_help = true)]
+#[command(after_help = "Environment:
+  QEDGIX_VECTOR_WIDTH  widest vector units used: portable, neon, avx2 or avx512 [default: the processor's widest]")]
 struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -79,6 +84,11 @@ pub fn run() -> ExitCode {
         Ok(cli) => cli,
         Err(message) => return output::print_usage(&message),
     };
+    if let Err(value) = VectorWidth::cap() {
+        let names = VectorWidth::ALL.map(VectorWidth::name).join(", ");
+        let message = format!("{VECTOR_WIDTH_VARIABLE}={value}: expected one of {names}\n");
+        return output::print_usage(&Cli::command().error(ErrorKind::InvalidValue, message));
+    }
     match cli.command {
         Command::Serve(args) => block_on(serve::run(args)),
         Command::Demo(args) => block_on(demo::run(args)),

@@ -4,14 +4,19 @@
 //! Y = X Wt (weights are transposed once per update), dX = dY W, dW += dYt X. A tile of C stays in vector registers while the
 //! kernel runs over k.
 //!
-//! Every element of C is summed over k in the same order, for any batch size and any row, by fused multiply-adds. Even and odd
-//! terms are summed separately, which lowers the rounding error and hides latency. So a policy's result for a fleet does not
-//! depend on the other fleets in the batch. General-purpose products have special cases for few rows and do not guarantee this.
-//! The kernel allocates nothing, packs nothing and starts no threads: callers split the work.
+//! Every element of C is summed over k in the same order, for any batch size, row and vector width, by fused multiply-adds (by
+//! multiplications and additions in the portable form). Even and odd terms are summed separately, which lowers the rounding error
+//! and hides latency. So a policy's result for a fleet does not depend on the other fleets in the batch. General-purpose products
+//! have special cases for few rows and do not guarantee this. The kernel allocates nothing, packs nothing (panels of B at these
+//! sizes fit into the first-level cache as they are) and starts no threads: callers split the work.
+//!
+//! Tiles have 6 rows. With AVX-512, they are 32 columns wide, and both sets of 6 x 2 sums are in its 32 registers. AVX2 has 16
+//! registers and NEON vectors of 4 numbers, so their tiles are 16 columns wide, and the even terms are summed before the odd ones.
 
-use pulp::{Arch, Simd, WithSimd};
+use pulp::{Simd, WithSimd};
 
 use super::real::Real;
+use super::simd::{VectorWidth, simd};
 
 /// A: element (i, k) is `data[i * row_stride + k * col_stride]`; one of the strides is 1.
 #[derive(Clone, Copy, Debug)]
@@ -69,23 +74,26 @@ const DEPTH: usize = 144;
 ///
 /// # Panics
 /// If a slice is too short for its shape.
-pub fn matmul<T: Real>(
-    (m, k, n): (usize, usize, usize),
-    a: Lhs<'_, T>,
-    b: Rhs<'_, T>,
+pub fn matmul<T: Real>(shape: (usize, usize, usize), a: Lhs<'_, T>, b: Rhs<'_, T>, c: Out<'_, T>, initial: InitialValue<'_, T>) {
+    if let Some(product) = Product::new(shape, (a, b), c, initial) {
+        simd(product);
+    }
+}
+
+/// Like [`matmul`], but with vectors of this width, whatever the environment says.
+///
+/// # Panics
+/// If a slice is too short for its shape.
+pub fn matmul_with<T: Real>(
+    width: VectorWidth,
+    shape: (usize, usize, usize),
+    (a, b): (Lhs<'_, T>, Rhs<'_, T>),
     c: Out<'_, T>,
     initial: InitialValue<'_, T>,
 ) {
-    if m == 0 || n == 0 {
-        return;
+    if let Some(product) = Product::new(shape, (a, b), c, initial) {
+        width.run(product);
     }
-    assert!(c.data.len() >= (m - 1) * c.stride + n && c.stride >= n, "C is too short");
-    assert!(k == 0 || a.data.len() > (m - 1) * a.row_stride + (k - 1) * a.col_stride, "A is too short");
-    assert!(k == 0 || b.data.len() >= (k - 1) * b.stride + n, "B is too short");
-    if let InitialValue::Bias(bias) = initial {
-        assert!(bias.len() >= n, "the bias is too short");
-    }
-    Arch::new().dispatch(Product { m, k, n, a, b, c, initial });
 }
 
 struct Product<'a, T> {
@@ -98,30 +106,40 @@ struct Product<'a, T> {
     initial: InitialValue<'a, T>,
 }
 
+impl<'a, T: Real> Product<'a, T> {
+    /// `None` if C is empty.
+    fn new(
+        (m, k, n): (usize, usize, usize),
+        (a, b): (Lhs<'a, T>, Rhs<'a, T>),
+        c: Out<'a, T>,
+        initial: InitialValue<'a, T>,
+    ) -> Option<Self> {
+        if m == 0 || n == 0 {
+            return None;
+        }
+        assert!(c.data.len() >= (m - 1) * c.stride + n && c.stride >= n, "C is too short");
+        assert!(k == 0 || a.data.len() > (m - 1) * a.row_stride + (k - 1) * a.col_stride, "A is too short");
+        assert!(a.col_stride == 1 || a.col_stride >= m, "rows of A overlap");
+        assert!(k == 0 || b.data.len() >= (k - 1) * b.stride + n && b.stride >= n, "B is too short");
+        if let InitialValue::Bias(bias) = initial {
+            assert!(bias.len() >= n, "the bias is too short");
+        }
+        Some(Self { m, k, n, a, b, c, initial })
+    }
+}
+
 impl<T: Real> WithSimd for Product<'_, T> {
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
-        let lanes = T::lanes::<S>();
         let mut k0 = 0;
         loop {
             let depth = DEPTH.min(self.k - k0);
-            let mut j = 0;
-            while j < self.n {
-                let left = self.n - j;
-                let width = left.min(2 * lanes);
-                // For whole vectors the width is known to the compiler, so that only the last columns use masks.
-                if left >= 2 * lanes {
-                    self.columns::<S, 2>(simd, k0, depth, j, 2 * lanes);
-                } else if left == lanes {
-                    self.columns::<S, 1>(simd, k0, depth, j, lanes);
-                } else if left > lanes {
-                    self.columns::<S, 2>(simd, k0, depth, j, left);
-                } else {
-                    self.columns::<S, 1>(simd, k0, depth, j, left);
-                }
-                j += width;
+            if S::F32_LANES >= 8 {
+                self.terms::<S, 2>(simd, k0, depth);
+            } else {
+                self.terms::<S, 4>(simd, k0, depth);
             }
             k0 += depth;
             if k0 >= self.k {
@@ -133,16 +151,40 @@ impl<T: Real> WithSimd for Product<'_, T> {
 }
 
 impl<T: Real> Product<'_, T> {
-    /// Columns j..j + width of C, terms k0..k0 + depth of the sums.
+    /// Terms k0..k0 + depth of all sums, for V vectors of columns at a time.
     #[inline(always)]
-    fn columns<S: Simd, const V: usize>(&mut self, simd: S, k0: usize, depth: usize, j: usize, width: usize) {
-        let mut i = 0;
-        // Two sets of 6 x 2 sums fit into 32 registers, two sets of 2 x 2 into 16.
-        if S::REGISTER_COUNT >= 32 {
-            while i + 6 <= self.m {
-                self.tile::<S, 6, V>(simd, (i, j, k0), depth, width);
-                i += 6;
+    fn terms<S: Simd, const V: usize>(&mut self, simd: S, k0: usize, depth: usize) {
+        let lanes = T::lanes::<S>();
+        let mut j = 0;
+        while j < self.n {
+            let left = self.n - j;
+            // For whole vectors the width is known to the compiler, so that only the last columns use masks.
+            if left >= V * lanes {
+                self.columns::<S, V>(simd, (j, k0), depth, V * lanes);
+            } else if left > 2 * lanes {
+                self.columns::<S, V>(simd, (j, k0), depth, left);
+            } else if left > lanes {
+                self.columns::<S, 2>(simd, (j, k0), depth, left);
+            } else if left == lanes {
+                self.columns::<S, 1>(simd, (j, k0), depth, lanes);
+            } else {
+                self.columns::<S, 1>(simd, (j, k0), depth, left);
             }
+            j += V * lanes;
+        }
+    }
+
+    /// Columns j..j + width of C.
+    #[inline(always)]
+    fn columns<S: Simd, const V: usize>(&mut self, simd: S, (j, k0): (usize, usize), depth: usize, width: usize) {
+        let mut i = 0;
+        while i + 6 <= self.m {
+            self.tile::<S, 6, V>(simd, (i, j, k0), depth, width);
+            i += 6;
+        }
+        if i + 3 <= self.m {
+            self.tile::<S, 3, V>(simd, (i, j, k0), depth, width);
+            i += 3;
         }
         while i + 2 <= self.m {
             self.tile::<S, 2, V>(simd, (i, j, k0), depth, width);
@@ -153,6 +195,7 @@ impl<T: Real> Product<'_, T> {
         }
     }
 
+    /// Rows i..i + R and columns j..j + width of C.
     #[inline(always)]
     fn tile<S: Simd, const R: usize, const V: usize>(
         &mut self,
@@ -162,65 +205,27 @@ impl<T: Real> Product<'_, T> {
         width: usize,
     ) {
         let lanes = T::lanes::<S>();
-        let last = width - (V - 1) * lanes;
         let mut sums = [[T::splat(simd, T::ZERO); V]; R];
         match self.initial {
             InitialValue::Zero => {}
-            InitialValue::Bias(bias) => {
-                for v in 0..V {
-                    let at = j + v * lanes;
-                    let x = T::load(simd, &bias[at..at + if v + 1 < V { lanes } else { last }]);
-                    for row in &mut sums {
-                        row[v] = x;
-                    }
-                }
-            }
+            InitialValue::Bias(bias) => sums = [load_row::<T, S, V>(simd, &bias[j..][..width]); R],
             InitialValue::Previous => {
                 for (r, row) in sums.iter_mut().enumerate() {
-                    let c = &self.c.data[(i + r) * self.c.stride + j..][..width];
-                    for (v, x) in row.iter_mut().enumerate() {
-                        *x = T::load(simd, &c[v * lanes..if v + 1 < V { (v + 1) * lanes } else { width }]);
-                    }
+                    *row = load_row::<T, S, V>(simd, &self.c.data[(i + r) * self.c.stride + j..][..width]);
                 }
             }
         }
         if depth > 0 {
-            let b = &self.b.data[k0 * self.b.stride + j..];
-            let b_row = |k: usize| &b[k * self.b.stride..][..width];
-            let mut odd = [[T::splat(simd, T::ZERO); V]; R];
+            let b = Strided { data: &self.b.data[k0 * self.b.stride + j..], stride: self.b.stride };
             if self.a.col_stride == 1 {
                 let mut rows: [&[T]; R] = [&[]; R];
                 for (r, row) in rows.iter_mut().enumerate() {
                     *row = &self.a.data[(i + r) * self.a.row_stride + k0..][..depth];
                 }
-                let mut k = 0;
-                while k + 1 < depth {
-                    accumulate(simd, |r| rows[r][k], b_row(k), &mut sums);
-                    accumulate(simd, |r| rows[r][k + 1], b_row(k + 1), &mut odd);
-                    k += 2;
-                }
-                if k < depth {
-                    accumulate(simd, |r| rows[r][k], b_row(k), &mut sums);
-                }
+                b.add_products::<S, R, V>(simd, (depth, width), RowMajor(rows), &mut sums);
             } else {
-                let a = &self.a.data[i + k0 * self.a.col_stride..];
-                let a_row = |k: usize| -> &[T; R] { a[k * self.a.col_stride..][..R].try_into().expect("R numbers") };
-                let mut k = 0;
-                while k + 1 < depth {
-                    let (a, next) = (a_row(k), a_row(k + 1));
-                    accumulate(simd, |r| a[r], b_row(k), &mut sums);
-                    accumulate(simd, |r| next[r], b_row(k + 1), &mut odd);
-                    k += 2;
-                }
-                if k < depth {
-                    let a = a_row(k);
-                    accumulate(simd, |r| a[r], b_row(k), &mut sums);
-                }
-            }
-            for (row, odd) in sums.iter_mut().zip(&odd) {
-                for (x, &y) in row.iter_mut().zip(odd) {
-                    *x = T::add_vectors(simd, *x, y);
-                }
+                let a = Strided { data: &self.a.data[i + k0 * self.a.col_stride..], stride: self.a.col_stride };
+                b.add_products::<S, R, V>(simd, (depth, width), a, &mut sums);
             }
         }
         for (r, row) in sums.iter().enumerate() {
@@ -232,6 +237,160 @@ impl<T: Real> Product<'_, T> {
     }
 }
 
+/// Columns of R rows of A, in pairs.
+trait Columns<T, const R: usize>: Copy {
+    /// A pair of columns.
+    type Pair: Copy;
+
+    /// The first `count` pairs.
+    fn pairs(self, count: usize) -> impl Iterator<Item = Self::Pair> + Clone;
+
+    /// Row r of a column of a pair.
+    fn of_pair(self, pair: Self::Pair, odd: bool, r: usize) -> T;
+
+    /// Row r of column k.
+    fn at(self, k: usize, r: usize) -> T;
+}
+
+/// R rows of equal length.
+#[derive(Clone, Copy)]
+struct RowMajor<'a, T, const R: usize>([&'a [T]; R]);
+
+impl<T: Real, const R: usize> Columns<T, R> for RowMajor<'_, T, R> {
+    type Pair = usize;
+
+    #[inline(always)]
+    fn pairs(self, count: usize) -> impl Iterator<Item = usize> + Clone {
+        0..count
+    }
+
+    #[inline(always)]
+    fn of_pair(self, pair: usize, odd: bool, r: usize) -> T {
+        self.0[r][2 * pair + usize::from(odd)]
+    }
+
+    #[inline(always)]
+    fn at(self, k: usize, r: usize) -> T {
+        self.0[r][k]
+    }
+}
+
+/// Rows of numbers, `stride` apart. The last one may end early.
+#[derive(Clone, Copy)]
+struct Strided<'a, T> {
+    data: &'a [T],
+    stride: usize,
+}
+
+impl<'a, T: Real, const R: usize> Columns<T, R> for Strided<'a, T> {
+    type Pair = &'a [T];
+
+    #[inline(always)]
+    fn pairs(self, count: usize) -> impl Iterator<Item = &'a [T]> + Clone {
+        self.data.chunks_exact(2 * self.stride).take(count)
+    }
+
+    #[inline(always)]
+    fn of_pair(self, pair: &'a [T], odd: bool, r: usize) -> T {
+        pair[usize::from(odd) * self.stride..][..R][r]
+    }
+
+    #[inline(always)]
+    fn at(self, k: usize, r: usize) -> T {
+        self.data[k * self.stride..][..R][r]
+    }
+}
+
+impl<T: Real> Strided<'_, T> {
+    /// Adds `depth` products of a column of A and a row of B, which is `self`, to `sums`.
+    #[inline(always)]
+    fn add_products<S: Simd, const R: usize, const V: usize>(
+        self,
+        simd: S,
+        (depth, width): (usize, usize),
+        a: impl Columns<T, R>,
+        sums: &mut [[T::Vector<S>; V]; R],
+    ) {
+        let mut odd = [[T::splat(simd, T::ZERO); V]; R];
+        // The last pair is apart, because the last row of B may be shorter than the stride.
+        let stride = self.stride;
+        let pairs = (depth - 1) / 2;
+        let b = self.data.chunks_exact(2 * stride);
+        // Both sets of sums, a row of B and a number of A.
+        if 2 * R * V + V + 1 <= S::REGISTER_COUNT {
+            for (a_pair, b) in a.pairs(pairs).zip(b) {
+                accumulate(
+                    simd,
+                    #[inline(always)]
+                    |r| a.of_pair(a_pair, false, r),
+                    &b[..width],
+                    sums,
+                );
+                accumulate(
+                    simd,
+                    #[inline(always)]
+                    |r| a.of_pair(a_pair, true, r),
+                    &b[stride..][..width],
+                    &mut odd,
+                );
+            }
+        } else {
+            for (a_pair, b) in a.pairs(pairs).zip(b.clone()) {
+                accumulate(
+                    simd,
+                    #[inline(always)]
+                    |r| a.of_pair(a_pair, false, r),
+                    &b[..width],
+                    sums,
+                );
+            }
+            // The compiler must keep these sums in memory now, or there are not enough registers for the odd ones.
+            *sums = std::hint::black_box(*sums);
+            for (a_pair, b) in a.pairs(pairs).zip(b) {
+                accumulate(
+                    simd,
+                    #[inline(always)]
+                    |r| a.of_pair(a_pair, true, r),
+                    &b[stride..][..width],
+                    &mut odd,
+                );
+            }
+        }
+        accumulate(
+            simd,
+            #[inline(always)]
+            |r| a.at(2 * pairs, r),
+            &self.data[2 * pairs * stride..][..width],
+            sums,
+        );
+        if depth % 2 == 0 {
+            accumulate(
+                simd,
+                #[inline(always)]
+                |r| a.at(depth - 1, r),
+                &self.data[(depth - 1) * stride..][..width],
+                &mut odd,
+            );
+        }
+        for (row, odd) in sums.iter_mut().zip(&odd) {
+            for (x, &y) in row.iter_mut().zip(odd) {
+                *x = T::add_vectors(simd, *x, y);
+            }
+        }
+    }
+}
+
+/// Loads V vectors; the last one may be shorter.
+#[inline(always)]
+fn load_row<T: Real, S: Simd, const V: usize>(simd: S, from: &[T]) -> [T::Vector<S>; V] {
+    let lanes = T::lanes::<S>();
+    let mut row = [T::splat(simd, T::ZERO); V];
+    for (v, x) in row.iter_mut().enumerate() {
+        *x = T::load(simd, &from[v * lanes..if v + 1 < V { (v + 1) * lanes } else { from.len() }]);
+    }
+    row
+}
+
 /// `sums[r]` += a(r) * b.
 #[inline(always)]
 fn accumulate<T: Real, S: Simd, const R: usize, const V: usize>(
@@ -240,11 +399,7 @@ fn accumulate<T: Real, S: Simd, const R: usize, const V: usize>(
     b: &[T],
     sums: &mut [[T::Vector<S>; V]; R],
 ) {
-    let lanes = T::lanes::<S>();
-    let mut row = [T::splat(simd, T::ZERO); V];
-    for (v, x) in row.iter_mut().enumerate() {
-        *x = T::load(simd, &b[v * lanes..if v + 1 < V { (v + 1) * lanes } else { b.len() }]);
-    }
+    let row = load_row::<T, S, V>(simd, b);
     for r in 0..R {
         let x = T::splat(simd, a(r));
         for v in 0..V {
@@ -252,7 +407,6 @@ fn accumulate<T: Real, S: Simd, const R: usize, const V: usize>(
         }
     }
 }
-
 #[cfg(test)]
 mod tests {
     use rand::RngExt;
@@ -265,6 +419,12 @@ mod tests {
     }
 
     fn check<T: Real>(tolerance: f64) {
+        for width in VectorWidth::available() {
+            check_width::<T>(width, tolerance);
+        }
+    }
+
+    fn check_width<T: Real>(width: VectorWidth, tolerance: f64) {
         let mut stream = crate::rng::stream(3, "matmul", 0);
         let mut draw = |len: usize| -> Vec<T> { (0..len).map(|_| T::from_f64(2.0 * stream.random::<f64>() - 1.0)).collect() };
         for m in [1, 2, 3, 5, 6, 7, 13, 24] {
@@ -277,7 +437,7 @@ mod tests {
                         for start in [InitialValue::Zero, InitialValue::Bias(&bias), InitialValue::Previous] {
                             let mut c = before.clone();
                             let (rhs, out) = (Rhs { data: &b, stride: wide_b }, Out { data: &mut c, stride: wide_c });
-                            matmul((m, k, n), lhs, rhs, out, start);
+                            matmul_with(width, (m, k, n), (lhs, rhs), out, start);
                             for (at, (&c, &before)) in c.iter().zip(&before).enumerate() {
                                 let (i, j) = (at / wide_c, at % wide_c);
                                 if j >= n {
@@ -290,7 +450,7 @@ mod tests {
                                     InitialValue::Previous => before,
                                 };
                                 let exact = naive(k, |k| a[i * place.0 + k * place.1], |k| b[k * wide_b + j], start);
-                                assert!((c.to_f64() - exact).abs() <= tolerance * (1.0 + k as f64), "{m} {k} {n}: {c} {exact}");
+                                assert!((c.to_f64() - exact).abs() <= tolerance * (1.0 + k as f64), "{width:?} {m} {k} {n}: {c} {exact}");
                             }
                         }
                     }
@@ -309,24 +469,34 @@ mod tests {
         check::<f64>(1e-14);
     }
 
+    /// Rows `rows` of a product of 50 rows.
+    fn product(width: VectorWidth, rows: std::ops::Range<usize>, k: usize, n: usize) -> Vec<f32> {
+        let data: Vec<f32> = (0..50 * k.max(n)).map(|i| ((i * 37 % 101) as f32 - 50.0) / 7.0).collect();
+        let b: Vec<f32> = (0..k * n).map(|i| ((i * 53 % 103) as f32 - 51.0) / 9.0).collect();
+        let mut c = vec![0.0; rows.len() * n];
+        let a = Lhs::rows(&data[rows.start * k..], k);
+        let out = Out { data: &mut c, stride: n };
+        matmul_with(width, (rows.len(), k, n), (a, Rhs { data: &b, stride: n }), out, InitialValue::Zero);
+        c
+    }
+
     #[test]
     fn a_row_has_the_same_bits_in_any_batch() {
-        let data: Vec<f32> = (0..50 * 64).map(|i| ((i * 37 % 101) as f32 - 50.0) / 7.0).collect();
-        let product = |rows: std::ops::Range<usize>| {
-            let mut c = vec![0.0; rows.len() * 33];
-            let a = Lhs::rows(&data[rows.start * 64..], 64);
-            matmul(
-                (rows.len(), 64, 33),
-                a,
-                Rhs { data: &data, stride: 33 },
-                Out { data: &mut c, stride: 33 },
-                InitialValue::Zero,
-            );
-            c
-        };
-        let whole = product(0..50);
-        for rows in [0..1, 3..5, 7..20, 49..50] {
-            assert_eq!(product(rows.clone()), whole[rows.start * 33..rows.end * 33]);
+        for width in VectorWidth::available() {
+            let whole = product(width, 0..50, 64, 33);
+            for rows in [0..1, 3..5, 4..7, 7..20, 49..50] {
+                assert_eq!(product(width, rows.clone(), 64, 33), whole[rows.start * 33..rows.end * 33], "{width:?} {rows:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn all_widths_that_fuse_have_the_same_bits() {
+        let mut widths = VectorWidth::available();
+        widths.retain(|&width| width != VectorWidth::Portable);
+        for (k, n) in [(1, 5), (21, 64), (64, 96), (2 * DEPTH + 1, 23)] {
+            let results: Vec<_> = widths.iter().map(|&width| product(width, 0..50, k, n)).collect();
+            assert!(results.windows(2).all(|pair| pair[0] == pair[1]), "{widths:?} {k} {n}");
         }
     }
 }

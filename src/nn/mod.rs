@@ -40,7 +40,7 @@ pub use mlp::{Mlp, MlpCache};
 pub use params::{Init, Parameter, ParameterLayout, Weights};
 pub use real::Real;
 pub use rgcn::{Rgcn, RgcnCache};
-pub use simd::simd;
+pub use simd::{VECTOR_WIDTH_VARIABLE, VectorWidth, simd};
 
 /// H, the width of hidden activations.
 pub const HIDDEN: usize = 64;

@@ -11,6 +11,7 @@ use serde_json::json;
 use super::output::outln;
 use super::run_args::{RunArgs, all_cores};
 use crate::learner::{Episodes, Learner, Rollout, TrainConfig};
+use crate::nn::VectorWidth;
 use crate::policy::mixer::MixerKind;
 
 /// Flags of `bench`.
@@ -107,6 +108,7 @@ fn learner(mut args: LearnerArgs) -> anyhow::Result<()> {
         let metrics = json!({
             "algorithm": config.algorithm,
             "threads": threads,
+            "vector_width": VectorWidth::current().name(),
             "update_s": update_s,
             "rollout_s": rollout_s,
             "env_steps_per_s": env_steps_per_s,
@@ -127,8 +129,9 @@ fn learner(mut args: LearnerArgs) -> anyhow::Result<()> {
         )?;
         outln!("rollout of {} episodes    {:.2} ms", t.envs, rollout_s * 1e3)?;
         outln!(
-            "environment steps per s  {env_steps_per_s:.0}   ({} updates per rollout, {threads} threads)",
-            t.updates_per_iteration
+            "environment steps per s  {env_steps_per_s:.0}   ({} updates per rollout, {threads} threads, {})",
+            t.updates_per_iteration,
+            VectorWidth::current().name()
         )?;
     }
     Ok(())
