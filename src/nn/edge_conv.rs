@@ -11,18 +11,18 @@
 //!
 //! A node without neighbours gets 0. The nodes computed are a prefix of the nodes read (see [`Graph`]).
 
+use pulp::Simd;
+
 use super::HIDDEN as H;
 use super::batch::{Batch, Rows, RowsMut};
+use super::edge_norm::{self, W, WithRows, with_rows};
 use super::graph::Graph;
-use super::layer_norm::{self, Affine, LayerNorm, Stats};
+use super::layer_norm::{Affine, LayerNorm, Stats};
 use super::linear::Linear;
 use super::matmul::{InitialValue, Lhs, Out, Rhs, matmul};
 use super::params::{ParameterLayout, Weights};
 use super::real::Real;
 use super::simd::simd;
-
-/// Width of f's hidden layer.
-const W: usize = 96;
 
 /// Second half of f's input.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -112,10 +112,8 @@ impl EdgeNet {
         let affine = self.norm.affine(w.params);
         let EdgeCache { u, v, a, stats } = cache;
         let (u, v) = (u.as_slice().as_chunks().0, v.as_slice().as_chunks().0);
-        simd(
-            #[inline(always)]
-            || aggregate(graph, self.mean, &affine, (u, v), stats, a.as_mut_slice().as_chunks_mut().0),
-        );
+        let (mean, a) = (self.mean, a.as_mut_slice().as_chunks_mut().0);
+        with_rows(Aggregate { graph, mean, affine: &affine, u, v, stats, a });
         let stride = y.stride;
         self.last.forward(w, a.rows(), RowsMut { data: &mut *y.data, ..y });
         let bias = self.last.bias(w);
@@ -158,10 +156,8 @@ impl EdgeNet {
         let (u, v) = (cache.u.as_slice().as_chunks().0, cache.v.as_slice().as_chunks().0);
         let (du_rows, dv_rows) = (du.as_mut_slice().as_chunks_mut().0, dv.as_mut_slice().as_chunks_mut().0);
         let da = da.as_slice().as_chunks().0;
-        simd(
-            #[inline(always)]
-            || aggregate_back(graph, self.mean, &affine, (u, v, &cache.stats, da), (du_rows, dv_rows), &mut sums),
-        );
+        let (mean, stats) = (self.mean, &cache.stats[..]);
+        with_rows(AggregateBack { graph, mean, affine: &affine, u, v, stats, da, du: du_rows, dv: dv_rows, sums: &mut sums });
         self.norm.add_grads(&sums, grads);
 
         self.first.backward_bias(du.rows(), grads);
@@ -197,73 +193,72 @@ fn last_bias_back<T: Real>(graph: &Graph, mean: bool, dy: &mut [[T; H]], bias: &
     }
 }
 
-#[inline(always)]
-fn aggregate<T: Real>(
-    graph: &Graph,
+/// a_i = agg_j relu(LayerNorm(u_i + v_j)).
+struct Aggregate<'a, T> {
+    graph: &'a Graph,
     mean: bool,
-    affine: &Affine<T, W>,
-    (u, v): (&[[T; W]], &[[T; W]]),
-    stats: &mut [[T; 2]],
-    a: &mut [[T; W]],
-) {
-    let mut stats = stats.iter_mut();
-    for (i, (u, a)) in u.iter().zip(a).enumerate() {
-        let mut sum = [T::ZERO; W];
-        let neighbours = graph.neighbours(i);
-        for (&j, stats) in neighbours.iter().zip(&mut stats) {
-            let v = &v[j as usize];
-            let mut x = [T::ZERO; W];
-            for c in 0..W {
-                x[c] = u[c] + v[c];
+    affine: &'a Affine<T, W>,
+    u: &'a [[T; W]],
+    v: &'a [[T; W]],
+    stats: &'a mut [[T; 2]],
+    a: &'a mut [[T; W]],
+}
+
+impl<T: Real> WithRows<T> for Aggregate<'_, T> {
+    #[inline(always)]
+    fn with_rows<S: Simd, const N: usize>(self, simd: S) {
+        let mut stats = self.stats.iter_mut();
+        for (i, (u, a)) in self.u.iter().zip(self.a).enumerate() {
+            let u = edge_norm::load::<T, S, N>(simd, u);
+            let mut sum = [T::splat(simd, T::ZERO); N];
+            let neighbours = self.graph.neighbours(i);
+            for (&j, stats) in neighbours.iter().zip(&mut stats) {
+                let x = edge_norm::add::<T, S, N>(simd, u, &edge_norm::load(simd, &self.v[j as usize]));
+                let s = edge_norm::stats::<T, S, N>(simd, &x);
+                *stats = [s.mean, s.rstd];
+                sum = edge_norm::add::<T, S, N>(simd, sum, &edge_norm::norm_relu::<T, S, N>(simd, &x, s, self.affine));
             }
-            let s = layer_norm::stats(&x);
-            *stats = [s.mean, s.rstd];
-            let mut y = [T::ZERO; W];
-            layer_norm::norm_relu(&x, s, affine, &mut y);
-            for c in 0..W {
-                sum[c] += y[c];
-            }
-        }
-        let weight = edge_weight(neighbours, mean);
-        for c in 0..W {
-            a[c] = sum[c] * weight;
+            let sum = edge_norm::times::<T, S, N>(simd, sum, edge_weight(neighbours, self.mean));
+            edge_norm::store::<T, S, N>(simd, &sum, a);
         }
     }
 }
 
-#[inline(always)]
-fn aggregate_back<T: Real>(
-    graph: &Graph,
+/// The gradients of u and v from that of a, and those of the LayerNorm.
+struct AggregateBack<'a, T> {
+    graph: &'a Graph,
     mean: bool,
-    affine: &Affine<T, W>,
-    (u, v, stats, da): (&[[T; W]], &[[T; W]], &[[T; 2]], &[[T; W]]),
-    (du, dv): (&mut [[T; W]], &mut [[T; W]]),
-    sums: &mut Affine<T, W>,
-) {
-    let mut stats = stats.iter();
-    for (i, ((u, da), du)) in u.iter().zip(da).zip(du).enumerate() {
-        let neighbours = graph.neighbours(i);
-        let weight = edge_weight(neighbours, mean);
-        let mut da = *da;
-        for d in &mut da {
-            *d *= weight;
-        }
-        let mut sum = [T::ZERO; W];
-        for (&j, stats) in neighbours.iter().zip(&mut stats) {
-            let v = &v[j as usize];
-            let mut x = [T::ZERO; W];
-            for c in 0..W {
-                x[c] = u[c] + v[c];
+    affine: &'a Affine<T, W>,
+    u: &'a [[T; W]],
+    v: &'a [[T; W]],
+    stats: &'a [[T; 2]],
+    da: &'a [[T; W]],
+    du: &'a mut [[T; W]],
+    dv: &'a mut [[T; W]],
+    sums: &'a mut Affine<T, W>,
+}
+
+impl<T: Real> WithRows<T> for AggregateBack<'_, T> {
+    #[inline(always)]
+    fn with_rows<S: Simd, const N: usize>(self, simd: S) {
+        let mut stats = self.stats.iter();
+        for (i, ((u, da), du)) in self.u.iter().zip(self.da).zip(self.du).enumerate() {
+            let neighbours = self.graph.neighbours(i);
+            let da = edge_norm::load::<T, S, N>(simd, da);
+            let da = edge_norm::times::<T, S, N>(simd, da, edge_weight(neighbours, self.mean));
+            let u = edge_norm::load::<T, S, N>(simd, u);
+            let mut sum = [T::splat(simd, T::ZERO); N];
+            for (&j, stats) in neighbours.iter().zip(&mut stats) {
+                let x = edge_norm::add::<T, S, N>(simd, u, &edge_norm::load(simd, &self.v[j as usize]));
+                let s = Stats { mean: stats[0], rstd: stats[1] };
+                let d = edge_norm::norm_relu_back::<T, S, N>(simd, (&x, s), self.affine, &da, self.sums);
+                sum = edge_norm::add::<T, S, N>(simd, sum, &d);
+                let dv = &mut self.dv[j as usize];
+                let total = edge_norm::add::<T, S, N>(simd, edge_norm::load(simd, dv), &d);
+                edge_norm::store::<T, S, N>(simd, &total, dv);
             }
-            let s = Stats { mean: stats[0], rstd: stats[1] };
-            let d = layer_norm::norm_relu_back(&x, s, affine, &da, sums);
-            let dv = &mut dv[j as usize];
-            for c in 0..W {
-                sum[c] += d[c];
-                dv[c] += d[c];
-            }
+            edge_norm::store::<T, S, N>(simd, &sum, du);
         }
-        *du = sum;
     }
 }
 

@@ -7,7 +7,7 @@ use super::params::{Init, ParameterLayout};
 use super::real::Real;
 
 /// Number of partial sums of a reduction. It is fixed, so that sums have the same order on every processor.
-const LANES: usize = 16;
+pub(super) const PARTS: usize = 16;
 const EPS: f64 = 1e-5;
 
 /// Offsets of scale and shift.
@@ -22,6 +22,13 @@ pub(super) struct LayerNorm<const W: usize> {
 pub(super) struct Stats<T> {
     pub(super) mean: T,
     pub(super) rstd: T,
+}
+
+impl<T: Real> Stats<T> {
+    #[inline(always)]
+    pub(super) fn new(mean: T, variance: T) -> Self {
+        Self { mean, rstd: T::ONE / (variance + T::from_f64(EPS)).sqrt() }
+    }
 }
 
 /// Scale and shift, or their gradients.
@@ -58,8 +65,8 @@ impl<T: Real, const W: usize> Affine<T, W> {
 
 /// Sum of all lanes, by repeated halving.
 #[inline(always)]
-fn fold<T: Real>(mut lanes: [T; LANES]) -> T {
-    let mut width = LANES / 2;
+fn fold<T: Real>(mut lanes: [T; PARTS]) -> T {
+    let mut width = PARTS / 2;
     while width > 0 {
         for l in 0..width {
             lanes[l] += lanes[l + width];
@@ -72,22 +79,21 @@ fn fold<T: Real>(mut lanes: [T; LANES]) -> T {
 #[inline(always)]
 pub(super) fn stats<T: Real, const W: usize>(x: &[T; W]) -> Stats<T> {
     let inverse_width = T::from_f64(1.0 / W as f64);
-    let mut sum = [T::ZERO; LANES];
-    for c in x.chunks_exact(LANES) {
-        for l in 0..LANES {
+    let mut sum = [T::ZERO; PARTS];
+    for c in x.chunks_exact(PARTS) {
+        for l in 0..PARTS {
             sum[l] += c[l];
         }
     }
     let mean = fold(sum) * inverse_width;
-    let mut square = [T::ZERO; LANES];
-    for c in x.chunks_exact(LANES) {
-        for l in 0..LANES {
+    let mut square = [T::ZERO; PARTS];
+    for c in x.chunks_exact(PARTS) {
+        for l in 0..PARTS {
             let d = c[l] - mean;
             square[l] = d.mul_add(d, square[l]);
         }
     }
-    let variance = fold(square) * inverse_width;
-    Stats { mean, rstd: T::ONE / (variance + T::from_f64(EPS)).sqrt() }
+    Stats::new(mean, fold(square) * inverse_width)
 }
 
 /// LayerNorm and ReLU: y = relu(g n + b).
@@ -119,9 +125,9 @@ pub(super) fn norm_relu_back<T: Real, const W: usize>(
         grads.shift[c] += d;
         e[c] = d * p.scale[c];
     }
-    let (mut sum, mut product) = ([T::ZERO; LANES], [T::ZERO; LANES]);
-    for (e, n) in e.chunks_exact(LANES).zip(n.chunks_exact(LANES)) {
-        for l in 0..LANES {
+    let (mut sum, mut product) = ([T::ZERO; PARTS], [T::ZERO; PARTS]);
+    for (e, n) in e.chunks_exact(PARTS).zip(n.chunks_exact(PARTS)) {
+        for l in 0..PARTS {
             sum[l] += e[l];
             product[l] = e[l].mul_add(n[l], product[l]);
         }

@@ -16,7 +16,7 @@
 use pulp::{Simd, WithSimd};
 
 use super::real::Real;
-use super::simd::{VectorWidth, simd};
+use super::simd::{VectorWidth, dispatch};
 
 /// A: element (i, k) is `data[i * row_stride + k * col_stride]`; one of the strides is 1.
 #[derive(Clone, Copy, Debug)]
@@ -76,7 +76,7 @@ const DEPTH: usize = 144;
 /// If a slice is too short for its shape.
 pub fn matmul<T: Real>(shape: (usize, usize, usize), a: Lhs<'_, T>, b: Rhs<'_, T>, c: Out<'_, T>, initial: InitialValue<'_, T>) {
     if let Some(product) = Product::new(shape, (a, b), c, initial) {
-        simd(product);
+        dispatch(product);
     }
 }
 
@@ -450,7 +450,10 @@ mod tests {
                                     InitialValue::Previous => before,
                                 };
                                 let exact = naive(k, |k| a[i * place.0 + k * place.1], |k| b[k * wide_b + j], start);
-                                assert!((c.to_f64() - exact).abs() <= tolerance * (1.0 + k as f64), "{width:?} {m} {k} {n}: {c} {exact}");
+                                assert!(
+                                    (c.to_f64() - exact).abs() <= tolerance * (1.0 + k as f64),
+                                    "{width:?} {m} {k} {n}: {c} {exact}"
+                                );
                             }
                         }
                     }

@@ -14,6 +14,7 @@ mod activations;
 mod adam;
 mod batch;
 mod edge_conv;
+mod edge_norm;
 mod embedding;
 mod graph;
 mod graph_layer;

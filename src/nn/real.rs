@@ -82,6 +82,14 @@ pub trait Real:
     fn fma<S: Simd>(simd: S, a: Self::Vector<S>, b: Self::Vector<S>, c: Self::Vector<S>) -> Self::Vector<S>;
     /// a + b in every lane.
     fn add_vectors<S: Simd>(simd: S, a: Self::Vector<S>, b: Self::Vector<S>) -> Self::Vector<S>;
+    /// a - b in every lane.
+    fn sub_vectors<S: Simd>(simd: S, a: Self::Vector<S>, b: Self::Vector<S>) -> Self::Vector<S>;
+    /// a * b in every lane.
+    fn mul_vectors<S: Simd>(simd: S, a: Self::Vector<S>, b: Self::Vector<S>) -> Self::Vector<S>;
+    /// In every lane `x` if `test` > 0, else 0.
+    fn where_positive<S: Simd>(simd: S, test: Self::Vector<S>, x: Self::Vector<S>) -> Self::Vector<S>;
+    /// Sum of all lanes, by repeated halving.
+    fn sum_lanes<S: Simd>(simd: S, x: Self::Vector<S>) -> Self;
     /// Loads the first lanes from `from`. Missing lanes are 0.
     fn load<S: Simd>(simd: S, from: &[Self]) -> Self::Vector<S>;
     /// Stores the first lanes to `to`, as many as fit.
@@ -171,6 +179,27 @@ impl Real for f32 {
     }
 
     #[inline(always)]
+    fn sub_vectors<S: Simd>(simd: S, a: S::f32s, b: S::f32s) -> S::f32s {
+        simd.sub_f32s(a, b)
+    }
+
+    #[inline(always)]
+    fn mul_vectors<S: Simd>(simd: S, a: S::f32s, b: S::f32s) -> S::f32s {
+        simd.mul_f32s(a, b)
+    }
+
+    #[inline(always)]
+    fn where_positive<S: Simd>(simd: S, test: S::f32s, x: S::f32s) -> S::f32s {
+        let zero = simd.splat_f32s(0.0);
+        simd.select_f32s(simd.less_than_f32s(zero, test), x, zero)
+    }
+
+    #[inline(always)]
+    fn sum_lanes<S: Simd>(simd: S, x: S::f32s) -> Self {
+        simd.reduce_sum_f32s(x)
+    }
+
+    #[inline(always)]
     fn load<S: Simd>(simd: S, from: &[Self]) -> S::f32s {
         match S::as_simd_f32s(from).0 {
             [x, ..] => *x,
@@ -240,6 +269,27 @@ impl Real for f64 {
     #[inline(always)]
     fn add_vectors<S: Simd>(simd: S, a: S::f64s, b: S::f64s) -> S::f64s {
         simd.add_f64s(a, b)
+    }
+
+    #[inline(always)]
+    fn sub_vectors<S: Simd>(simd: S, a: S::f64s, b: S::f64s) -> S::f64s {
+        simd.sub_f64s(a, b)
+    }
+
+    #[inline(always)]
+    fn mul_vectors<S: Simd>(simd: S, a: S::f64s, b: S::f64s) -> S::f64s {
+        simd.mul_f64s(a, b)
+    }
+
+    #[inline(always)]
+    fn where_positive<S: Simd>(simd: S, test: S::f64s, x: S::f64s) -> S::f64s {
+        let zero = simd.splat_f64s(0.0);
+        simd.select_f64s(simd.less_than_f64s(zero, test), x, zero)
+    }
+
+    #[inline(always)]
+    fn sum_lanes<S: Simd>(simd: S, x: S::f64s) -> Self {
+        simd.reduce_sum_f64s(x)
     }
 
     #[inline(always)]

@@ -77,10 +77,17 @@ impl VectorWidth {
     }
 }
 
-/// Runs `op` with the [current](VectorWidth::current) width. Functions that `op` calls must be `inline(always)`; others are
+/// Runs `f`, compiled for the [current](VectorWidth::current) width. Functions that `f` calls must be `inline(always)`; others are
 /// compiled for the baseline processor.
 #[inline(always)]
-pub fn simd<Op: WithSimd>(op: Op) -> Op::Output {
+pub fn simd<R>(f: impl FnOnce() -> R) -> R {
+    // Not generic over `WithSimd`: a closure that is not known to be `FnOnce` is called through a function for the baseline.
+    dispatch(f)
+}
+
+/// Runs `op` with the [current](VectorWidth::current) width.
+#[inline(always)]
+pub(super) fn dispatch<Op: WithSimd>(op: Op) -> Op::Output {
     static CURRENT: OnceLock<Arch> = OnceLock::new();
     CURRENT.get_or_init(|| VectorWidth::current().arch().unwrap_or(Arch::Scalar)).dispatch(op)
 }
