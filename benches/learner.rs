@@ -1,5 +1,4 @@
-//! Time of an update and of a rollout step, by algorithm, fleet size, batch and threads, and of the matrix products:
-//! `cargo bench --bench learner`.
+//! Time of an update and of a rollout step, by algorithm, fleet size, batch and threads: `cargo bench --bench learner`.
 #![allow(missing_docs)] // criterion's macros
 
 #[path = "../tests/sample/mod.rs"]
@@ -7,9 +6,8 @@ mod sample;
 
 use std::time::Duration;
 
-use criterion::{BatchSize, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use qedgix::learner::{Algorithm, Learner, MixerKind, Preset, TrainConfig};
-use qedgix::nn::matmul::{InitialValue, Lhs, Out, Rhs, matmul};
 use qedgix::policy::{Aggregation, BatchedAgent, Identity, ObservationKind, StepInput, TOKEN};
 use sample::episodes;
 
@@ -61,28 +59,6 @@ fn update(c: &mut Criterion) {
     }
 }
 
-/// The matrix product alone, at the shapes of a chunk of 8 episodes and of one slot.
-fn products(c: &mut Criterion) {
-    let mut group = c.benchmark_group("product, one thread");
-    group.sample_size(20).measurement_time(Duration::from_secs(1));
-    for [m, k, n] in [[1944, 64, 96], [1944, 64, 192], [1944, 128, 64], [24, 64, 192], [24, 64, 8]] {
-        let (a, b) = (vec![0.5_f32; m * k], vec![0.25_f32; k * n]);
-        // One operation is a multiplication or an addition.
-        group.throughput(Throughput::Elements((2 * m * k * n) as u64));
-        group.bench_function(format!("{m} x {k} by {k} x {n}"), |bench| {
-            bench.iter_batched_ref(
-                || vec![0.0_f32; m * n],
-                |c| {
-                    let out = Out { data: c, stride: n };
-                    matmul((m, k, n), Lhs::rows(&a, k), Rhs { data: &b, stride: n }, out, InitialValue::Zero);
-                },
-                BatchSize::NumIterations(100),
-            );
-        });
-    }
-    group.finish();
-}
-
 fn step(c: &mut Criterion) {
     let mut group = c.benchmark_group("rollout step");
     for fleets in [8, 256] {
@@ -104,5 +80,5 @@ fn step(c: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, update, products, step);
+criterion_group!(benches, update, step);
 criterion_main!(benches);

@@ -2,9 +2,9 @@
 
 mod sample;
 
-use qedgix::learner::loss::{Loss, TdLambda, Trace};
+use qedgix::learner::loss::{Loss, TdLambda};
 use qedgix::nn::{
-    Batch, Graph, GraphLayer, Gru, HIDDEN, LayerCache, LayerScratch, Linear, Mlp, MlpCache, ParameterLayout, Weights, argmax,
+    Batch, Graph, GraphLayer, Gru, HIDDEN, LayerCache, LayerScratch, Linear, Mlp, MlpCache, ParameterLayout, Weights,
 };
 use qedgix::policy::mixer::MixerKind;
 use qedgix::policy::{AgentConfig, Aggregation, Dims, EnvParams, Gnn, Identity, Memory, ObservationKind};
@@ -261,44 +261,5 @@ fn whole_loss() {
         check(name, &ranges, &online, &gradient, |online| {
             loss.compute_gradient(online, &target, std::slice::from_ref(&episodes), None).loss
         });
-    }
-}
-
-/// Largest error of a gradient in f32, relative to its tensor's largest gradient in f64, and how many of the best actions differ.
-fn rounding(uavs: usize, users: usize, seed: u64) -> (f64, String, usize) {
-    let dims = Dims { uavs, users, env: EnvParams { actions: 9, slots: 20, ..EnvParams::default() } };
-    let td_lambda = TdLambda { gamma: 0.99, lambda: 0.6 };
-    let episodes = episodes(&dims, 4, seed);
-    let mut exact = Loss::<f64>::new(AGENT, dims, MixerKind::Qmix, td_lambda, 1);
-    let mut rounded = Loss::<f32>::new(AGENT, dims, MixerKind::Qmix, td_lambda, 1);
-    let layout = exact.layout().clone();
-    let online: Vec<f32> = layout.initialise(&mut rng::stream(seed, "online", 0));
-    let target: Vec<f32> = layout.initialise(&mut rng::stream(seed, "target", 0));
-    let wide = |x: &[f32]| -> Vec<f64> { x.iter().map(|&x| f64::from(x)).collect() };
-    let (mut trace, mut trace_32) = (Trace::default(), Trace::default());
-    exact.compute_gradient(&wide(&online), &wide(&target), std::slice::from_ref(&episodes), Some(&mut trace));
-    rounded.compute_gradient(&online, &target, std::slice::from_ref(&episodes), Some(&mut trace_32));
-    let actions = dims.env.actions;
-    let best = trace.q.chunks(actions).zip(trace_32.q.chunks(actions)).filter(|(a, b)| argmax(a) != argmax(b)).count();
-    let mut worst = (0.0, String::new(), best);
-    for p in layout.parameters() {
-        let (a, b) = (&exact.gradient()[p.range.clone()], &rounded.gradient()[p.range.clone()]);
-        let scale = a.iter().fold(0.0, |m: f64, g| m.max(g.abs()));
-        let error = a.iter().zip(b).fold(0.0, |m: f64, (a, b)| m.max((a - f64::from(*b)).abs())) / scale;
-        println!("{uavs} {users} {seed}: {} {error:.1e} of {scale:.1e}", p.name);
-        if error > worst.0 {
-            worst = (error, p.name.clone(), best);
-        }
-    }
-    worst
-}
-
-#[test]
-fn gradients_in_f32_differ_from_f64_by_rounding() {
-    for (uavs, users) in [(3, 5), (8, 30)] {
-        for seed in 0..8 {
-            let (error, name, best) = rounding(uavs, users, seed);
-            println!("{uavs} {users} {seed}: worst {name} {error:.1e}, {best} best actions differ");
-        }
     }
 }

@@ -112,8 +112,8 @@ impl EdgeNet {
         let affine = self.norm.affine(w.params);
         let EdgeCache { u, v, a, stats } = cache;
         let (u, v) = (u.as_slice().as_chunks().0, v.as_slice().as_chunks().0);
-        let (mean, a) = (self.mean, a.as_mut_slice().as_chunks_mut().0);
-        with_rows(Aggregate { graph, mean, affine: &affine, u, v, stats, a });
+        let sums = a.as_mut_slice().as_chunks_mut().0;
+        with_rows(Aggregate { graph, mean: self.mean, affine: &affine, u, v, stats, a: sums });
         let stride = y.stride;
         self.last.forward(w, a.rows(), RowsMut { data: &mut *y.data, ..y });
         let bias = self.last.bias(w);
