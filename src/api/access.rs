@@ -31,7 +31,7 @@ const GRPC: &[(&str, &str, Requirement)] = &[
     ("qedgix.v1.PolicyService", "DeletePolicy DeletePolicyVersion", ADMIN),
     ("qedgix.v1.EnvironmentService", "CreateEnvironment Reset Step DeleteEnvironment", ACT),
     ("qedgix.v1.EnvironmentService", "GetEnvironment", READ),
-    ("qedgix.v1.JobService", "SubmitJob EditJob CancelJob PauseJob ResumeJob RetryJob DeleteJob", JOBS),
+    ("qedgix.v1.JobService", "SubmitJob EditJob CancelJob PauseJob ResumeJob RetryJob ContinueJob DeleteJob", JOBS),
     (
         "qedgix.v1.JobService",
         "GetJob ListJobs GetJobMetrics WatchJob GetJobLogs GetJobResult WatchJobLogs ListCheckpoints DownloadCheckpoint",
@@ -71,6 +71,7 @@ const REST: &[(&str, &str, Requirement)] = &[
     ("GET", "/v1/jobs /v1/jobs/{id} /v1/jobs/{id}/metrics /v1/jobs/{id}/checkpoints /v1/jobs/{id}/logs", READ),
     ("GET", "/v1/jobs/{id}/events /v1/jobs/{id}/result /v1/jobs/{id}/logs/events /v1/checkpoints/{id}", READ),
     ("POST", "/v1/jobs /v1/jobs/{id}/cancel /v1/jobs/{id}/pause /v1/jobs/{id}/resume /v1/jobs/{id}/retry", JOBS),
+    ("POST", "/v1/jobs/{id}/continue", JOBS),
     ("PATCH", "/v1/jobs/{id}", JOBS),
     ("DELETE", "/v1/jobs/{id}", JOBS),
     ("GET", "/v2 /v2/models/{model} /v2/models/{model}/ready /v2/models/{model}/config", READ),

@@ -8,6 +8,7 @@
 mod error;
 mod file;
 mod format;
+mod warm_start;
 
 use std::collections::BTreeMap;
 
@@ -16,6 +17,7 @@ use sha2::{Digest, Sha256};
 pub use error::Error;
 pub use file::Tensor;
 pub use format::{FORMAT, MAX_MAGNITUDE, VERSION};
+pub use warm_start::InitialParameters;
 
 use crate::env::EpisodeMetrics;
 use crate::invalid::Invalid;

@@ -395,6 +395,7 @@ mod tests {
                 spec,
                 notes: String::new(),
                 parent: None,
+                beginning: None,
                 now: clock.now(),
                 idempotency: None,
             })

@@ -10,7 +10,7 @@ use sha2::{Digest, Sha256};
 use super::evaluation::EvaluationRequest;
 use super::sweep::SweepRequest;
 use crate::invalid::{Invalid, in_range};
-use crate::store::{EarlyStop, Job, JobEdit, JobId, JobKind, JobLimits, JobSpec, is_metric_name};
+use crate::store::{EarlyStop, Job, JobEdit, JobId, JobKind, JobLimits, JobSpec, PublishRule, is_metric_name};
 use crate::train_config::{Algorithm, Preset, TrainConfig, floats_to_integers};
 
 /// A job as it is submitted; what is absent has a default.
@@ -50,6 +50,12 @@ pub struct JobRequest {
     /// When training ends before all steps are done.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stop: Option<EarlyStop>,
+    /// What training begins with; default: weights that are drawn.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub init: Option<InitRequest>,
+    /// Where the policy is published, and which alias moves to it; default: under the name of the job, and none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub publish: Option<PublishRequest>,
     /// Algorithm.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub algorithm: Option<Algorithm>,
@@ -73,6 +79,54 @@ pub struct JobRequest {
     pub seed: Option<u64>,
 }
 
+/// What training begins with; exactly one is given.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct InitRequest {
+    /// A policy of the server: NAME, NAME@ALIAS or NAME:VERSION.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub policy: Option<String>,
+    /// Id of a checkpoint of a job.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub checkpoint: Option<String>,
+}
+
+/// Where the policy of a job is published, and which alias moves to it.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PublishRequest {
+    /// Name of the policy; default: the name of the job.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub policy: Option<String>,
+    /// Alias that moves to the new version when the job succeeds.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub alias: Option<String>,
+    /// Condition of the move; default: none.
+    #[serde(rename = "if", skip_serializing_if = "Option::is_none")]
+    pub condition: Option<PromotionCondition>,
+}
+
+/// When an alias moves.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PromotionCondition {
+    /// The policy (a baseline, NAME, NAME@ALIAS or NAME:VERSION) that the new version must be better than, as it is then.
+    pub better_than: String,
+}
+
+impl PublishRequest {
+    fn resolve(self) -> Result<PublishRule, Invalid> {
+        let Self { policy, alias, condition } = self;
+        if condition.is_some() && alias.is_none() {
+            return Err(Invalid::missing("publish.alias", "the alias that moves if the condition holds"));
+        }
+        if let Some(policy) = &policy {
+            check_name("publish.policy", policy)?;
+        }
+        Ok(PublishRule { policy, alias, better_than: condition.map(|condition| condition.better_than) })
+    }
+}
+
 impl JobRequest {
     /// Reads a document. Whole numbers count as integers however they are written, because a `google.protobuf.Struct` has no
     /// integers.
@@ -85,13 +139,10 @@ impl JobRequest {
 
     /// SHA-256 of the request in canonical form, by which the same request is recognised.
     pub fn digest(&self) -> [u8; 32] {
-        let mut document = serde_json::to_value(self).expect("a request is plain data");
-        floats_to_integers(&mut document);
-        // Objects are ordered by key, so this is canonical.
-        Sha256::digest(document.to_string()).into()
+        digest(self)
     }
 
-    /// The specification with every default filled in.
+    /// The specification with every default filled in, without `init`, which only the server can look up.
     ///
     /// # Errors
     /// The first field that is out of range, or the first unknown or mistyped field of `environment` and `training`.
@@ -129,6 +180,8 @@ impl JobRequest {
             limits,
             after,
             stop: self.stop,
+            init: None,
+            publish: self.publish.map(PublishRequest::resolve).transpose()?,
             config: None,
             evaluation: None,
             sweep: None,
@@ -154,6 +207,8 @@ impl JobRequest {
             ("training", self.training.is_some()),
             ("seed", self.seed.is_some()),
             ("stop", self.stop.is_some()),
+            ("init", self.init.is_some()),
+            ("publish", self.publish.is_some()),
         ];
         let unwanted: &[(&str, bool)] = match kind {
             JobKind::Train => &[("evaluation", self.evaluation.is_some()), ("sweep", self.sweep.is_some())],
@@ -169,6 +224,13 @@ impl JobRequest {
             None => Ok(()),
         }
     }
+}
+
+/// How a job that has ended is continued.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct ContinueRequest {
+    /// Environment steps to train further.
+    pub steps: u64,
 }
 
 /// What a caller changes of a job, as a JSON merge patch (RFC 7396): what is absent stays, and null means the default.
@@ -240,6 +302,14 @@ fn from_json<T: DeserializeOwned>(mut document: Value) -> Result<T, Invalid> {
         return Err(Invalid::schema("job", document, "an object"));
     }
     serde_path_to_error::deserialize(document).map_err(|e| Invalid::from_parser(&e.path().to_string(), e.inner()))
+}
+
+/// SHA-256 of a request in canonical form.
+pub fn digest(request: &impl Serialize) -> [u8; 32] {
+    let mut document = serde_json::to_value(request).expect("a request is plain data");
+    floats_to_integers(&mut document);
+    // Objects are ordered by key, so this is canonical.
+    Sha256::digest(document.to_string()).into()
 }
 
 /// Most jobs that a job comes after.

@@ -19,7 +19,7 @@ use super::replay::{Replay, group_environment};
 use super::rollout::Rollout;
 use super::snapshot::{self, SnapshotError};
 use super::state::{Counters, Phase, RunState};
-use super::{Disturbance, Episodes, Evaluation, Event, Iteration, Learner, TrainConfig, Training, layout_list};
+use super::{Disturbance, Episodes, Evaluation, Event, Iteration, Learner, TrainConfig, layout_list};
 use crate::checkpoint::{self, Checkpoint};
 use crate::env::EpisodeMetrics;
 use crate::invalid::Invalid;
@@ -69,6 +69,36 @@ impl Trainer {
         trainer.replay = snapshot.replay;
         trainer.run = snapshot.run;
         Ok(trainer)
+    }
+
+    /// Begins with the parameters of a checkpoint instead of drawn ones. Returns whether those of the mixer are among them. To be
+    /// called before the first step.
+    ///
+    /// # Errors
+    /// [`Invalid`] with the field of the architecture that differs.
+    pub fn begin_with(&mut self, checkpoint: &Checkpoint) -> Result<bool, Invalid> {
+        let initial = checkpoint.initial_parameters(&self.config, self.learner.parameters())?;
+        self.learner.begin_with(&initial.parameters);
+        Ok(initial.mixer)
+    }
+
+    /// Lets a restored run go on to `steps` environment steps, which is not less than before.
+    ///
+    /// # Errors
+    /// [`Invalid`] for fewer steps, or if training diverged.
+    pub fn extend_to(&mut self, steps: u64) -> Result<(), Invalid> {
+        let before = self.config.training.steps;
+        let Counters { phase, env_steps, .. } = self.run.counters;
+        if steps < before || (phase == Phase::Done && env_steps < before) {
+            return Err(Invalid::new("training.steps", steps, format!("at least {before}, in a run that did not diverge")));
+        }
+        self.config.training.steps = steps;
+        let ended = env_steps > 0 && !matches!(phase, Phase::Evaluate | Phase::Iterate);
+        if ended && env_steps < steps {
+            self.run.layouts.clear();
+            self.run.counters.phase = Phase::Iterate;
+        }
+        Ok(())
     }
 
     /// Everything needed to resume the run later, also on another machine.
@@ -187,8 +217,8 @@ impl Trainer {
     fn iterate(&mut self) -> Event {
         let t = &self.config.training;
         let counters = &mut self.run.counters;
-        let epsilon = epsilon(t, counters.env_steps);
-        let learning_rate = learning_rate(t, counters.env_steps);
+        let epsilon = t.epsilon_at(counters.env_steps);
+        let learning_rate = t.learning_rate_at(counters.env_steps);
         if !t.vary.is_none() {
             let environment = group_environment(&self.config, counters.episodes);
             self.rollout =
@@ -264,22 +294,7 @@ impl Iterator for Trainer {
     }
 }
 
-/// The learning rate after `env_steps` environment steps. It falls linearly to `learning_rate_decay` of its start value.
-fn learning_rate(t: &Training, env_steps: u64) -> f64 {
-    let done = (env_steps as f64 / t.steps as f64).min(1.0);
-    t.learning_rate * (1.0 - (1.0 - t.learning_rate_decay) * done)
-}
-
-/// Epsilon after `env_steps` environment steps. It falls linearly from 1 to `epsilon_end`, then is constant.
-fn epsilon(t: &Training, env_steps: u64) -> f64 {
-    if env_steps >= t.epsilon_anneal {
-        return t.epsilon_end;
-    }
-    1.0 - (1.0 - t.epsilon_end) * env_steps as f64 / t.epsilon_anneal as f64
-}
-
 #[cfg(test)]
-#[allow(clippy::float_cmp, reason = "the ends of the schedule are exact")]
 mod tests {
     use super::*;
     use crate::train_config::{Algorithm, Preset};
@@ -301,14 +316,5 @@ mod tests {
         assert_eq!(trainer.best().unwrap(), Some(best));
         let mut restored = Trainer::restore(&trainer.snapshot(), 1).unwrap();
         assert!(restored.next().is_none(), "a restored run that diverged yields no events");
-    }
-
-    #[test]
-    fn epsilon_falls_linearly_to_its_final_value() {
-        let t = TrainConfig::preset(Algorithm::Qedgix, Preset::Practical).training;
-        assert_eq!(epsilon(&t, 0), 1.0);
-        assert!((epsilon(&t, 50_000) - 0.525).abs() < 1e-12);
-        assert_eq!(epsilon(&t, 100_000), 0.05);
-        assert_eq!(epsilon(&t, u64::MAX), 0.05);
     }
 }

@@ -80,6 +80,18 @@ impl Learner {
         })
     }
 
+    /// Makes these the parameters of all networks, before the first update.
+    ///
+    /// # Panics
+    /// If there are not as many as the networks have.
+    pub fn begin_with(&mut self, parameters: &[f32]) {
+        self.online.copy_from_slice(parameters);
+        self.target.copy_from_slice(parameters);
+        if let Some(average) = &mut self.average {
+            average.parameters.copy_from_slice(parameters);
+        }
+    }
+
     /// One Adam step on the loss of the episodes in `groups`, then the updates of target networks and averaged parameters.
     ///
     /// # Panics

@@ -11,7 +11,45 @@ use tokio::sync::{OwnedSemaphorePermit, watch};
 use super::keys::Caller;
 use super::{App, Error, jobs};
 use crate::invalid::in_range;
-use crate::store::{Job, JobEvent, JobEventKind};
+use crate::store::{Job, JobEvent, JobEventKind, MetricRow};
+
+/// The metric with the environment steps per second.
+pub(super) const SPEED: &str = "env_steps_per_s";
+
+/// How far a job had come when it reported metrics.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Progress {
+    /// Environment steps done.
+    pub step: u64,
+    /// Environment steps of the whole job.
+    pub steps: u64,
+    /// Environment steps per second at that time; `None`: not measured.
+    pub steps_per_second: Option<f64>,
+}
+
+impl Progress {
+    /// Progress after the rows of an event.
+    fn of(rows: &[MetricRow], steps: u64) -> Self {
+        let step = rows.iter().map(|row| row.step).max().unwrap_or_default();
+        let speed = rows.iter().filter(|row| row.name == SPEED).max_by_key(|row| row.step);
+        Self { step, steps, steps_per_second: speed.and_then(|row| row.value) }
+    }
+
+    /// Seconds until all steps are done, at this speed.
+    pub fn seconds_left(&self) -> Option<f64> {
+        let speed = self.steps_per_second.filter(|speed| *speed > 0.0)?;
+        Some(self.steps.saturating_sub(self.step) as f64 / speed)
+    }
+}
+
+/// An event, and the progress of the job if it has metrics.
+#[derive(Clone, Debug, PartialEq)]
+pub struct WatchedEvent {
+    /// The event.
+    pub event: JobEvent,
+    /// The progress.
+    pub progress: Option<Progress>,
+}
 
 /// A watch of a job.
 pub struct Watch {
@@ -19,6 +57,7 @@ pub struct Watch {
     caller: Caller,
     id: String,
     job: i64,
+    steps: u64,
     after: u64,
     ended: bool,
     changes: watch::Receiver<()>,
@@ -32,11 +71,11 @@ pub struct Watch {
 /// open, [`Error::Draining`].
 pub async fn watch(app: &Arc<App>, caller: &Caller, id: &str, after: u64) -> Result<Watch, Error> {
     let permit = app.watchers.acquire(app)?;
-    let Job { row_id: job, state, last_event, .. } = jobs::get(app, caller, id).await?;
+    let Job { row_id: job, state, last_event, spec, .. } = jobs::get(app, caller, id).await?;
     in_range("after", after, 0..=last_event)?;
     let ended = state.ended() && after == last_event;
     let (changes, caller) = (app.store.changes(job), caller.clone());
-    Ok(Watch { app: app.clone(), caller, id: id.to_owned(), job, after, ended, changes, _permit: permit })
+    Ok(Watch { app: app.clone(), caller, id: id.to_owned(), job, steps: spec.steps, after, ended, changes, _permit: permit })
 }
 
 impl Watch {
@@ -47,12 +86,20 @@ impl Watch {
 
     /// The events, oldest first, until the job has ended. The stream ends early with [`Error::Draining`], with
     /// [`Error::NotFound`] when the job is deleted, or with [`Error::Internal`].
-    pub fn events(self) -> impl Stream<Item = Result<JobEvent, Error>> + Send + use<> {
+    pub fn events(self) -> impl Stream<Item = Result<WatchedEvent, Error>> + Send + use<> {
+        let steps = self.steps;
+        let watched = move |event: JobEvent| {
+            let progress = match &event.kind {
+                JobEventKind::Metrics(rows) => Some(Progress::of(rows, steps)),
+                JobEventKind::State { .. } => None,
+            };
+            WatchedEvent { event, progress }
+        };
         let pages = futures::stream::try_unfold(self, |mut watch| async {
             let page = watch.page().await?;
             Ok::<_, Error>(page.map(|page| (futures::stream::iter(page.into_iter().map(Ok)), watch)))
         });
-        pages.try_flatten()
+        pages.try_flatten().map_ok(watched)
     }
 
     /// Waits for the next events; `None` after the last.
@@ -75,5 +122,23 @@ impl Watch {
             }
         }
         Ok(None)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::Timestamp;
+
+    use super::*;
+
+    #[test]
+    fn the_time_left_follows_from_the_last_speed() {
+        let row = |name: &str, step, value| MetricRow { name: name.into(), step, value: Some(value), at: Timestamp::UNIX_EPOCH };
+        let rows = [row("loss", 400, 1.0), row(SPEED, 200, 10.0), row(SPEED, 400, 50.0)];
+        let progress = Progress::of(&rows, 1000);
+        assert_eq!(progress, Progress { step: 400, steps: 1000, steps_per_second: Some(50.0) });
+        assert_eq!(progress.seconds_left(), Some(12.0));
+        assert_eq!(Progress::of(&rows[..1], 1000).seconds_left(), None);
+        assert_eq!(Progress { steps_per_second: Some(0.0), ..progress }.seconds_left(), None);
     }
 }

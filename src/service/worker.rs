@@ -10,9 +10,10 @@ use super::{App, Error};
 use crate::error_code::ErrorCode;
 use crate::invalid::{Invalid, in_range};
 use crate::jobs::evaluation::EvaluationSpec;
+use crate::jobs::worker::RivalComparison;
 use crate::jobs::{Directive, equal_secrets, token_digest};
 use crate::store::{
-    EarlyStop, EndedAttempt, Job, JobId, Lease, Metric, NewCheckpoint, PartialSnapshot, Snapshot, WorkerResult, is_metric_name,
+    EarlyStop, EndedAttempt, InitKind, Job, JobId, Lease, Metric, NewCheckpoint, PartialSnapshot, PublishRule, Snapshot, WorkerResult, is_metric_name,
 };
 use crate::train_config::TrainConfig;
 
@@ -51,6 +52,10 @@ pub struct AttemptTask {
     pub snapshot: Option<Snapshot>,
     /// Time between snapshots.
     pub snapshot_every: std::time::Duration,
+    /// Whether training begins with weights of a checkpoint, unless there is a snapshot.
+    pub initial_weights: bool,
+    /// Whether the best checkpoint is compared with a policy, see [`rival`].
+    pub rival: bool,
     /// When training ends before all steps are done.
     pub stop: Option<EarlyStop>,
     /// The values that `stop` has observed up to the snapshot.
@@ -102,6 +107,8 @@ pub async fn fetch(app: &App, lease: Lease) -> Result<AttemptTask, Error> {
         evaluation: spec.evaluation,
         snapshot,
         snapshot_every: app.scheduler.config().snapshot_every,
+        initial_weights: spec.init.is_some_and(|init| init.from == InitKind::Weights),
+        rival: spec.publish.is_some_and(|rule| rule.better_than.is_some()),
         stop: spec.stop,
         observed,
     })
@@ -128,6 +135,32 @@ pub async fn snapshot(app: &App, lease: Lease) -> Result<Snapshot, Error> {
 /// [`Error::Internal`] when the database fails.
 pub async fn snapshot_chunk(app: &App, snapshot: &Snapshot, index: u32) -> Result<Option<Vec<u8>>, Error> {
     Ok(app.store.snapshot_chunk(snapshot.id, index).await?)
+}
+
+/// The weights that the job begins with, as safetensors.
+///
+/// # Errors
+/// [`Error::NotFound`] when the job begins with weights that are drawn.
+pub async fn initial_weights(app: &App, lease: Lease) -> Result<Vec<u8>, Error> {
+    let weights = app.store.initial_weights(lease.job_id).await?;
+    weights.ok_or_else(|| Error::not_found("initial weights of the job", lease.job_id.to_string()))
+}
+
+/// The policy that the job must be better than, as it is now: the name of a baseline, or `NAME:VERSION` and its checkpoint. `None`: it
+/// does not exist.
+///
+/// # Errors
+/// [`Error::Internal`] when the database fails.
+pub async fn rival(app: &App, lease: Lease) -> Result<Option<(String, Vec<u8>)>, Error> {
+    let job = app.store.job(lease.job_id).await?.ok_or_else(|| attempt_ended(lease))?;
+    let rule = job.spec.decode().map_err(Error::internal)?.publish.unwrap_or_default();
+    let Some(rival) = rule.better_than else { return Ok(None) };
+    match policies::export(app, &rival.parse()?).await {
+        Ok((reference, bytes)) => Ok(Some((format!("{}:{}", reference.name, reference.version), bytes))),
+        Err(Error::Precondition { code: ErrorCode::NoCheckpoint, .. }) => Ok(Some((rival, Vec::new()))),
+        Err(Error::NotFound { .. }) => Ok(None),
+        Err(e) => Err(e),
+    }
 }
 
 /// The checkpoint of a policy that the job evaluates, as safetensors.
@@ -189,7 +222,10 @@ pub async fn finish(app: &App, lease: Lease, result: WorkerResult, document: Opt
     let document = document.as_deref();
     let job = match result {
         WorkerResult::Succeeded => match new_version(app, lease).await {
-            Ok(Some(version)) => policies::publish_and_end(app, version, lease).await?,
+            Ok(Some((version, promotion))) => {
+                let promotion = promotion.map(|rule| promotion_of(rule, document)).transpose()?;
+                policies::publish_and_end(app, version, promotion, lease).await?
+            }
             Ok(None) => end(app, lease, &WorkerResult::Succeeded, document).await?,
             // Another attempt would fail with the same checkpoint.
             Err(Error::Invalid(e)) => {
@@ -218,15 +254,25 @@ async fn end(app: &App, lease: Lease, result: &WorkerResult, document: Option<&s
 }
 
 /// The best policy of a job, under the name that it is published as; `None` if the job has no checkpoint.
-async fn new_version(app: &App, lease: Lease) -> Result<Option<policies::NewVersion>, Error> {
+async fn new_version(app: &App, lease: Lease) -> Result<Option<(policies::NewVersion, Option<PublishRule>)>, Error> {
     let job = app.store.job(lease.job_id).await?.ok_or_else(|| attempt_ended(lease))?;
     let Some(checkpoint) = app.store.best_checkpoint(lease.job_id).await? else { return Ok(None) };
     // The end of an id is random. Its beginning is the time, which jobs submitted together share.
     let id = lease.job_id.to_string();
-    let name = job.spec.name.unwrap_or_else(|| format!("job-{}", &id[id.len() - 8..]));
+    let rule = job.spec.decode().ok().and_then(|spec| spec.publish);
+    let name = rule.as_ref().and_then(|rule| rule.policy.clone()).or(job.spec.name);
+    let name = name.unwrap_or_else(|| format!("job-{}", &id[id.len() - 8..]));
     // The name was checked at submission. Another owner may have made it since, so it is checked again when it is published.
     let publisher = Publisher { owner: job.owner, any_name: job.any_name, key: None };
-    policies::NewVersion::from_bytes(app, publisher, &name, checkpoint).await.map(Some)
+    let version = policies::NewVersion::from_bytes(app, publisher, &name, checkpoint).await?;
+    Ok(Some((version, rule.filter(|rule| rule.alias.is_some()))))
+}
+
+/// The move of an alias that the rule of a job asks for, with the comparison that its worker has made.
+fn promotion_of(rule: PublishRule, document: Option<&str>) -> Result<policies::Promotion, Error> {
+    let comparison = document.map(serde_json::from_str::<RivalComparison>).transpose();
+    let comparison = comparison.map_err(|e| Invalid::new("result", e, "a comparison with the rival"))?;
+    Ok(policies::Promotion { alias: rule.alias.unwrap_or_default(), better_than: rule.better_than, comparison })
 }
 
 /// Size and digest that an upload declares.

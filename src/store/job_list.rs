@@ -10,7 +10,7 @@ use sqlx::{QueryBuilder, Sqlite};
 
 use super::jobs::JobRow;
 use super::submission::text_of;
-use super::{Job, JobId, JobKind, JobState, Result, Store};
+use super::{Job, JobId, JobKind, JobSpec, JobState, Result, Store, UnreadableSpec};
 use crate::train_config::Algorithm;
 
 /// The jobs that a list contains; what is absent does not restrict it.
@@ -103,6 +103,8 @@ pub struct JobList {
 pub struct ListedJob {
     /// The job.
     pub job: Job,
+    /// Its specification; reading it takes time, so it is done once.
+    pub spec: Result<JobSpec, UnreadableSpec>,
     /// The name or value by which it is sorted.
     pub key: Option<SortKey>,
 }
@@ -146,11 +148,12 @@ impl Store {
                     continue;
                 }
             };
-            bytes += FIXED + job.notes.len() + job.spec.shown_bytes() + job.reason.as_ref().map_or(0, String::len);
+            let spec = job.spec.decode();
+            bytes += FIXED + job.notes.len() + job.spec.shown_bytes(spec.is_ok()) + job.reason.as_ref().map_or(0, String::len);
             if bytes > list.max_bytes && !jobs.is_empty() {
                 return Ok((jobs, true));
             }
-            jobs.push(ListedJob { key: keys.remove(&job.row_id).flatten(), job });
+            jobs.push(ListedJob { key: keys.remove(&job.row_id).flatten(), spec, job });
         }
         Ok((jobs, more))
     }

@@ -2,6 +2,7 @@
 //! crash neither loses nor duplicates a row.
 
 use jiff::Timestamp;
+use sqlx::{QueryBuilder, Sqlite};
 
 use super::attempts::is_active;
 use super::metric_summaries::summarize;
@@ -92,17 +93,21 @@ impl Store {
         after: Option<&MetricCursor>,
         limit: u32,
     ) -> Result<Vec<MetricRow>> {
-        let sql = "SELECT m.name, m.step, m.value, m.at FROM metrics m JOIN jobs j ON j.number = m.job
-                   WHERE j.id = ?1 AND (?2 IS NULL OR m.name = ?2) AND (?3 IS NULL OR (m.name, m.step) > (?3, ?4))
-                   ORDER BY m.name, m.step LIMIT ?5";
-        let rows: Vec<(String, i64, Option<f64>, i64)> = sqlx::query_as(sql)
-            .bind(id.to_string())
-            .bind(name)
-            .bind(after.map(|a| a.name.as_str()))
-            .bind(after.map(|a| a.step as i64))
-            .bind(limit)
-            .fetch_all(&self.read)
-            .await?;
+        // Only the conditions that there are, so that each page begins where the last one ended.
+        let mut sql = QueryBuilder::<Sqlite>::new("SELECT name, step, value, at FROM metrics WHERE job = (SELECT number FROM jobs WHERE id = ");
+        sql.push_bind(id.to_string()).push(")");
+        if let Some(name) = name {
+            sql.push(" AND name = ").push_bind(name);
+        }
+        match after {
+            Some(after) if name == Some(&after.name) => drop(sql.push(" AND step > ").push_bind(after.step as i64)),
+            Some(after) => {
+                sql.push(" AND (name, step) > (").push_bind(&after.name).push(", ").push_bind(after.step as i64).push(")");
+            }
+            None => {}
+        }
+        sql.push(" ORDER BY name, step LIMIT ").push_bind(limit);
+        let rows: Vec<(String, i64, Option<f64>, i64)> = sql.build_query_as().fetch_all(&self.read).await?;
         rows.into_iter()
             .map(|(name, step, value, at)| Ok(MetricRow { name, step: step as u64, value, at: timestamp(at)? }))
             .collect()

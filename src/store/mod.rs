@@ -57,8 +57,8 @@ pub use metric_summaries::{MetricSummary, larger_is_better};
 pub use metrics::{Metric, MetricCursor, MetricRow, is_metric_name};
 pub use policies::{NewPolicyVersion, PolicyVersion, PublishedPolicy, VersionKey};
 pub use snapshots::{PartialSnapshot, Snapshot};
-pub use specs::{EarlyStop, JobKind, JobLimits, JobSpec, StoredSpec, UnreadableSpec};
-pub use submission::{NewJob, SubmitResult};
+pub use specs::{EarlyStop, InitKind, JobInit, JobKind, JobLimits, JobSpec, PublishRule, StoredSpec, UnreadableSpec};
+pub use submission::{Beginning, NewJob, SubmitResult};
 pub use writes::WriteFailure;
 
 use std::path::{Path, PathBuf};
@@ -91,6 +91,7 @@ const MIGRATIONS: &[(&str, &str)] = &migrations![
     "0009_consecutive_failures.sql",
     "0010_finding_jobs.sql",
     "0011_lifecycle.sql",
+    "0012_jobs_for_a_week.sql",
 ];
 
 /// Name of the database file inside the data directory.

@@ -41,6 +41,20 @@ async fn discard_incomplete(db: &mut SqliteConnection, job: i64) -> Result<()> {
     Ok(())
 }
 
+/// Gives a new job a copy of another job's snapshot.
+pub(super) async fn copy_snapshot(db: &mut SqliteConnection, job: i64, snapshot: &Snapshot, now: i64) -> Result<()> {
+    let sql = "INSERT INTO snapshots (job, attempt, step, size, sha256, created_at)
+               SELECT ?, 0, step, size, sha256, ? FROM snapshots WHERE id = ? AND sha256 IS NOT NULL";
+    let copied = sqlx::query(sql).bind(job).bind(now).bind(snapshot.id).execute(&mut *db).await?;
+    if copied.rows_affected() == 0 {
+        return Err(super::corrupt("snapshot", snapshot.id, "deleted meanwhile"));
+    }
+    let sql = "INSERT INTO snapshot_chunks (snapshot, number, bytes) SELECT ?, number, bytes FROM snapshot_chunks WHERE snapshot = ?";
+    sqlx::query(sql).bind(copied.last_insert_rowid()).bind(snapshot.id).execute(&mut *db).await?;
+    sqlx::query("UPDATE jobs SET step = ? WHERE number = ?").bind(snapshot.step as i64).bind(job).execute(&mut *db).await?;
+    Ok(())
+}
+
 impl Store {
     /// Begins a snapshot taken at `step` and deletes the rest of an interrupted upload. Returns `None` if the attempt has
     /// ended.

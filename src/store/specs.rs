@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
+use uuid::Uuid;
 
 use super::JobId;
 use super::named_enum::named_enum;
@@ -20,6 +21,46 @@ named_enum! {
         /// Trains many policies.
         Sweep = "sweep",
     }
+}
+
+named_enum! {
+    /// What a job that does not begin anew begins with.
+    InitKind {
+        /// The weights of a checkpoint.
+        Weights = "weights",
+        /// The snapshot of another job, with its optimiser and replay.
+        Snapshot = "snapshot",
+    }
+}
+
+/// What a job that trains begins with, instead of weights that are drawn.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct JobInit {
+    /// Weights or a snapshot.
+    pub from: InitKind,
+    /// The policy with these weights, as `NAME:VERSION`.
+    pub policy: Option<String>,
+    /// Id of the checkpoint with these weights.
+    pub checkpoint: Option<Uuid>,
+    /// The job that this one continues.
+    pub job: Option<JobId>,
+    /// Environment steps of training before.
+    pub step: u64,
+    /// SHA-256 of the weights or the snapshot, lower-case hexadecimal.
+    pub sha256: String,
+}
+
+/// Where the policy of a job is published, and which alias moves to it.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PublishRule {
+    /// Name of the policy; `None`: the name of the job.
+    pub policy: Option<String>,
+    /// Alias that moves to the new version.
+    pub alias: Option<String>,
+    /// The policy that the new version must be better than, or the alias stays.
+    pub better_than: Option<String>,
 }
 
 /// The specification of a job, with all defaults filled in.
@@ -44,6 +85,12 @@ pub struct JobSpec {
     /// When training ends before all steps are done; `None`: never.
     #[serde(default)]
     pub stop: Option<EarlyStop>,
+    /// What training begins with; `None`: weights that are drawn.
+    #[serde(default)]
+    pub init: Option<JobInit>,
+    /// Where the policy is published; `None`: under the name of the job.
+    #[serde(default)]
+    pub publish: Option<PublishRule>,
     /// The complete training configuration of a job that trains.
     #[serde(default)]
     pub config: Option<TrainConfig>,
@@ -73,6 +120,8 @@ impl JobSpec {
             limits: JobLimits::default(),
             after: Vec::new(),
             stop: None,
+            init: None,
+            publish: None,
             config: Some(config),
             evaluation: None,
             sweep: None,
@@ -158,6 +207,10 @@ impl StoredSpec {
     /// # Errors
     /// [`UnreadableSpec`] names the field that this version does not know or cannot read.
     pub fn decode(&self) -> Result<JobSpec, UnreadableSpec> {
+        if let Ok(spec) = serde_json::from_str(&self.document) {
+            return Ok(spec);
+        }
+        // Once more, to find the field.
         let mut parser = serde_json::Deserializer::from_str(&self.document);
         serde_path_to_error::deserialize(&mut parser).map_err(|error| {
             let reason = error.to_string();
@@ -166,10 +219,10 @@ impl StoredSpec {
         })
     }
 
-    /// Bytes of the texts that a list shows.
-    pub(super) fn shown_bytes(&self) -> usize {
+    /// Bytes of the texts that a list shows. `readable`: whether this version can read the document.
+    pub(super) fn shown_bytes(&self, readable: bool) -> usize {
         let labels: usize = self.labels.iter().map(|(key, value)| key.len() + value.len() + 8).sum();
-        let document = if self.decode().is_ok() { 0 } else { self.document.len() };
+        let document = if readable { 0 } else { self.document.len() };
         self.name.as_ref().map_or(0, String::len) + labels + document
     }
 }

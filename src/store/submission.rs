@@ -2,14 +2,16 @@
 
 use std::collections::BTreeMap;
 
+use bytes::Bytes;
 use jiff::Timestamp;
 use serde::Serialize;
 use sqlx::SqliteConnection;
 
 use super::jobs::{find, get_existing};
+use super::snapshots::copy_snapshot;
 use super::specs::JobSpec;
 use super::transitions::{Transition, count_blockers, transition};
-use super::{Job, JobId, JobState, Result, Store, corrupt};
+use super::{Job, JobId, JobState, Result, Snapshot, Store, corrupt};
 
 /// A job to submit.
 #[derive(Clone, Debug)]
@@ -26,10 +28,21 @@ pub struct NewJob {
     pub notes: String,
     /// The job that makes this one; `None`: a caller makes it.
     pub parent: Option<JobId>,
+    /// What it begins with, as [`JobSpec::init`] describes.
+    pub beginning: Option<Beginning>,
     /// The current time.
     pub now: Timestamp,
     /// The idempotency key of the request, which belongs to the owner, and the SHA-256 of its body.
     pub idempotency: Option<(String, [u8; 32])>,
+}
+
+/// What a job begins with, instead of weights that are drawn.
+#[derive(Clone, Debug)]
+pub enum Beginning {
+    /// A checkpoint as safetensors, and its SHA-256.
+    Weights(String, Bytes),
+    /// A copy of this snapshot.
+    Snapshot(Snapshot),
 }
 
 impl NewJob {
@@ -85,6 +98,15 @@ impl Store {
         Ok(SubmitResult::Created(job))
     }
 
+    /// The weights that a job begins with, as safetensors; `None`: they are drawn.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn initial_weights(&self, job: JobId) -> Result<Option<Vec<u8>>> {
+        let sql = "SELECT w.bytes FROM jobs j JOIN initial_weights w ON w.sha256 = j.init WHERE j.id = ?";
+        Ok(sqlx::query_scalar(sql).bind(job.to_string()).fetch_optional(&self.read).await?)
+    }
+
     /// The result of repeating a submission of `owner` with this idempotency key and SHA-256 of its body; `None` if the key is new.
     ///
     /// # Errors
@@ -124,6 +146,11 @@ pub(super) async fn insert(tx: &mut SqliteConnection, new: &NewJob) -> Result<Jo
         .await?
         .last_insert_rowid();
     set_labels(tx, row_id, labels).await?;
+    match &new.beginning {
+        Some(Beginning::Weights(sha256, bytes)) => set_weights(tx, row_id, sha256, bytes).await?,
+        Some(Beginning::Snapshot(snapshot)) => copy_snapshot(tx, row_id, snapshot, now).await?,
+        None => {}
+    }
     for needed in &new.spec.after {
         let sql = "INSERT INTO job_dependencies (job, needs) SELECT ?, number FROM jobs WHERE id = ?";
         sqlx::query(sql).bind(row_id).bind(needed.to_string()).execute(&mut *tx).await?;
@@ -135,6 +162,14 @@ pub(super) async fn insert(tx: &mut SqliteConnection, new: &NewJob) -> Result<Jo
         sqlx::query(sql).bind(new.owner()).bind(key).bind(body.as_slice()).bind(row_id).bind(now).execute(&mut *tx).await?;
     }
     get_existing(tx, new.id).await
+}
+
+/// Makes these the weights that a job begins with.
+async fn set_weights(db: &mut SqliteConnection, job: i64, sha256: &str, bytes: &[u8]) -> Result<()> {
+    let sql = "INSERT INTO initial_weights (sha256, bytes) VALUES (?, ?) ON CONFLICT DO NOTHING";
+    sqlx::query(sql).bind(sha256).bind(bytes).execute(&mut *db).await?;
+    sqlx::query("UPDATE jobs SET init = ? WHERE number = ?").bind(sha256).bind(job).execute(&mut *db).await?;
+    Ok(())
 }
 
 /// Makes these the labels by which the job is found.

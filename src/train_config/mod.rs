@@ -170,6 +170,9 @@ impl Algorithm {
 }
 
 impl TrainConfig {
+    /// Most environment steps of a run.
+    pub const MAX_STEPS: u64 = 1_000_000_000_000;
+
     /// The configuration of `algorithm` and `preset` without overrides.
     pub fn preset(algorithm: Algorithm, preset: Preset) -> Self {
         let mut environment = EnvConfig::default();
@@ -382,11 +385,37 @@ impl TrainConfig {
 }
 
 impl Training {
+    /// The learning rate after `env_steps` environment steps. It falls linearly to `learning_rate_decay` of its start value.
+    pub fn learning_rate_at(&self, env_steps: u64) -> f64 {
+        let done = (env_steps as f64 / self.steps as f64).min(1.0);
+        self.learning_rate * (1.0 - (1.0 - self.learning_rate_decay) * done)
+    }
+
+    /// Epsilon after `env_steps` environment steps. It falls linearly from 1 to `epsilon_end`, then is constant.
+    pub fn epsilon_at(&self, env_steps: u64) -> f64 {
+        if env_steps >= self.epsilon_anneal {
+            return self.epsilon_end;
+        }
+        1.0 - (1.0 - self.epsilon_end) * env_steps as f64 / self.epsilon_anneal as f64
+    }
+
+    /// The training of `steps` more environment steps from weights that were trained for `env_steps`: the learning rate stays where
+    /// it was, and epsilon does not rise again once it has fallen.
+    pub fn continued(&self, env_steps: u64, steps: u64) -> Self {
+        Self {
+            steps,
+            learning_rate: self.learning_rate_at(env_steps),
+            learning_rate_decay: 1.0,
+            epsilon_anneal: self.epsilon_anneal.saturating_sub(env_steps).max(1),
+            ..self.clone()
+        }
+    }
+
     fn validate(&self) -> Result<(), Invalid> {
         in_range("layers", self.layers, 1..=8)?;
         in_range("hops", self.hops, 1..=9)?;
         in_range("hyper_init", self.hyper_init, 0.0..=10.0)?;
-        in_range("steps", self.steps, 1..=1_000_000_000_000)?;
+        in_range("steps", self.steps, 1..=TrainConfig::MAX_STEPS)?;
         in_range("learning_rate", self.learning_rate, 1e-12..=1.0)?;
         in_range("learning_rate_decay", self.learning_rate_decay, 0.0..=1.0)?;
         in_range("gamma", self.gamma, 0.0..=1.0)?;
@@ -535,5 +564,18 @@ mod tests {
             checked += 1;
         }
         assert_eq!(checked, 20, "rows of the table with the name of a field");
+    }
+
+    #[test]
+    fn schedules_fall_linearly_and_stay_where_they_ended() {
+        let t = TrainConfig::preset(Algorithm::Qedgix, Preset::Practical).training;
+        assert_eq!((t.epsilon_at(0), t.epsilon_at(100_000), t.epsilon_at(u64::MAX)), (1.0, 0.05, 0.05));
+        assert!((t.epsilon_at(50_000) - 0.525).abs() < 1e-12);
+        assert_eq!(t.learning_rate_at(0), 1e-3);
+        assert!((t.learning_rate_at(u64::MAX) - 1e-4).abs() < 1e-12);
+        let more = t.continued(t.steps, 5000);
+        assert_eq!((more.steps, more.epsilon_anneal, more.learning_rate_at(5000)), (5000, 1, t.learning_rate_at(t.steps)));
+        assert_eq!(more.epsilon_at(1), 0.05);
+        assert_eq!(t.continued(40_000, 5000).epsilon_anneal, 60_000);
     }
 }

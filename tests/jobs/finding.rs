@@ -222,7 +222,7 @@ async fn many_jobs_are_listed() {
         let (id, now) = (JobId(uuid::Uuid::now_v7()), Timestamp::now());
         let begin = Instant::now();
         let (notes, parent) = (String::new(), None);
-        let new = NewJob { id, owner: None, any_name: false, spec, notes, parent, now, idempotency: None };
+        let new = NewJob { id, owner: None, any_name: false, spec, notes, parent, beginning: None, now, idempotency: None };
         store.submit_job(new).await.unwrap();
         submits.push(begin.elapsed());
     }

@@ -39,7 +39,7 @@ async fn an_evaluation_returns_the_report_of_the_command() {
     let job = server.reaches(&id, "succeeded").await;
     assert_eq!((&job["kind"], &job["algorithm"], &job["policy"]), (&json!("evaluate"), &json!(null), &json!(null)));
     // Tour is added as a reference.
-    assert_eq!(job["progress"], json!({"step": 20, "steps": 20}));
+    assert_eq!(job["progress"], json!({"step": 20, "steps": 20, "steps_per_second": null, "seconds_left": null}));
     assert_eq!(job["evaluation"]["policies"], json!(["mine:1", "sweep", "nearest"]));
     let report = server.get(&format!("/v1/jobs/{id}/result")).await;
     let mut command = Command::new(PROGRAM);

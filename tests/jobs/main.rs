@@ -4,6 +4,7 @@ mod command_line;
 mod events;
 mod finding;
 mod harness;
+mod killed_sweep;
 mod kinds;
 mod lifecycle;
 #[path = "../process/mod.rs"]
@@ -16,3 +17,4 @@ mod space;
 mod submission;
 mod train_command;
 mod unreadable;
+mod warm_start;

@@ -24,6 +24,7 @@ async fn running(store: &Store) -> Lease {
         any_name: false,
         spec,
         notes: String::new(),
+        beginning: None,
         parent: None,
         now: NOW,
         idempotency: None,

@@ -27,7 +27,7 @@ async fn job_shows_its_configuration_which_can_be_submitted_again() {
     assert_eq!(job["training"]["steps"], 400);
     assert_eq!(job["training"]["mixer"], "vdn");
     assert_eq!((&job["seed"], &job["labels"]["who"], &job["kind"]), (&json!(7), &json!("me"), &json!("train")));
-    assert_eq!(job["progress"], json!({"step": 0, "steps": 400}));
+    assert_eq!(job["progress"], json!({"step": 0, "steps": 400, "steps_per_second": null, "seconds_left": null}));
 
     let fields = ["kind", "algorithm", "preset", "environment", "training", "threads", "priority", "seed", "name", "labels"];
     let again: Value = fields.iter().map(|f| ((*f).to_owned(), job[f].clone())).collect::<serde_json::Map<_, _>>().into();

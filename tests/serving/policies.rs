@@ -112,6 +112,7 @@ async fn a_checkpoint_of_a_job_is_published_by_its_id() {
         any_name: false,
         spec,
         notes: String::new(),
+        beginning: None,
         parent: None,
         now,
         idempotency: None,

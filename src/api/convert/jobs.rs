@@ -7,10 +7,11 @@ use super::response::timestamp;
 use super::structs::to_struct;
 use crate::invalid::Invalid;
 use crate::jobs::Directive;
+use crate::service::events::{Progress, WatchedEvent};
 use crate::service::jobs::{JobView, ListRequest, Waiting};
 use crate::store::{
-    Attempt, Checkpoint, CheckpointKind, JobEvent, JobEventKind, JobKind, JobSpec, JobState, Metric, MetricRow, MetricSummary,
-    NewCheckpoint, StoredSpec, WorkerResult,
+    Attempt, Checkpoint, CheckpointKind, JobEventKind, JobKind, JobSpec, JobState, Metric, MetricRow, MetricSummary,
+    NewCheckpoint, PublishRule, StoredSpec, WorkerResult,
 };
 use crate::wire::v1;
 
@@ -80,21 +81,27 @@ pub fn job_summary(view: JobView) -> v1::Job {
 
 impl From<JobView> for v1::Job {
     fn from(view: JobView) -> Self {
-        job_message(view, |JobSpec { limits, after, stop, config, evaluation, sweep, point, .. }| {
+        job_message(view, |JobSpec { limits, after, stop, init, publish, config, evaluation, sweep, point, .. }| {
             let (environment, training) = config.as_ref().map(|config| (&config.environment, &config.training)).unzip();
             json!({
                 "environment": environment, "training": training, "max_attempts": limits.max_attempts, "timeout": limits.timeout,
-                "backoff": limits.backoff, "after": after, "stop": stop, "evaluation": evaluation, "sweep": sweep,
+                "backoff": limits.backoff, "after": after, "stop": stop, "init": init, "publish": publish.as_ref().map(publish_document), "evaluation": evaluation, "sweep": sweep,
                 "point": point,
             })
         })
     }
 }
 
+/// A rule of publication as it is submitted.
+fn publish_document(rule: &PublishRule) -> Value {
+    let PublishRule { policy, alias, better_than } = rule;
+    let condition = better_than.as_ref().map(|better_than| json!({"better_than": better_than}));
+    json!({"policy": policy, "alias": alias, "if": condition})
+}
+
 /// The message of a job, whose `spec` also has the fields that `details` selects.
 fn job_message(view: JobView, details: impl Fn(&JobSpec) -> Value) -> v1::Job {
-    let JobView { job, waiting, metrics } = view;
-    let decoded = job.spec.decode();
+    let JobView { job, spec: decoded, progress, waiting, metrics } = view;
     let StoredSpec { kind, name, labels, threads, priority, algorithm, preset, seed, steps, document } = job.spec;
     let mut spec = json!({
         "kind": kind, "name": name, "labels": labels, "threads": threads, "priority": priority, "algorithm": algorithm,
@@ -130,6 +137,8 @@ fn job_message(view: JobView, details: impl Fn(&JobSpec) -> Value) -> v1::Job {
         metrics: metrics.into_iter().map(|(name, summary)| (name, summary.into())).collect(),
         waiting: waiting.map(Into::into),
         unreadable,
+        steps_per_second: progress.steps_per_second,
+        seconds_left: progress.seconds_left(),
     }
 }
 
@@ -175,8 +184,15 @@ impl From<MetricRow> for v1::MetricRow {
     }
 }
 
-impl From<JobEvent> for v1::JobEvent {
-    fn from(event: JobEvent) -> Self {
+impl From<Progress> for v1::JobProgress {
+    fn from(progress: Progress) -> Self {
+        let Progress { step, steps, steps_per_second } = progress;
+        Self { step, steps, steps_per_second, seconds_left: progress.seconds_left() }
+    }
+}
+
+impl From<WatchedEvent> for v1::JobEvent {
+    fn from(WatchedEvent { event, progress }: WatchedEvent) -> Self {
         use v1::job_event::What;
         let what = match event.kind {
             JobEventKind::State { state, attempt, reason, at } => What::State(v1::JobStateChange {
@@ -185,7 +201,10 @@ impl From<JobEvent> for v1::JobEvent {
                 reason: reason.unwrap_or_default(),
                 at: Some(timestamp(at)),
             }),
-            JobEventKind::Metrics(rows) => What::Metrics(v1::JobMetrics { rows: rows.into_iter().map(Into::into).collect() }),
+            JobEventKind::Metrics(rows) => What::Metrics(v1::JobMetrics {
+                rows: rows.into_iter().map(Into::into).collect(),
+                progress: progress.map(Into::into),
+            }),
         };
         Self { id: event.id, what: Some(what) }
     }

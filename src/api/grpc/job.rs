@@ -12,7 +12,7 @@ use crate::api::auth::caller;
 use crate::api::convert::jobs::{job_summary, list_request};
 use crate::api::convert::structs::from_struct;
 use crate::api::errors::stream_status;
-use crate::jobs::spec::{EditRequest, JobRequest};
+use crate::jobs::spec::{ContinueRequest, EditRequest, JobRequest};
 use crate::service::jobs::LogLines;
 use crate::service::keys::Caller;
 use crate::service::worker::MAX_CHUNK;
@@ -86,6 +86,14 @@ impl JobService for Service {
 
     async fn retry_job(&self, request: Request<v1::RetryJobRequest>) -> GrpcResult<v1::Job> {
         self.change(caller(request.extensions()), &request.into_inner().id, JobAction::Retry).await
+    }
+
+    async fn continue_job(&self, request: Request<v1::ContinueJobRequest>) -> GrpcResult<v1::Job> {
+        let caller = caller(request.extensions());
+        let v1::ContinueJobRequest { id, steps, idempotency_key } = request.into_inner();
+        let key = non_empty(&idempotency_key).map(str::to_owned);
+        let (job, _) = jobs::continue_job(&self.0, &caller, &id, ContinueRequest { steps }, key).await?;
+        Ok(Response::new(job.into()))
     }
 
     async fn get_job_metrics(&self, request: Request<v1::GetJobMetricsRequest>) -> GrpcResult<v1::GetJobMetricsResponse> {

@@ -43,6 +43,15 @@ fn json_text(document: Option<&impl Serialize>) -> Result<String, Error> {
     document.map_or_else(|| Ok(String::new()), |document| serde_json::to_string(document).map_err(Error::internal))
 }
 
+type ChunkStream = Pin<Box<dyn Stream<Item = Result<v1::Chunk, Status>> + Send>>;
+
+/// A file in chunks.
+fn chunks(bytes: Vec<u8>) -> Response<ChunkStream> {
+    let bytes = Bytes::from(bytes);
+    let parts = (0..bytes.len()).step_by(MAX_CHUNK).map(move |at| bytes.slice(at..bytes.len().min(at + MAX_CHUNK)));
+    Response::new(Box::pin(futures::stream::iter(parts.map(|data| Ok(v1::Chunk { data })))))
+}
+
 #[tonic::async_trait]
 impl WorkerService for Service {
     async fn fetch(&self, request: Request<v1::FetchRequest>) -> GrpcResult<v1::FetchResponse> {
@@ -54,12 +63,14 @@ impl WorkerService for Service {
             threads: task.threads as u32,
             snapshot_step: task.snapshot.map(|snapshot| snapshot.step),
             snapshot_every_ms: task.snapshot_every.as_millis() as u64,
+            initial_weights: task.initial_weights,
+            rival: task.rival,
             stop: json_text(task.stop.as_ref())?,
             observed: task.observed.into_iter().map(Into::into).collect(),
         }))
     }
 
-    type DownloadSnapshotStream = Pin<Box<dyn Stream<Item = Result<v1::Chunk, Status>> + Send>>;
+    type DownloadSnapshotStream = ChunkStream;
 
     async fn download_snapshot(&self, request: Request<v1::DownloadSnapshotRequest>) -> GrpcResult<Self::DownloadSnapshotStream> {
         let lease = self.lease(request.metadata()).await?;
@@ -75,13 +86,35 @@ impl WorkerService for Service {
         Ok(Response::new(Box::pin(chunks)))
     }
 
-    type DownloadPolicyStream = Pin<Box<dyn Stream<Item = Result<v1::Chunk, Status>> + Send>>;
+    type DownloadPolicyStream = ChunkStream;
 
     async fn download_policy(&self, request: Request<v1::DownloadPolicyRequest>) -> GrpcResult<Self::DownloadPolicyStream> {
         let lease = self.lease(request.metadata()).await?;
-        let bytes = Bytes::from(worker::policy(&self.0, lease, &request.into_inner().policy).await?);
+        Ok(chunks(worker::policy(&self.0, lease, &request.into_inner().policy).await?))
+    }
+
+    type DownloadInitialWeightsStream = ChunkStream;
+
+    async fn download_initial_weights(
+        &self,
+        request: Request<v1::DownloadInitialWeightsRequest>,
+    ) -> GrpcResult<Self::DownloadInitialWeightsStream> {
+        let lease = self.lease(request.metadata()).await?;
+        Ok(chunks(worker::initial_weights(&self.0, lease).await?))
+    }
+
+    type DownloadRivalStream = Pin<Box<dyn Stream<Item = Result<v1::RivalPart, Status>> + Send>>;
+
+    async fn download_rival(&self, request: Request<v1::DownloadRivalRequest>) -> GrpcResult<Self::DownloadRivalStream> {
+        let lease = self.lease(request.metadata()).await?;
+        let Some((policy, bytes)) = worker::rival(&self.0, lease).await? else {
+            return Ok(Response::new(Box::pin(futures::stream::empty())));
+        };
+        let bytes = Bytes::from(bytes);
+        let first = v1::RivalPart { policy, data: Bytes::new() };
         let parts = (0..bytes.len()).step_by(MAX_CHUNK).map(move |at| bytes.slice(at..bytes.len().min(at + MAX_CHUNK)));
-        Ok(Response::new(Box::pin(futures::stream::iter(parts.map(|data| Ok(v1::Chunk { data }))))))
+        let parts = parts.map(|data| v1::RivalPart { policy: String::new(), data });
+        Ok(Response::new(Box::pin(futures::stream::iter(std::iter::once(first).chain(parts).map(Ok)))))
     }
 
     async fn report(&self, request: Request<v1::ReportRequest>) -> GrpcResult<v1::ReportResponse> {

@@ -16,14 +16,15 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::extract::{Path, Query};
-use super::jobs::{JobPath, MetricRow};
+use super::jobs::{JobPath, MetricRow, Progress};
 use super::openapi::{BadRequest, Draining, NotFound};
 use crate::api::errors::log_internal;
 use crate::invalid::Invalid;
+use crate::service::events::WatchedEvent;
 use crate::service::jobs::LogLines;
 use crate::service::keys::Caller;
 use crate::service::{App, Error, events, jobs};
-use crate::store::{JobEvent, JobEventKind, JobState};
+use crate::store::{JobEventKind, JobState};
 
 /// The route.
 pub(super) fn router() -> OpenApiRouter<Arc<App>> {
@@ -45,7 +46,7 @@ struct ServerSentEvent {
     #[schema(pattern = "^[0-9]+$")]
     id: String,
     event: EventName,
-    /// JSON: `{state, attempt, reason, at}`, or `{metrics}` with rows as in `listJobMetrics`.
+    /// JSON: `{state, attempt, reason, at}`, or `{metrics, progress}` with rows as in `listJobMetrics` and the progress of a job at that time.
     #[schema(content_media_type = "application/json")]
     data: String,
 }
@@ -70,19 +71,21 @@ enum EventData {
     },
     Metrics {
         metrics: Vec<MetricRow>,
+        progress: Option<Progress>,
     },
 }
 
-impl TryFrom<JobEvent> for ServerSentEvent {
+impl TryFrom<WatchedEvent> for ServerSentEvent {
     type Error = Error;
 
-    fn try_from(event: JobEvent) -> Result<Self, Error> {
+    fn try_from(WatchedEvent { event, progress }: WatchedEvent) -> Result<Self, Error> {
+        let progress = progress.map(Into::into);
         let (name, data) = match event.kind {
             JobEventKind::State { state, attempt, reason, at } => {
                 (EventName::State, EventData::State { state, attempt, reason, at })
             }
             JobEventKind::Metrics(rows) => {
-                (EventName::Metrics, EventData::Metrics { metrics: rows.into_iter().map(Into::into).collect() })
+                (EventName::Metrics, EventData::Metrics { metrics: rows.into_iter().map(Into::into).collect(), progress })
             }
         };
         let data = serde_json::to_string(&data).map_err(Error::internal)?;

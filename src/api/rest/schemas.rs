@@ -47,6 +47,18 @@ pub(super) fn optional_policy_spec() -> RefOr<Schema> {
     string(concat!("^(", name!(), "(@", name!(), "|:", version!(), ")?)?$"))
 }
 
+/// NAME of a policy or an alias, or null.
+pub(super) fn nullable_name() -> RefOr<Schema> {
+    schema(json!({"type": ["string", "null"], "pattern": concat!("^", name!(), "$")}))
+}
+
+/// NAME, NAME@ALIAS, NAME:VERSION or null.
+pub(super) fn nullable_policy_spec() -> RefOr<Schema> {
+    schema(json!({
+        "type": ["string", "null"], "pattern": concat!("^", name!(), "(@", name!(), "|:", version!(), ")?$")
+    }))
+}
+
 /// Page token that contains a row id.
 pub(super) fn number_token() -> RefOr<Schema> {
     string("^[0-9]{0,18}$")

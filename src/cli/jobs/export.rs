@@ -76,6 +76,7 @@ fn config(job: &Value) -> Value {
         "timeout",
         "backoff",
         "stop",
+        "publish",
         "algorithm",
         "preset",
         "environment",
@@ -85,7 +86,13 @@ fn config(job: &Value) -> Value {
         "seed",
     ];
     let given = fields.iter().filter(|field| !job[**field].is_null());
-    given.map(|field| ((*field).to_owned(), job[*field].clone())).collect::<Map<_, _>>().into()
+    let mut config: Map<_, _> = given.map(|field| ((*field).to_owned(), job[*field].clone())).collect();
+    for source in ["policy", "checkpoint"] {
+        if !job["init"][source].is_null() {
+            config.insert("init".into(), json!({source: job["init"][source]}));
+        }
+    }
+    config.into()
 }
 
 /// The attempts of a job in the order of their begin.

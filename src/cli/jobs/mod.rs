@@ -34,6 +34,7 @@ pub use self::export::{checkpoint, write_verified};
   qedgix jobs watch my-policy                       # ctrl-c leaves; the job goes on
   qedgix jobs logs -f 01a202d1-93be
   qedgix jobs cancel 01a202d1-93be 01a202d1-93bf
+  qedgix jobs continue my-policy --steps 2e5        # a new job with the same configuration
   qedgix jobs compare --label sweep=rates --svg rates.svg
   qedgix jobs export my-policy --out my-policy --tensorboard
   qedgix jobs submit --file my-policy/config.json --set training.learning_rate=3e-4
@@ -79,6 +80,8 @@ enum Command {
     Resume(Jobs),
     /// Put failed jobs back into the queue; they continue from their snapshots
     Retry(Jobs),
+    /// Train a job that has ended further, in a new job: from its snapshot if that is kept, or else from its last weights
+    Continue(submit::ContinueArgs),
     /// Delete jobs that have ended, with their metrics, logs and checkpoints
     Delete(Jobs),
     /// Compare jobs: how their configurations differ, best and last values of a metric, means over seeds, and curves as SVG
@@ -112,6 +115,7 @@ pub async fn run(args: JobsArgs) -> anyhow::Result<()> {
         Command::Pause(jobs) => change(&client, "pause", &jobs.jobs, json).await,
         Command::Resume(jobs) => change(&client, "resume", &jobs.jobs, json).await,
         Command::Retry(jobs) => change(&client, "retry", &jobs.jobs, json).await,
+        Command::Continue(args) => submit::continue_job(&client, args, json).await,
         Command::Delete(jobs) => change(&client, "delete", &jobs.jobs, json).await,
         Command::Compare(args) => compare::run(&client, args, json).await,
         Command::Export(args) => export::run(&client, args, json).await,

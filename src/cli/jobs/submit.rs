@@ -4,16 +4,17 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use clap::Args;
-use serde_json::{Map, Value};
+use serde_json::{Map, Value, json};
 
+use super::reference::resolve;
 use super::screen::{Lines, Screen};
 use super::view::JobView;
 use super::watch::{self, OnSignal};
 use crate::cli::client::{Client, ClientError};
 use crate::cli::output::{errln, outln};
-use crate::cli::run_args::{RunArgs, insert};
+use crate::cli::run_args::{RunArgs, count, insert};
 
 /// Flags of `jobs submit`.
 #[derive(Args, Debug)]
@@ -43,15 +44,19 @@ pub struct JobArgs {
     /// Label for people; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     label: Vec<String>,
+    /// Begins with the weights of this policy (NAME, NAME@ALIAS, NAME:VERSION) or of the checkpoint with this id [default: weights are
+    /// drawn]
+    #[arg(long, env = "QEDGIX_INIT", value_name = "POLICY_OR_ID")]
+    init: Option<String>,
     /// Jobs with a higher priority start first, -100 to 100 [default: 0]
     #[arg(long, env = "QEDGIX_PRIORITY", allow_negative_numbers = true)]
     priority: Option<i64>,
 }
 
 impl JobArgs {
-    /// A job with a name and threads only.
-    pub fn new(name: Option<String>, threads: Option<usize>) -> Self {
-        Self { name, threads, label: Vec::new(), priority: None }
+    /// A job with a name, threads and initial weights only.
+    pub fn new(name: Option<String>, threads: Option<usize>, init: Option<String>) -> Self {
+        Self { name, threads, label: Vec::new(), init, priority: None }
     }
 }
 
@@ -64,6 +69,14 @@ pub fn body(mut document: Map<String, Value>, run: &RunArgs, job: &JobArgs) -> a
     insert(&mut document, "name", job.name.as_deref());
     insert(&mut document, "threads", job.threads);
     insert(&mut document, "priority", job.priority);
+    if let Some(init) = &job.init {
+        ensure!(
+            !Path::new(init).is_file(),
+            "--init {init}: a server takes policies and ids of checkpoints; publish the file first: qedgix policies upload NAME {init}"
+        );
+        let field = if uuid::Uuid::try_parse(init).is_ok() { "checkpoint" } else { "policy" };
+        document.insert("init".into(), json!({field: init}));
+    }
     if !job.label.is_empty() {
         let labels = document.entry("labels").or_insert_with(|| Map::new().into());
         let labels = labels.as_object_mut().context("labels: expected an object")?;
@@ -80,10 +93,15 @@ pub fn body(mut document: Map<String, Value>, run: &RunArgs, job: &JobArgs) -> a
 /// # Errors
 /// The server cannot be reached, or refuses the job.
 pub async fn submit(client: &Client, body: &Value) -> Result<Value, ClientError> {
+    add(client, "/v1/jobs", body).await
+}
+
+/// Posts a request that adds a job, as [`submit`] does.
+async fn add(client: &Client, path: &str, body: &Value) -> Result<Value, ClientError> {
     const TRIES: u32 = 4;
     let key = uuid::Uuid::now_v7().to_string();
     for tried in 1.. {
-        let error = match client.post_once("/v1/jobs", body, &key).await {
+        let error = match client.post_once(path, body, &key).await {
             Ok(job) => return Ok(job),
             Err(error) => error,
         };
@@ -101,17 +119,44 @@ pub async fn submit(client: &Client, body: &Value) -> Result<Value, ClientError>
 pub(super) async fn run(client: &Client, args: SubmitArgs, json: bool) -> anyhow::Result<()> {
     let document = args.file.as_deref().map(read).transpose()?.unwrap_or_default();
     let job = submit(client, &body(document, &args.run, &args.job)?).await?;
+    print_and_watch(client, &job, json, args.watch).await
+}
+
+/// Flags of `jobs continue`.
+#[derive(Args, Debug)]
+pub struct ContinueArgs {
+    /// Id of a training job that has ended, the beginning of it, or a name
+    job: String,
+    /// Environment steps to train further, as 400000, 400_000 or 4e5
+    #[arg(long, value_parser = count)]
+    steps: u64,
+    /// Follow the new job until its end; the exit status is then that of `jobs watch`
+    #[arg(long)]
+    watch: bool,
+}
+
+/// Runs `jobs continue`.
+pub(super) async fn continue_job(client: &Client, args: ContinueArgs, json: bool) -> anyhow::Result<()> {
+    let id = resolve(client, &args.job).await?;
+    let job = add(client, &format!("/v1/jobs/{id}/continue"), &json!({"steps": args.steps})).await?;
+    let what = if job["init"]["from"] == "snapshot" { "the snapshot" } else { "the last weights" };
+    errln!("continues with {what} of job {id}, from step {}", job["init"]["step"]);
+    print_and_watch(client, &job, json, args.watch).await
+}
+
+/// Prints a job that was added, and follows it.
+async fn print_and_watch(client: &Client, job: &Value, json: bool, watch: bool) -> anyhow::Result<()> {
     let id = job["id"].as_str().context("the response of the server has no job id")?.to_owned();
-    match (json, args.watch) {
+    match (json, watch) {
         (true, _) => outln!("{job:#}")?,
         (false, true) => errln!("job {id}"),
         (false, false) => outln!("{id}")?,
     }
-    if !args.watch {
+    if !watch {
         return Ok(());
     }
     let lines = if json { Lines::Error } else { Lines::Out };
-    let ended = watch::follow(client, &mut Screen::new(JobView::new(&job), lines), OnSignal::Leave).await?;
+    let ended = watch::follow(client, &mut Screen::new(JobView::new(job), lines), OnSignal::Leave).await?;
     ended.into_result(client, &id)
 }
 

@@ -21,6 +21,7 @@ use crate::cli::{progress, table};
 use crate::files::partial_path;
 use crate::jobs::memory;
 use crate::learner::{Evaluation, Event, Summary, TrainConfig, Trainer, evaluate, layout_list, summarize};
+use crate::serving::bundled;
 
 /// Ending of snapshots, and of the default snapshot of a checkpoint.
 const SNAPSHOT: &str = ".snapshot";
@@ -35,7 +36,7 @@ pub async fn run(args: &TrainArgs) -> anyhow::Result<()> {
     let paths = Paths::check(args)?;
     let threads = args.threads.unwrap_or_else(all_cores);
     let mut trainer = match &args.resume {
-        None => Trainer::new(args.run.resolve()?, threads)?,
+        None => begin(args, threads)?,
         Some(path) => {
             let bytes = fs::read(path).with_context(|| format!("--resume {}", path.display()))?;
             let trainer = Trainer::restore(&bytes, threads).with_context(|| format!("--resume {}", path.display()))?;
@@ -48,6 +49,21 @@ pub async fn run(args: &TrainArgs) -> anyhow::Result<()> {
     trainer.stop_with(Arc::clone(&stop.flag));
     let every = Duration::from_secs_f64(args.snapshot_every);
     tokio::task::spawn_blocking(move || Run::begin(trainer, paths, every)?.train(&stop, threads)).await?
+}
+
+/// A new run, from the weights of `--init` if they are given.
+fn begin(args: &TrainArgs, threads: usize) -> anyhow::Result<Trainer> {
+    let mut trainer = Trainer::new(args.run.resolve()?, threads)?;
+    if let Some(name) = &args.init {
+        let bundled = bundled::BUNDLED.iter().find(|(bundled, _)| bundled == name);
+        let bytes = match bundled.filter(|_| !Path::new(name).exists()) {
+            Some((_, bytes)) => bytes.to_vec(),
+            None => fs::read(name).with_context(|| format!("--init {name}: neither a bundled policy nor a file that can be read"))?,
+        };
+        let weights = Checkpoint::from_bytes(&bytes).with_context(|| format!("--init {name}"))?;
+        trainer.begin_with(&weights).with_context(|| format!("--init {name}"))?;
+    }
+    Ok(trainer)
 }
 
 /// The files of a run.

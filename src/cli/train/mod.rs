@@ -21,6 +21,7 @@ const OUT: &str = "policy.safetensors";
 #[command(after_help = "Examples:
   qedgix train --algorithm qmix --steps 4e5 --out qmix.safetensors       # ctrl-c or SIGTERM stops the run ...
   qedgix train --resume qmix.safetensors.snapshot                        # ... and this continues it, with the same result
+  qedgix train --init qmix.safetensors --algorithm qmix --steps 1e5 --set training.epsilon_anneal=1   # without random headings
   qedgix train --uavs 4 --users 8 --set training.learning_rate=5e-4 --metrics curve.csv
 
 As a job of a server, with the same files at the end:
@@ -52,6 +53,10 @@ pub struct TrainArgs {
     /// Continues the run of this snapshot. Flags of the run may be left out, and must not differ from the snapshot
     #[arg(long, env = "QEDGIX_RESUME", value_name = "FILE", conflicts_with = "server")]
     resume: Option<PathBuf>,
+    /// Begins with the weights of this checkpoint file or bundled policy, with --server of a policy or a checkpoint id of the server.
+    /// The agents must have the same architecture; a mixer that differs begins anew [default: weights are drawn]
+    #[arg(long, env = "QEDGIX_INIT", value_name = "FILE_OR_POLICY", conflicts_with = "resume")]
+    init: Option<String>,
     /// Replaces a snapshot that another run has left
     #[arg(long, conflicts_with = "server")]
     overwrite: bool,

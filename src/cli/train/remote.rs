@@ -31,7 +31,7 @@ pub async fn run(args: &TrainArgs, address: &str) -> anyhow::Result<()> {
         check_writable(path).context(flag)?;
     }
     let client = Client::new(address, &args.connect)?;
-    let body = body(Map::new(), &args.run, &JobArgs::new(args.name.clone(), args.threads))?;
+    let body = body(Map::new(), &args.run, &JobArgs::new(args.name.clone(), args.threads, args.init.clone()))?;
     let job = submit(&client, &body).await?;
     let id = job["id"].as_str().context("the response of the server has no job id")?.to_owned();
     outln!("job {id}")?;

@@ -9,7 +9,7 @@ use tonic::metadata::{Ascii, MetadataValue};
 use tonic::service::Interceptor;
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Channel, Endpoint};
-use tonic::{Code, Request, Status};
+use tonic::{Code, Request, Response, Status, Streaming};
 
 use super::Assignment;
 use crate::error_code::ErrorCode;
@@ -112,26 +112,30 @@ impl Client {
     }
 
     pub(super) async fn download_snapshot(&self) -> Result<Vec<u8>, ClientError> {
-        retry(TRANSFER_TIMEOUT, || async {
-            let mut chunks = self.0.clone().download_snapshot(v1::DownloadSnapshotRequest {}).await?.into_inner();
-            let mut bytes = Vec::new();
-            while let Some(chunk) = chunks.message().await? {
-                bytes.extend_from_slice(&chunk.data);
-            }
-            Ok(bytes)
-        })
-        .await
+        let request = || v1::DownloadSnapshotRequest {};
+        retry(TRANSFER_TIMEOUT, || async { join(self.0.clone().download_snapshot(request()).await?).await }).await
+    }
+
+    pub(super) async fn download_initial_weights(&self) -> Result<Vec<u8>, ClientError> {
+        let request = || v1::DownloadInitialWeightsRequest {};
+        retry(TRANSFER_TIMEOUT, || async { join(self.0.clone().download_initial_weights(request()).await?).await }).await
     }
 
     pub(super) async fn download_policy(&self, policy: &str) -> Result<Vec<u8>, ClientError> {
+        let request = || v1::DownloadPolicyRequest { policy: policy.to_owned() };
+        retry(TRANSFER_TIMEOUT, || async { join(self.0.clone().download_policy(request()).await?).await }).await
+    }
+
+    /// The policy that the job must be better than, and its checkpoint, which is empty for a baseline; `None`: it does not exist.
+    pub(super) async fn download_rival(&self) -> Result<Option<(String, Vec<u8>)>, ClientError> {
         retry(TRANSFER_TIMEOUT, || async {
-            let request = v1::DownloadPolicyRequest { policy: policy.to_owned() };
-            let mut chunks = self.0.clone().download_policy(request).await?.into_inner();
+            let mut parts = self.0.clone().download_rival(v1::DownloadRivalRequest {}).await?.into_inner();
+            let Some(first) = parts.message().await? else { return Ok(None) };
             let mut bytes = Vec::new();
-            while let Some(chunk) = chunks.message().await? {
-                bytes.extend_from_slice(&chunk.data);
+            while let Some(part) = parts.message().await? {
+                bytes.extend_from_slice(&part.data);
             }
-            Ok(bytes)
+            Ok(Some((first.policy, bytes)))
         })
         .await
     }
@@ -149,6 +153,15 @@ impl Client {
             || parts(Part::Header(header.clone()), bytes, Part::Data, |part| v1::UploadCheckpointRequest { part: Some(part) });
         retry(TRANSFER_TIMEOUT, || async { self.0.clone().upload_checkpoint(parts()).await.map(drop) }).await
     }
+}
+
+/// The file that is sent in chunks.
+async fn join(response: Response<Streaming<v1::Chunk>>) -> Result<Vec<u8>, Status> {
+    let (mut chunks, mut bytes) = (response.into_inner(), Vec::new());
+    while let Some(chunk) = chunks.message().await? {
+        bytes.extend_from_slice(&chunk.data);
+    }
+    Ok(bytes)
 }
 
 /// The messages of an upload: a header, then the data in chunks.

@@ -8,6 +8,7 @@ mod client;
 mod early_stop;
 mod evaluation;
 mod report;
+mod rival;
 mod training;
 
 use std::any::Any;
@@ -21,6 +22,7 @@ use tokio::sync::{mpsc, oneshot};
 
 use self::client::{Client, ClientError};
 use self::early_stop::StopRule;
+pub use self::rival::RivalComparison;
 use self::evaluation::EvaluationTask;
 use self::training::{ReportQueue, TrainingTask};
 use super::Directive;
@@ -205,6 +207,10 @@ impl Work {
             Some(_) => Some(client.download_snapshot().await?),
             None => None,
         };
+        let initial_weights = match task.snapshot_step {
+            None if task.initial_weights => Some(client.download_initial_weights().await?),
+            _ => None,
+        };
         tracing::info!(threads, from_step = task.snapshot_step, "training");
         let snapshot_every = Duration::from_millis(task.snapshot_every_ms);
         let stop_rule = match task.stop.as_str() {
@@ -213,15 +219,28 @@ impl Work {
         };
         let observed: Vec<_> = task.observed.iter().map(|metric| (metric.step, metric.value)).collect();
         let stop_rule = stop_rule.map(|rule| StopRule::new(rule, &observed));
-        Ok(Self::Train(TrainingTask { config, threads, snapshot, snapshot_every, stop_rule }))
+        let rival = task.rival;
+        Ok(Self::Train(TrainingTask { config, threads, snapshot, initial_weights, snapshot_every, stop_rule, rival }))
     }
 
     /// Does the work. Returns how it ended, and the result as JSON if it has one.
-    fn run(self, reports: &ReportQueue, stop: &StopSignal) -> (WorkerResult, Option<String>) {
+    fn run(self, reports: &ReportQueue, stop: &StopSignal, server: &ServerHandle) -> (WorkerResult, Option<String>) {
         match self {
-            Self::Train(task) => (training::train(task, reports, stop), None),
+            Self::Train(task) => training::train(task, reports, stop, server),
             Self::Evaluate(task) => evaluation::evaluate(&task, reports, stop),
         }
+    }
+}
+
+/// Calls of the server by the thread of the work, which waits for them.
+pub(crate) struct ServerHandle {
+    client: Client,
+    runtime: tokio::runtime::Handle,
+}
+
+impl ServerHandle {
+    fn rival(&self) -> Result<Option<(String, Vec<u8>)>, ClientError> {
+        self.runtime.block_on(self.client.download_rival())
     }
 }
 
@@ -232,8 +251,9 @@ async fn work(client: &Client, stop: Arc<StopSignal>) -> Result<(WorkerResult, O
     let reports = ReportQueue::new(sender);
     let snapshot_pending = reports.snapshot_pending();
     let (result_sender, result) = oneshot::channel();
+    let server = ServerHandle { client: client.clone(), runtime: tokio::runtime::Handle::current() };
     let run = move || {
-        let result = std::panic::catch_unwind(AssertUnwindSafe(|| work.run(&reports, &stop)));
+        let result = std::panic::catch_unwind(AssertUnwindSafe(|| work.run(&reports, &stop, &server)));
         let result = result.unwrap_or_else(|panic| {
             let reason = format!("panic: {}", panic_message(&*panic));
             (WorkerResult::Failed { reason, permanent: false }, None)

@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::mpsc::Sender;
 
-use super::StopSignal;
 use super::early_stop::StopRule;
+use super::{ServerHandle, StopSignal, rival};
 use crate::checkpoint::Checkpoint;
 use crate::invalid::Invalid;
 use crate::jobs::Directive;
@@ -39,9 +39,13 @@ pub(super) struct TrainingTask {
     pub config: TrainConfig,
     pub threads: usize,
     pub snapshot: Option<Vec<u8>>,
+    /// The checkpoint that training begins with, if there is no snapshot; `None`: weights are drawn.
+    pub initial_weights: Option<Vec<u8>>,
     pub snapshot_every: Duration,
     /// When training ends before all steps are done.
     pub stop_rule: Option<StopRule>,
+    /// Whether the best checkpoint is compared with a policy of the server.
+    pub rival: bool,
 }
 
 /// The queue of reports. Adding a report waits while the queue is full.
@@ -79,25 +83,43 @@ impl ReportQueue {
     }
 }
 
-/// Trains until the end, or until `stop` is set.
-pub(super) fn train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> WorkerResult {
-    match try_train(task, reports, stop) {
-        Ok(end) => end,
+/// Trains until the end, or until `stop` is set. Returns how that ended, and the comparison with the rival as JSON if there is one.
+pub(super) fn train(
+    task: TrainingTask,
+    reports: &ReportQueue,
+    stop: &StopSignal,
+    server: &ServerHandle,
+) -> (WorkerResult, Option<String>) {
+    let (rival, threads) = (task.rival, task.threads);
+    let trained = try_train(task, reports, stop).and_then(|(end, best)| match best.filter(|_| rival) {
+        Some(best) if end == WorkerResult::Succeeded => {
+            let Some(rival) = server.rival()? else { return Ok((end, None)) };
+            tracing::info!(rival = rival.0, "training is done; comparing the best checkpoint");
+            let compared = rival::compare(&best, &rival, threads, &stop.flag());
+            let compared = compared.map(|comparison| serde_json::to_string(&comparison)).transpose()?;
+            Ok((if compared.is_some() { end } else { WorkerResult::Stopped }, compared))
+        }
+        _ => Ok((end, None)),
+    });
+    match trained {
+        Ok(ended) => ended,
         Err(e) => {
             // Another attempt would fail with the same configuration, snapshot or weights, but the host may have threads again.
             let permanent = e.downcast_ref::<Invalid>().is_none_or(|e| e.field != "threads");
-            WorkerResult::Failed { reason: e.to_string(), permanent }
+            (WorkerResult::Failed { reason: e.to_string(), permanent }, None)
         }
     }
 }
 
-fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Result<WorkerResult, Box<dyn std::error::Error>> {
-    let TrainingTask { config, threads, snapshot, snapshot_every, mut stop_rule } = task;
-    let mut trainer = match &snapshot {
-        Some(bytes) => Trainer::restore(bytes, threads)?,
-        None => Trainer::new(config, threads)?,
-    };
-    drop(snapshot);
+/// Trains. Returns how it ended, and the best checkpoint of a run that is done.
+fn try_train(
+    mut task: TrainingTask,
+    reports: &ReportQueue,
+    stop: &StopSignal,
+) -> Result<(WorkerResult, Option<Checkpoint>), Box<dyn std::error::Error>> {
+    let snapshot_every = task.snapshot_every;
+    let mut stop_rule = task.stop_rule.take();
+    let mut trainer = begin(task)?;
     trainer.add_reports();
     trainer.stop_with(stop.flag());
     let mut curve = CurveSampler::new(trainer.config(), trainer.env_steps());
@@ -119,14 +141,14 @@ fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Re
             }
             Event::Diverged { env_steps } => {
                 let reason = format!("training diverged at step {env_steps}: a parameter is not finite or too large");
-                return Ok(WorkerResult::Failed { reason, permanent: true });
+                return Ok((WorkerResult::Failed { reason, permanent: true }, None));
             }
             _ => {}
         }
         if ends {
             tracing::info!(step = trainer.env_steps(), "training ends early");
             reports.checkpoint(CheckpointKind::Last, &trainer.checkpoint()?);
-            return Ok(WorkerResult::Succeeded);
+            return Ok((WorkerResult::Succeeded, trainer.best()?));
         }
         if last_snapshot.elapsed() >= snapshot_every && !reports.snapshot_pending.load(Ordering::Acquire) {
             reports.snapshot(&trainer);
@@ -134,16 +156,34 @@ fn try_train(task: TrainingTask, reports: &ReportQueue, stop: &StopSignal) -> Re
         }
     }
     match stop.directive() {
-        Directive::Cancel => Ok(WorkerResult::Stopped),
+        Directive::Cancel => Ok((WorkerResult::Stopped, None)),
         Directive::Pause if !trainer.finished() => {
             reports.snapshot(&trainer);
-            Ok(WorkerResult::Stopped)
+            Ok((WorkerResult::Stopped, None))
         }
         Directive::Pause | Directive::Continue => {
             reports.checkpoint(CheckpointKind::Last, &trainer.checkpoint()?);
-            Ok(WorkerResult::Succeeded)
+            Ok((WorkerResult::Succeeded, trainer.best()?))
         }
     }
+}
+
+/// The run of a task: from its snapshot, from its initial weights, or anew.
+fn begin(task: TrainingTask) -> Result<Trainer, Box<dyn std::error::Error>> {
+    let TrainingTask { config, threads, snapshot, initial_weights, .. } = task;
+    if let Some(bytes) = snapshot {
+        let mut trainer = Trainer::restore(&bytes, threads)?;
+        // The snapshot of a job that this one continues has the configuration of that job.
+        trainer.extend_to(config.training.steps)?;
+        return Ok(trainer);
+    }
+    let mut trainer = Trainer::new(config, threads)?;
+    if let Some(bytes) = initial_weights {
+        let checkpoint = Checkpoint::from_bytes(&bytes)?;
+        let mixer = trainer.begin_with(&checkpoint)?;
+        tracing::info!(from_step = checkpoint.env_steps(), mixer, "training begins with given weights");
+    }
+    Ok(trainer)
 }
 
 /// Selects the iterations that become points of a training curve, and adds the training speed to them.

@@ -60,7 +60,7 @@ pub async fn list(app: &App, caller: &Caller, request: ListRequest, page: &PageR
     let list = JobList { filter, order, after, limit, max_bytes: MAX_BYTES };
     let (jobs, more) = app.store.jobs(&list).await?;
     let next_token = jobs.last().filter(|_| more).map(|last| cursor(&list.order.by, last)).unwrap_or_default();
-    let items = views(app, jobs.into_iter().map(|listed| listed.job).collect(), &metrics).await?;
+    let items = views(app, jobs, &metrics).await?;
     Ok(Page { items, next_token })
 }
 

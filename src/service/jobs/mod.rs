@@ -1,8 +1,10 @@
 //! The use cases of jobs: submit, get, list, edit, cancel, pause, resume, retry, delete, and read metrics, checkpoints and logs.
 
 mod evaluation;
+mod init;
 mod listing;
 mod logs;
+mod publication;
 mod sweep;
 mod view;
 
@@ -19,13 +21,13 @@ use super::policies::{self, Publisher};
 use super::{App, Error, Page, PageRequest};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
-use crate::jobs::SchedulerConfig;
 use crate::jobs::memory::check as check_memory;
-use crate::jobs::spec::{EditRequest, JobRequest};
+use crate::jobs::spec::{self, ContinueRequest, EditRequest, JobRequest};
 use crate::store::{
-    ActionResult, Checkpoint, Job, JobAction, JobId, JobKind, JobState, MetricCursor, MetricRow, NewJob, PendingAction,
-    SubmitResult, is_metric_name,
+    ActionResult, Beginning, Checkpoint, Job, JobAction, JobId, JobKind, JobSpec, JobState, MetricCursor, MetricRow, NewJob,
+    PendingAction, SubmitResult, is_metric_name,
 };
+use init::InitialWeights;
 
 /// Puts a job into the queue. Returns the job, which is in the database, and whether it is new: the same `idempotency_key` with
 /// the same request returns the existing job.
@@ -50,35 +52,59 @@ async fn submit_job(
     request: JobRequest,
     idempotency_key: Option<String>,
 ) -> Result<(Job, bool), Error> {
-    if let Some(key) = &idempotency_key {
-        let printable = key.bytes().all(|b| (b' '..=b'~').contains(&b));
-        if key.is_empty() || key.len() > 255 || !printable {
-            return Err(Invalid::new("idempotency_key", format!("{key:?}"), "1 to 255 printable ASCII characters").into());
-        }
-    }
-    let idempotency = idempotency_key.map(|key| (key, request.digest()));
-    // A repeated request returns its job, even if the server would not accept that job today.
-    if let Some((key, body)) = &idempotency
-        && let Some(result) = app.store.submitted_job(caller.owner().id(), key, body).await?
-    {
-        return submitted(app, result);
-    }
-    let SchedulerConfig { memory, .. } = app.scheduler.config();
-    let notes = request.notes.clone().unwrap_or_default();
+    let idempotency = match repeated(app, caller, idempotency_key, || request.digest()).await? {
+        Ok(idempotency) => idempotency,
+        Err(result) => return submitted(app, result),
+    };
     if request.kind == Some(JobKind::Sweep) {
         return submitted(app, sweep::submit(app, caller, request, idempotency).await?);
     }
+    let (notes, init) = (request.notes.clone().unwrap_or_default(), request.init.clone());
     let mut spec = request.resolve(app.scheduler.cpu_budget())?;
-    if let Some(config) = &spec.config {
-        check_memory(config, spec.threads, *memory)?;
-    }
     if let Some(evaluation) = spec.evaluation.take() {
         spec.evaluation = Some(evaluation::pin_versions(app, evaluation)?);
     }
-    if let Some(name) = spec.name.as_ref().filter(|_| spec.kind == JobKind::Train) {
-        // Reported now instead of after training.
-        policies::check_publishable(name)?;
-        policies::check_owner(app, &Publisher::from(caller), name).await?;
+    let beginning = match init {
+        Some(init) => Some(InitialWeights::find(app, caller, &init).await?.put_into(&mut spec)?),
+        None => None,
+    };
+    add(app, caller, Addition { spec, notes, beginning, idempotency }).await
+}
+
+/// The idempotency key of a request with the SHA-256 of its body, or the result of the same request before.
+async fn repeated(
+    app: &App,
+    caller: &Caller,
+    key: Option<String>,
+    digest: impl FnOnce() -> [u8; 32],
+) -> Result<Result<Option<(String, [u8; 32])>, SubmitResult>, Error> {
+    let Some(key) = key else { return Ok(Ok(None)) };
+    let printable = key.bytes().all(|b| (b' '..=b'~').contains(&b));
+    if key.is_empty() || key.len() > 255 || !printable {
+        return Err(Invalid::new("idempotency_key", format!("{key:?}"), "1 to 255 printable ASCII characters").into());
+    }
+    let body = digest();
+    // A repeated request returns its job, even if the server would not accept that job today.
+    let before = app.store.submitted_job(caller.owner().id(), &key, &body).await?;
+    Ok(before.map_or(Ok(Some((key, body))), Err))
+}
+
+/// A job to add to the queue.
+struct Addition {
+    spec: JobSpec,
+    notes: String,
+    beginning: Option<Beginning>,
+    idempotency: Option<(String, [u8; 32])>,
+}
+
+/// Checks a job against the server and adds it to the queue.
+async fn add(app: &App, caller: &Caller, addition: Addition) -> Result<(Job, bool), Error> {
+    let Addition { spec, notes, beginning, idempotency } = addition;
+    if let Some(config) = &spec.config {
+        check_memory(config, spec.threads, app.scheduler.config().memory)?;
+    }
+    if spec.kind == JobKind::Train {
+        publication::check(app, caller, &spec).await?;
     }
     for (i, needed) in spec.after.iter().enumerate() {
         check_dependency(app, caller, i, *needed).await?;
@@ -86,8 +112,35 @@ async fn submit_job(
     app.admit()?;
     let Publisher { owner, any_name, .. } = caller.into();
     let id = JobId(Uuid::now_v7());
-    let new = NewJob { id, owner, any_name, spec, notes, parent: None, now: app.clock.now(), idempotency };
+    let new = NewJob { id, owner, any_name, spec, notes, parent: None, beginning, now: app.clock.now(), idempotency };
     submitted(app, app.store.submit_job(new).await?)
+}
+
+/// Continues the training job `id`, which has ended, in a new job with the same configuration, name and labels. It begins with the
+/// snapshot of that job if that is kept, or else with its last weights; [`JobInit`](crate::store::JobInit) of the new job says
+/// which. Returns the job, and whether it is new, as [`submit`] does.
+///
+/// # Errors
+/// [`Error::NotFound`]. [`Error::Precondition`]: the job has not ended, does not train, or has nothing to continue from. As [`submit`].
+pub async fn continue_job(
+    app: &App,
+    caller: &Caller,
+    id: &str,
+    request: ContinueRequest,
+    idempotency_key: Option<String>,
+) -> Result<(JobView, bool), Error> {
+    let idempotency = match repeated(app, caller, idempotency_key, || spec::digest(&(id, request))).await? {
+        Ok(idempotency) => idempotency,
+        Err(result) => {
+            let (job, new) = submitted(app, result)?;
+            return Ok((view::view(app, job).await?, new));
+        }
+    };
+    let job = get(app, caller, id).await?;
+    let (spec, beginning) = init::continued(app, caller, &job, request).await?;
+    let addition = Addition { spec, notes: String::new(), beginning: Some(beginning), idempotency };
+    let (job, new) = add(app, caller, addition).await?;
+    Ok((view::view(app, job).await?, new))
 }
 
 fn submitted(app: &App, result: SubmitResult) -> Result<(Job, bool), Error> {

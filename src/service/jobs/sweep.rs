@@ -6,16 +6,17 @@ use rand::RngExt;
 use serde_json::{Value, json};
 use uuid::Uuid;
 
-use super::check_dependency;
+use super::init::InitialWeights;
+use super::{check_dependency, publication};
 use crate::jobs::memory::check as check_memory;
 use crate::jobs::spec::JobRequest;
 use crate::jobs::{sweep, sweep_jobs};
 use crate::learner::Interval;
 use crate::rng;
 use crate::service::keys::Caller;
-use crate::service::policies::{self, Publisher};
+use crate::service::policies::Publisher;
 use crate::service::{App, Error};
-use crate::store::{Job, JobFilter, JobId, JobList, JobOrder, JobSort, JobState, MetricSummary, NewJob, SubmitResult};
+use crate::store::{Job, JobFilter, JobId, JobList, JobOrder, JobSort, JobState, ListedJob, MetricSummary, NewJob, SubmitResult};
 
 /// The metrics of the result of a sweep.
 const METRICS: [&str; 6] =
@@ -29,17 +30,22 @@ pub(super) async fn submit(
     idempotency: Option<(String, [u8; 32])>,
 ) -> Result<SubmitResult, Error> {
     let notes = request.notes.clone().unwrap_or_default();
-    let sweep = sweep_jobs::resolve(request, app.scheduler.cpu_budget())?;
+    let weights = match &request.init {
+        Some(init) => Some(InitialWeights::find(app, caller, init).await?),
+        None => None,
+    };
+    let mut sweep = sweep_jobs::resolve(request, app.scheduler.cpu_budget())?;
     let memory = app.scheduler.config().memory;
-    for (i, job) in sweep.jobs.iter().enumerate() {
+    let mut beginning = None;
+    for (i, job) in sweep.jobs.iter_mut().enumerate() {
         let at = |e: crate::invalid::Invalid| e.with_prefix(&format!("sweep.jobs[{i}]"));
+        if let Some(weights) = &weights {
+            beginning = Some(weights.put_into(job).map_err(at)?);
+        }
         if let Some(config) = &job.config {
             check_memory(config, job.threads, memory).map_err(at)?;
         }
-        if let Some(name) = &job.name {
-            policies::check_publishable(name)?;
-            policies::check_owner(app, &Publisher::from(caller), name).await?;
-        }
+        publication::check(app, caller, job).await?;
     }
     for (i, needed) in sweep.spec.after.iter().enumerate() {
         check_dependency(app, caller, i, *needed).await?;
@@ -47,9 +53,9 @@ pub(super) async fn submit(
     app.admit()?;
     let Publisher { owner, any_name, .. } = caller.into();
     let parent = JobId(Uuid::now_v7());
-    let job = |id, spec, notes, parent, idempotency| {
-        let owner = owner.clone();
-        NewJob { id, owner, any_name, spec, notes, parent, now: app.clock.now(), idempotency }
+    let job = |id, spec, notes, parent: Option<JobId>, idempotency| {
+        let (owner, beginning) = (owner.clone(), beginning.clone().filter(|_| parent.is_some()));
+        NewJob { id, owner, any_name, spec, notes, parent, beginning, now: app.clock.now(), idempotency }
     };
     let jobs: Vec<NewJob> =
         sweep.jobs.into_iter().map(|spec| job(JobId(Uuid::now_v7()), spec, String::new(), Some(parent), None)).collect();
@@ -63,14 +69,14 @@ pub(super) async fn result(app: &App, sweep: &Job) -> Result<Value, Error> {
     let filter = JobFilter { parent: Some(sweep.id), ..JobFilter::default() };
     let order = JobOrder { by: JobSort::Created, descending: false };
     let list = JobList { filter, order, after: None, limit: sweep::MAX_JOBS, max_bytes: usize::MAX };
-    let jobs: Vec<Job> = app.store.jobs(&list).await?.0.into_iter().map(|listed| listed.job).collect();
-    let rows: Vec<i64> = jobs.iter().map(|job| job.row_id).collect();
+    let jobs = app.store.jobs(&list).await?.0;
+    let rows: Vec<i64> = jobs.iter().map(|listed| listed.job.row_id).collect();
     let metrics = app.store.metric_summaries(&rows, &METRICS.map(str::to_owned)).await?;
     let mut states = BTreeMap::<&str, usize>::new();
     let mut of_points: Vec<Vec<&Job>> = vec![Vec::new(); points.len()];
-    for job in &jobs {
+    for ListedJob { job, spec, .. } in &jobs {
         *states.entry(job.state.as_str()).or_default() += 1;
-        let point = job.spec.decode().ok().and_then(|spec| spec.point);
+        let point = spec.as_ref().ok().and_then(|spec| spec.point);
         if let Some(of_point) = point.and_then(|point| of_points.get_mut(point as usize)) {
             of_point.push(job);
         }

@@ -5,8 +5,9 @@ use std::fmt::Write as _;
 
 use jiff::Timestamp;
 
+use crate::service::events::{Progress, SPEED};
 use crate::service::{App, Error};
-use crate::store::{Job, JobState, MetricSummary};
+use crate::store::{Job, JobSpec, JobState, ListedJob, MetricSummary, UnreadableSpec};
 
 /// Most metrics that a single job shows. Lists show those that are asked for.
 const MAX_METRICS: u32 = 100;
@@ -16,6 +17,10 @@ const MAX_METRICS: u32 = 100;
 pub struct JobView {
     /// The record.
     pub job: Job,
+    /// Its specification, as far as this version can read it.
+    pub spec: Result<JobSpec, UnreadableSpec>,
+    /// Steps done, and of a running job the speed.
+    pub progress: Progress,
     /// Why the job has not started; only for a queued job.
     pub waiting: Option<Waiting>,
     /// The best and the last value of metrics, by name.
@@ -55,26 +60,36 @@ impl Waiting {
 
 /// The view of one job.
 pub(super) async fn view(app: &App, job: Job) -> Result<JobView, Error> {
-    let metrics = app.store.job_metric_summaries(job.row_id, MAX_METRICS).await?.into_iter().collect();
-    let waiting = waiting(app, std::slice::from_ref(&job)).await?.remove(&job.row_id);
-    Ok(JobView { job, waiting, metrics })
+    let metrics: BTreeMap<_, _> = app.store.job_metric_summaries(job.row_id, MAX_METRICS).await?.into_iter().collect();
+    let progress = progress(&job, metrics.get(SPEED));
+    let waiting = waiting(app, std::iter::once(&job)).await?.remove(&job.row_id);
+    Ok(JobView { spec: job.spec.decode(), job, progress, waiting, metrics })
+}
+
+fn progress(job: &Job, speed: Option<&MetricSummary>) -> Progress {
+    let speed = speed.filter(|_| job.state == JobState::Running).and_then(|speed| speed.last);
+    Progress { step: job.step, steps: job.spec.steps, steps_per_second: speed }
 }
 
 /// The views of the jobs of a list, with the metrics `names`.
-pub(super) async fn views(app: &App, jobs: Vec<Job>, names: &[String]) -> Result<Vec<JobView>, Error> {
-    let rows: Vec<i64> = jobs.iter().map(|job| job.row_id).collect();
+pub(super) async fn views(app: &App, jobs: Vec<ListedJob>, names: &[String]) -> Result<Vec<JobView>, Error> {
+    let rows: Vec<i64> = jobs.iter().map(|listed| listed.job.row_id).collect();
     let mut metrics = app.store.metric_summaries(&rows, names).await?;
-    let mut waiting = waiting(app, &jobs).await?;
-    let view = |job: Job| {
+    let running = jobs.iter().filter(|listed| listed.job.state == JobState::Running).map(|listed| listed.job.row_id);
+    let speeds = app.store.metric_summaries(&running.collect::<Vec<_>>(), &[SPEED.to_owned()]).await?;
+    let mut waiting = waiting(app, jobs.iter().map(|listed| &listed.job)).await?;
+    let view = |ListedJob { job, spec, .. }: ListedJob| {
         let metrics = metrics.remove(&job.row_id).unwrap_or_default().into_iter().collect();
-        JobView { waiting: waiting.remove(&job.row_id), metrics, job }
+        let speed = speeds.get(&job.row_id).and_then(|speeds| speeds.first());
+        let progress = progress(&job, speed.map(|(_, speed)| speed));
+        JobView { waiting: waiting.remove(&job.row_id), spec, progress, metrics, job }
     };
     Ok(jobs.into_iter().map(view).collect())
 }
 
 /// Why the queued ones among `jobs` wait, by row id.
-async fn waiting(app: &App, jobs: &[Job]) -> Result<BTreeMap<i64, Waiting>, Error> {
-    let queued: Vec<&Job> = jobs.iter().filter(|job| job.state == JobState::Queued).collect();
+async fn waiting(app: &App, jobs: impl Iterator<Item = &Job>) -> Result<BTreeMap<i64, Waiting>, Error> {
+    let queued: Vec<&Job> = jobs.filter(|job| job.state == JobState::Queued).collect();
     if queued.is_empty() {
         return Ok(BTreeMap::new());
     }

@@ -8,6 +8,7 @@ mod aliases;
 mod deletion;
 mod info;
 mod loading;
+mod promotion;
 mod publish;
 mod stored;
 mod upload_limit;
@@ -20,6 +21,7 @@ pub use info::PolicyDetails;
 pub use loading::{IndexEntry, Loads, fill_registry, index, load_policy, unload_policy};
 pub(super) use loading::{pinned, resolve};
 pub use publish::{CheckpointSource, PublishRequest, Publisher, check_owner, check_publishable, publish, publish_bytes};
+pub(super) use promotion::Promotion;
 pub(super) use publish::{NewVersion, publish_and_end};
 pub use upload_limit::{UploadLimit, UploadPermit};
 

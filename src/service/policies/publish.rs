@@ -5,6 +5,7 @@ use jiff::Timestamp;
 use super::aliases::{check_alias, unloaded};
 use super::deletion::retain_after_publishing;
 use super::info::{self, PolicyDetails, complete};
+use super::promotion::Promotion;
 use super::stored::{CheckpointBytes, ParsedCheckpoint};
 use super::upload_limit::UploadPermit;
 use super::{PolicyStores, one_at_a_time};
@@ -124,21 +125,29 @@ pub async fn publish(app: &App, caller: &Caller, request: PublishRequest) -> Res
     Ok((published, new))
 }
 
-/// Ends the attempt of a job that succeeded and publishes `version`, in one transaction. Nothing is published if the job is
-/// being cancelled. Returns the job, or `None` if the attempt has already ended.
+/// Ends the attempt of a job that succeeded, publishes `version`, and moves the alias of the promotion if its condition holds, in one
+/// transaction. Nothing is published if the job is being cancelled. Returns the job, or `None` if the attempt has already ended.
 ///
 /// # Errors
 /// [`Error::Internal`] when the database fails.
-pub(in crate::service) async fn publish_and_end(app: &App, version: NewVersion, lease: Lease) -> Result<Option<Job>, Error> {
+pub(in crate::service) async fn publish_and_end(
+    app: &App,
+    version: NewVersion,
+    promotion: Option<Promotion>,
+    lease: Lease,
+) -> Result<Option<Job>, Error> {
     let (max_attempts, now) = (app.scheduler.config().max_attempts, app.clock.now());
     let name = version.name.clone();
     let job = one_at_a_time(app, async move |PolicyStores { store, registry }| {
-        let new = version.row(now, None);
-        let ended =
-            EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: Some(new), document: None, max_attempts, now };
+        // Policies do not change between the decision and the transaction.
+        let decision = promotion.as_ref().map(|p| (p, p.decide(&registry, &version.name, &version.parsed.digest)));
+        let alias = decision.as_ref().filter(|(_, decision)| decision.is_ok()).map(|(promotion, _)| promotion.alias.as_str());
+        let document = decision.as_ref().map(|(promotion, decision)| promotion.document(decision).to_string());
+        let (new, document) = (version.row(now, alias), document.as_deref());
+        let ended = EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: Some(new), document, max_attempts, now };
         let Some((job, published)) = store.end_attempt(ended).await? else { return Ok(None) };
         if let Some(published) = published {
-            version.register(&registry, published, None);
+            version.register(&registry, published, alias);
         }
         Ok(Some(job))
     })

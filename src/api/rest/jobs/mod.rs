@@ -5,9 +5,11 @@ mod types;
 
 use std::sync::Arc;
 
+use axum::body::Body;
 use axum::extract::State;
-use axum::http::{HeaderMap, HeaderName, StatusCode, header};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use futures::{StreamExt, TryStreamExt};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
@@ -17,14 +19,16 @@ use utoipa_axum::routes;
 use super::extract::{Json, Path, Query};
 use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
 use super::schemas;
+use crate::api::errors::log_internal;
 use crate::invalid::Invalid;
+use crate::service::jobs::JobView;
 use crate::service::keys::Caller;
 use crate::service::{App, Error, PageRequest, checkpoints, jobs};
 use crate::store::{JobAction, JobKind, JobState};
 use crate::train_config::Algorithm;
-use request::{JobEdit, JobRequest};
-pub(super) use types::MetricRow;
-use types::{Attempt, Checkpoint, Job, JobSummary, to_csv};
+use request::{JobContinuation, JobEdit, JobRequest};
+pub(super) use types::{MetricRow, Progress};
+use types::{Attempt, CSV_HEADER, Checkpoint, Job, JobSummary, add_csv};
 
 type AppState = State<Arc<App>>;
 
@@ -37,6 +41,7 @@ pub(super) fn router() -> OpenApiRouter<Arc<App>> {
         .routes(routes!(pause))
         .routes(routes!(resume))
         .routes(routes!(retry))
+        .routes(routes!(continue_job))
         .routes(routes!(metrics))
         .routes(routes!(checkpoints))
         .routes(routes!(logs))
@@ -80,19 +85,23 @@ async fn submit(
     headers: HeaderMap,
     Json(request): Json<JobRequest>,
 ) -> Result<Response, Error> {
+    let added = jobs::submit(&app, &caller, request.into(), idempotency_key(&headers)?).await?;
+    Ok(created(added))
+}
+
+fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, Invalid> {
     const KEY: HeaderName = HeaderName::from_static("idempotency-key");
-    let key = match headers.get(KEY) {
-        None => None,
-        Some(value) => match value.to_str() {
-            Ok(key) => Some(key.to_owned()),
-            Err(_) => return Err(Invalid::new("idempotency-key", format!("{value:?}"), "ASCII").into()),
-        },
-    };
-    let (job, new) = jobs::submit(&app, &caller, request.into(), key).await?;
+    let text = |value: &HeaderValue| value.to_str().map(str::to_owned);
+    let key = headers.get(KEY).map(|value| text(value).map_err(|_| Invalid::new("idempotency-key", format!("{value:?}"), "ASCII")));
+    key.transpose()
+}
+
+/// The response to a submission: the job, and whether it is new.
+fn created((job, new): (JobView, bool)) -> Response {
     let location = (header::LOCATION, format!("/v1/jobs/{}", job.job.id));
     let replayed = (HeaderName::from_static("idempotency-replayed"), (!new).to_string());
     // The status is the one of the first response, which the caller of a retry did not receive.
-    Ok((StatusCode::CREATED, [location, replayed], axum::Json(Job::from(job))).into_response())
+    (StatusCode::CREATED, [location, replayed], axum::Json(Job::from(job))).into_response()
 }
 
 #[derive(Deserialize, IntoParams)]
@@ -245,6 +254,41 @@ async fn retry(State(app): AppState, caller: Caller, Path(JobPath { id }): Path<
     Ok(axum::Json(jobs::change(&app, &caller, &id, JobAction::Retry).await?.into()))
 }
 
+/// Continue a training job that has ended, in a new job with the same configuration, name and labels
+///
+/// The new job begins with the snapshot of the job if that is kept (failed jobs keep theirs), or else with its last weights; `init`
+/// of the new job says which.
+#[utoipa::path(
+    post, path = "/v1/jobs/{id}/continue", operation_id = "continueJob", tag = "jobs",
+    params(
+        JobPath,
+        (
+            "idempotency-key" = Option<String>, Header, description = "As in `submitJob`.",
+            min_length = 1, max_length = 255, pattern = "^[!-~]([ -~]*[!-~])?$", nullable = false
+        )
+    ),
+    request_body = JobContinuation,
+    responses(
+        (
+            status = 201, description = "The new job.", body = Job,
+            headers(
+                ("location", description = "Path of the job."),
+                ("idempotency-replayed", description = "`true` if the key was used before.")
+            )
+        ),
+        BadBody, NotFound, Conflict, Draining
+    )
+)]
+async fn continue_job(
+    State(app): AppState,
+    caller: Caller,
+    Path(JobPath { id }): Path<JobPath>,
+    headers: HeaderMap,
+    Json(request): Json<JobContinuation>,
+) -> Result<Response, Error> {
+    Ok(created(jobs::continue_job(&app, &caller, &id, request.into(), idempotency_key(&headers)?).await?))
+}
+
 #[derive(Clone, Copy, Default, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 enum Format {
@@ -301,24 +345,52 @@ async fn metrics(
     Query(query): Query<MetricsQuery>,
 ) -> Result<Response, Error> {
     let MetricsQuery { name, format, page_size, page_token } = query;
-    let mut request = PageRequest { size: page_size, token: page_token };
-    let mut page = jobs::metrics(&app, &caller, &id, name.as_deref(), &request).await?;
+    let request = PageRequest { size: page_size, token: page_token };
+    let page = jobs::metrics(&app, &caller, &id, name.as_deref(), &request).await?;
     if let Format::Json = format {
         let page = page.map(Into::into);
         return Ok(axum::Json(MetricPage { metrics: page.items, next_page_token: page.next_token }).into_response());
     }
+    let csv_type = [(header::CONTENT_TYPE, "text/csv; charset=utf-8")];
+    let mut text = CSV_HEADER.to_owned();
+    add_csv(&mut text, &page.items);
     // CSV has all rows unless the request sets a page size.
-    while page_size == 0 && !page.next_token.is_empty() {
-        request.token = std::mem::take(&mut page.next_token);
-        let more = jobs::metrics(&app, &caller, &id, name.as_deref(), &request).await?;
-        page.items.extend(more.items);
-        page.next_token = more.next_token;
+    if page_size == 0 && !page.next_token.is_empty() {
+        let rest = MetricsCsv { app, caller, id, name, next_token: page.next_token };
+        let rest = futures::stream::try_unfold(rest, MetricsCsv::next).inspect_err(log_internal);
+        let all = futures::stream::once(std::future::ready(Ok(text))).chain(rest);
+        return Ok((csv_type, Body::from_stream(all)).into_response());
     }
-    let mut response = ([(header::CONTENT_TYPE, "text/csv; charset=utf-8")], to_csv(&page.items)).into_response();
+    let mut response = (csv_type, text).into_response();
     if let Some(token) = page.next_token.parse().ok().filter(|_| !page.next_token.is_empty()) {
         response.headers_mut().insert(NEXT_PAGE_TOKEN, token);
     }
     Ok(response)
+}
+
+/// The rest of the metrics of a job as CSV. One page is in memory at a time.
+struct MetricsCsv {
+    app: Arc<App>,
+    caller: Caller,
+    id: String,
+    name: Option<String>,
+    /// Empty: nothing is left.
+    next_token: String,
+}
+
+impl MetricsCsv {
+    async fn next(mut self) -> Result<Option<(String, Self)>, Error> {
+        if self.next_token.is_empty() {
+            return Ok(None);
+        }
+        let request = PageRequest { size: 0, token: std::mem::take(&mut self.next_token) };
+        self.caller.check(self.app.clock.now())?;
+        let page = jobs::metrics(&self.app, &self.caller, &self.id, self.name.as_deref(), &request).await?;
+        let mut text = String::new();
+        add_csv(&mut text, &page.items);
+        self.next_token = page.next_token;
+        Ok(Some((text, self)))
+    }
 }
 
 #[derive(Serialize, ToSchema)]

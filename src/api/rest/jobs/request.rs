@@ -9,6 +9,7 @@ use utoipa::openapi::RefOr;
 use utoipa::openapi::schema::Schema;
 
 use crate::api::config_schemas::{partial_training, schema};
+use crate::api::rest::schemas;
 use crate::api::json;
 use crate::env::EnvConfig;
 use crate::jobs::evaluation::EvaluationRequest;
@@ -60,6 +61,10 @@ pub(super) struct JobRequest {
     after: Option<Vec<String>>,
     /// When training ends before all steps are done; the job then succeeds. Default: never.
     stop: Option<EarlyStop>,
+    /// What training begins with. Default: weights that are drawn.
+    init: Option<Init>,
+    /// Where the policy is published when the job succeeds. Default: under the name of the job, and no alias moves.
+    publish: Option<Publish>,
     /// Default: `qedgix`.
     algorithm: Option<Algorithm>,
     /// The configuration that `environment` and `training` start from; default: `practical`.
@@ -85,7 +90,8 @@ impl From<JobRequest> for spec::JobRequest {
     fn from(request: JobRequest) -> Self {
         let JobRequest { kind, name, labels, notes, threads, priority, algorithm, preset, environment, training, seed, .. } =
             request;
-        let JobRequest { max_attempts, timeout, backoff, after, stop, evaluation, sweep, .. } = request;
+        let JobRequest { max_attempts, timeout, backoff, after, stop, init, publish, evaluation, sweep, .. } = request;
+        let (init, publish) = (init.map(Into::into), publish.map(Into::into));
         let sweep = sweep.map(Into::into);
         let evaluation = evaluation.map(Into::into);
         let stop = stop.map(Into::into);
@@ -101,6 +107,8 @@ impl From<JobRequest> for spec::JobRequest {
             backoff,
             after,
             stop,
+            init,
+            publish,
             algorithm,
             preset,
             environment,
@@ -109,6 +117,62 @@ impl From<JobRequest> for spec::JobRequest {
             sweep,
             seed,
         }
+    }
+}
+
+/// Weights that training begins with: exactly one of `policy` and `checkpoint`. The agents must have the same architecture. The
+/// mixer is taken over if it is the same, and drawn otherwise.
+#[derive(Debug, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields, remote = "Self")]
+pub(super) struct Init {
+    /// A policy of the server: NAME, NAME@ALIAS or NAME:VERSION. The version is that of the submission.
+    #[schema(schema_with = schemas::nullable_policy_spec)]
+    policy: Option<String>,
+    /// Id of a checkpoint of a job.
+    #[schema(value_type = Option<Uuid>)]
+    checkpoint: Option<String>,
+}
+
+json::objects_only!(Init);
+
+impl From<Init> for spec::InitRequest {
+    fn from(Init { policy, checkpoint }: Init) -> Self {
+        Self { policy, checkpoint }
+    }
+}
+
+/// Where the policy of a job is published, and which alias moves to it in the same transaction. Moving an alias requires the scope
+/// `admin`.
+#[derive(Debug, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields, remote = "Self")]
+pub(super) struct Publish {
+    /// Name of the policy; default: the name of the job.
+    #[schema(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,62}$")]
+    policy: Option<String>,
+    /// Alias that moves to the new version.
+    #[schema(schema_with = schemas::nullable_name)]
+    alias: Option<String>,
+    /// Condition of the move. Default: none.
+    #[serde(rename = "if")]
+    condition: Option<PromotionCondition>,
+}
+
+/// When an alias moves.
+#[derive(Debug, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields, remote = "Self")]
+struct PromotionCondition {
+    /// A baseline, or a policy of the server: NAME, NAME@ALIAS or NAME:VERSION, as it is when the job ends. The mean AoI of the best
+    /// checkpoint on 256 layouts of `eval-v1` must be lower than its. It must exist, unless it is the policy that the job publishes.
+    #[schema(schema_with = schemas::policy_spec)]
+    better_than: String,
+}
+
+json::objects_only!(Publish, PromotionCondition);
+
+impl From<Publish> for spec::PublishRequest {
+    fn from(Publish { policy, alias, condition }: Publish) -> Self {
+        let condition = condition.map(|PromotionCondition { better_than }| spec::PromotionCondition { better_than });
+        Self { policy, alias, condition }
     }
 }
 
@@ -235,6 +299,23 @@ impl From<EarlyStop> for store::EarlyStop {
 impl From<store::EarlyStop> for EarlyStop {
     fn from(store::EarlyStop { metric, at_most, at_least, patience }: store::EarlyStop) -> Self {
         Self { metric, at_most, at_least, patience }
+    }
+}
+
+/// How a job is continued.
+#[derive(Debug, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+#[schema(example = json!({"steps": 20_000}))]
+pub(super) struct JobContinuation {
+    /// Environment steps to train further.
+    #[serde(deserialize_with = "json::integer")]
+    #[schema(minimum = 1, maximum = 1_000_000_000_000_u64)]
+    steps: u64,
+}
+
+impl From<JobContinuation> for spec::ContinueRequest {
+    fn from(JobContinuation { steps }: JobContinuation) -> Self {
+        Self { steps }
     }
 }
 

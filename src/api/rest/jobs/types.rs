@@ -10,8 +10,9 @@ use uuid::Uuid;
 
 use super::request::{EarlyStop, optional_kind};
 use crate::env::EnvConfig;
+use crate::service::events;
 use crate::service::jobs::{self, JobView};
-use crate::store::{self, AttemptOutcome, CheckpointKind, JobId, JobState, PendingAction, StoredSpec};
+use crate::store::{self, AttemptOutcome, CheckpointKind, InitKind, JobId, JobState, PendingAction, StoredSpec};
 use crate::train_config::{Algorithm, Preset, Training};
 
 /// A job without its environment and its training configuration.
@@ -122,12 +123,27 @@ pub(super) struct UnreadableSpec {
     document: String,
 }
 
+/// How far a job has come.
 #[derive(Debug, Serialize, ToSchema)]
-struct Progress {
+pub(in crate::api::rest) struct Progress {
     /// Environment steps done.
     step: u64,
     /// Environment steps to do.
     steps: u64,
+    /// Environment steps per second; null if they were not measured, or the job does not run.
+    #[schema(required = true)]
+    steps_per_second: Option<f64>,
+    /// Seconds until all steps are done at this speed; null without one.
+    #[schema(required = true)]
+    seconds_left: Option<f64>,
+}
+
+impl From<events::Progress> for Progress {
+    fn from(progress: events::Progress) -> Self {
+        let seconds_left = progress.seconds_left();
+        let events::Progress { step, steps, steps_per_second } = progress;
+        Self { step, steps, steps_per_second, seconds_left }
+    }
 }
 
 /// A job with its whole configuration.
@@ -149,6 +165,12 @@ pub(super) struct Job {
     /// When training ends before all steps are done; null: never.
     #[schema(required = true)]
     stop: Option<EarlyStop>,
+    /// What training begins with; null: weights that are drawn.
+    #[schema(required = true)]
+    init: Option<JobInit>,
+    /// Where the policy is published; null: under the name of the job, and no alias moves.
+    #[schema(required = true)]
+    publish: Option<PublishRule>,
     /// Null, like `training`, if the job does not train, or if the specification is unreadable.
     #[schema(required = true)]
     environment: Option<EnvConfig>,
@@ -165,6 +187,59 @@ pub(super) struct Job {
     point: Option<u64>,
 }
 
+/// What training begins with.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct JobInit {
+    /// The weights of a checkpoint, or the snapshot of another job with its optimiser and replay.
+    #[schema(value_type = String, pattern = "^(weights|snapshot)$")]
+    from: InitKind,
+    /// NAME:VERSION of the policy with these weights.
+    #[schema(required = true)]
+    policy: Option<String>,
+    /// Id of the checkpoint with these weights.
+    #[schema(required = true)]
+    checkpoint: Option<Uuid>,
+    /// The job that this one continues.
+    #[schema(value_type = Option<Uuid>, required = true)]
+    job: Option<JobId>,
+    /// Environment steps of training before.
+    step: u64,
+    #[schema(pattern = "^[0-9a-f]{64}$")]
+    sha256: String,
+}
+
+impl From<store::JobInit> for JobInit {
+    fn from(store::JobInit { from, policy, checkpoint, job, step, sha256 }: store::JobInit) -> Self {
+        Self { from, policy, checkpoint, job, step, sha256 }
+    }
+}
+
+/// Where the policy of a job is published, and which alias moves to it.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct PublishRule {
+    /// Null: the name of the job.
+    #[schema(required = true)]
+    policy: Option<String>,
+    #[schema(required = true)]
+    alias: Option<String>,
+    /// Condition of the move; null: none.
+    #[serde(rename = "if")]
+    #[schema(required = true)]
+    condition: Option<PromotionCondition>,
+}
+
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = StoredPromotionCondition)]
+struct PromotionCondition {
+    better_than: String,
+}
+
+impl From<store::PublishRule> for PublishRule {
+    fn from(store::PublishRule { policy, alias, better_than }: store::PublishRule) -> Self {
+        Self { policy, alias, condition: better_than.map(|better_than| PromotionCondition { better_than }) }
+    }
+}
+
 impl From<JobView> for JobSummary {
     fn from(view: JobView) -> Self {
         Job::from(view).summary
@@ -172,15 +247,15 @@ impl From<JobView> for JobSummary {
 }
 
 impl From<JobView> for Job {
-    fn from(JobView { job, waiting, metrics }: JobView) -> Self {
-        let decoded = job.spec.decode();
-        let StoredSpec { kind, name, labels, threads, priority, algorithm, preset, seed, steps, document } = job.spec;
+    fn from(JobView { job, spec: decoded, progress, waiting, metrics }: JobView) -> Self {
+        let StoredSpec { kind, name, labels, threads, priority, algorithm, preset, seed, document, .. } = job.spec;
         let (spec, unreadable) = match decoded {
             Ok(spec) => (Some(spec), None),
             Err(reason) => (None, Some(UnreadableSpec { reason: reason.to_string(), document })),
         };
         let limits = spec.as_ref().map(|spec| spec.limits).unwrap_or_default();
         let point = spec.as_ref().and_then(|spec| spec.point);
+        let (init, publish) = spec.as_ref().map(|spec| (spec.init.clone(), spec.publish.clone())).unwrap_or_default();
         let (after, stop, config, evaluation, sweep) =
             spec.map_or_else(Default::default, |spec| (spec.after, spec.stop, spec.config, spec.evaluation, spec.sweep));
         let (environment, training) = config.map(|config| (config.environment, config.training)).unzip();
@@ -190,7 +265,7 @@ impl From<JobView> for Job {
             state: job.state,
             wanted: job.pending_action,
             reason: job.reason,
-            progress: Progress { step: job.step, steps },
+            progress: progress.into(),
             attempts: job.attempts,
             failures: job.failures,
             policy: job.policy,
@@ -219,6 +294,8 @@ impl From<JobView> for Job {
             backoff: limits.backoff,
             after,
             stop: stop.map(Into::into),
+            init: init.map(Into::into),
+            publish: publish.map(Into::into),
             environment,
             training,
             evaluation,
@@ -247,15 +324,16 @@ impl From<store::MetricRow> for MetricRow {
     }
 }
 
-/// Metrics as a table: a header, then a line per row; an unknown value is empty. Names contain no comma.
-pub(super) fn to_csv(rows: &[store::MetricRow]) -> String {
+/// The first line of metrics as a table.
+pub(super) const CSV_HEADER: &str = "name,step,value,at\n";
+
+/// Adds a line of a table per row; an unknown value is empty. Names contain no comma.
+pub(super) fn add_csv(csv: &mut String, rows: &[store::MetricRow]) {
     use std::fmt::Write;
-    let mut csv = String::from("name,step,value,at\n");
     for store::MetricRow { name, step, value, at } in rows {
         let value = value.map(|v| v.to_string()).unwrap_or_default();
         writeln!(csv, "{name},{step},{value},{at}").expect("writing to a string cannot fail");
     }
-    csv
 }
 
 /// A checkpoint without its bytes.
