@@ -12,6 +12,7 @@ use crate::invalid::{Invalid, in_range};
 use crate::jobs::evaluation::EvaluationSpec;
 use crate::jobs::worker::RivalComparison;
 use crate::jobs::{Directive, equal_secrets, token_digest};
+use crate::policy::baselines;
 use crate::store::{
     EarlyStop, EndedAttempt, InitKind, Job, JobId, Lease, Metric, NewCheckpoint, PartialSnapshot, PublishRule, Snapshot, WorkerResult, is_metric_name,
 };
@@ -155,9 +156,11 @@ pub async fn rival(app: &App, lease: Lease) -> Result<Option<(String, Vec<u8>)>,
     let job = app.store.job(lease.job_id).await?.ok_or_else(|| attempt_ended(lease))?;
     let rule = job.spec.decode().map_err(Error::internal)?.publish.unwrap_or_default();
     let Some(rival) = rule.better_than else { return Ok(None) };
+    if baselines::is_name(&rival) {
+        return Ok(Some((rival, Vec::new())));
+    }
     match policies::export(app, &rival.parse()?).await {
         Ok((reference, bytes)) => Ok(Some((format!("{}:{}", reference.name, reference.version), bytes))),
-        Err(Error::Precondition { code: ErrorCode::NoCheckpoint, .. }) => Ok(Some((rival, Vec::new()))),
         Err(Error::NotFound { .. }) => Ok(None),
         Err(e) => Err(e),
     }

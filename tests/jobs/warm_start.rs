@@ -76,7 +76,7 @@ async fn weights_that_do_not_fit_are_refused_with_the_field_that_differs() {
         let mut job = with(&json!({"init": {"policy": "base"}}));
         for (name, value) in fields.as_object().unwrap() {
             match value.as_object() {
-                Some(more) if name != "init" => job[name].as_object_mut().unwrap().extend(more.clone()),
+                Some(more) if job[name].is_object() && name != "init" => job[name].as_object_mut().unwrap().extend(more.clone()),
                 _ => job[name] = value.clone(),
             }
         }

@@ -44,6 +44,11 @@ pub const LIST: [BaselineInfo; 8] = [
     info::<tour::Tour>(),
 ];
 
+/// Whether a baseline has this name.
+pub fn is_name(name: &str) -> bool {
+    LIST.iter().any(|baseline| baseline.name == name)
+}
+
 /// The baseline `name` in the environment `env`, or `None` for an unknown name.
 pub fn by_name(name: &str, env: EnvParams) -> Option<Arc<dyn Policy>> {
     LIST.iter().find(|baseline| baseline.name == name).map(|baseline| (baseline.create)(env))

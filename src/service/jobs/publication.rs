@@ -1,6 +1,7 @@
 //! Whether a job may publish as it asks to. Checked at the submission, instead of after training.
 
 use crate::invalid::Invalid;
+use crate::policy::baselines;
 use crate::service::keys::{Caller, Scope};
 use crate::service::policies::{self, Publisher};
 use crate::service::{App, Error};
@@ -25,7 +26,7 @@ pub(super) async fn check(app: &App, caller: &Caller, spec: &JobSpec) -> Result<
         let message = format!("publish.alias moves an alias, which requires a key with the scope {scope}");
         return Err(Error::PermissionDenied { message, scope });
     }
-    if let Some(rival) = &rule.better_than {
+    if let Some(rival) = rule.better_than.as_ref().filter(|rival| !baselines::is_name(rival)) {
         let unknown = || {
             Invalid::new("publish.if.better_than", format!("{rival:?}"), "a policy of this server, or the one that the job publishes")
         };

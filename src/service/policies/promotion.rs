@@ -4,7 +4,8 @@ use serde_json::{Value, json};
 
 use super::aliases::check_alias;
 use crate::jobs::worker::RivalComparison;
-use crate::serving::{PolicyKind, PolicySpec, Registry};
+use crate::policy::baselines;
+use crate::serving::{PolicySpec, Registry};
 
 /// The move of an alias when a job succeeds.
 #[derive(Clone, Debug)]
@@ -29,10 +30,8 @@ impl Promotion {
         }
         let Some(rival) = &self.better_than else { return Ok(()) };
         let found = rival.parse::<PolicySpec>().ok().and_then(|spec| registry.describe(&spec).ok());
-        let now = found.map(|found| match found.state.kind {
-            PolicyKind::Baseline => found.state.reference.name,
-            _ => format!("{}:{}", found.state.reference.name, found.state.reference.version),
-        });
+        let version = found.map(|found| format!("{}:{}", found.state.reference.name, found.state.reference.version));
+        let now = if baselines::is_name(rival) { Some(rival.clone()) } else { version };
         match (now, &self.comparison) {
             // Nothing is there that could be better.
             (None, _) => Ok(()),
