@@ -94,7 +94,9 @@ impl Store {
         limit: u32,
     ) -> Result<Vec<MetricRow>> {
         // Only the conditions that there are, so that each page begins where the last one ended.
-        let mut sql = QueryBuilder::<Sqlite>::new("SELECT name, step, value, at FROM metrics WHERE job = (SELECT number FROM jobs WHERE id = ");
+        let mut sql = QueryBuilder::<Sqlite>::new(
+            "SELECT name, step, value, at FROM metrics WHERE job = (SELECT number FROM jobs WHERE id = ",
+        );
         sql.push_bind(id.to_string()).push(")");
         if let Some(name) = name {
             sql.push(" AND name = ").push_bind(name);

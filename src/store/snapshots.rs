@@ -49,7 +49,8 @@ pub(super) async fn copy_snapshot(db: &mut SqliteConnection, job: i64, snapshot:
     if copied.rows_affected() == 0 {
         return Err(super::corrupt("snapshot", snapshot.id, "deleted meanwhile"));
     }
-    let sql = "INSERT INTO snapshot_chunks (snapshot, number, bytes) SELECT ?, number, bytes FROM snapshot_chunks WHERE snapshot = ?";
+    let sql =
+        "INSERT INTO snapshot_chunks (snapshot, number, bytes) SELECT ?, number, bytes FROM snapshot_chunks WHERE snapshot = ?";
     sqlx::query(sql).bind(copied.last_insert_rowid()).bind(snapshot.id).execute(&mut *db).await?;
     sqlx::query("UPDATE jobs SET step = ? WHERE number = ?").bind(snapshot.step as i64).bind(job).execute(&mut *db).await?;
     Ok(())

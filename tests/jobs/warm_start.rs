@@ -164,7 +164,10 @@ async fn a_failed_job_is_continued_from_its_snapshot() {
     let job = grpc.continue_job(request).await.unwrap().into_inner();
     assert_eq!((job.step, job.steps), (step, step + 1000));
     let shown = server.get(&format!("/v1/jobs/{}", job.id)).await;
-    assert_eq!((&shown["init"]["from"], &shown["init"]["job"], &shown["init"]["step"]), (&json!("snapshot"), &json!(id), &json!(step)));
+    assert_eq!(
+        (&shown["init"]["from"], &shown["init"]["job"], &shown["init"]["step"]),
+        (&json!("snapshot"), &json!(id), &json!(step))
+    );
     // The copy does not depend on its source.
     expect(server.request(Method::DELETE, &format!("/v1/jobs/{id}")), StatusCode::NO_CONTENT).await;
     let worker = server.worker().await;
@@ -187,7 +190,8 @@ fn a_run_that_was_extended_is_one_that_had_more_steps() {
         let mut training = job["training"].as_object().unwrap().clone();
         training.extend([("steps".into(), json!(steps)), ("learning_rate_decay".into(), json!(1.0))]);
         let environment = job["environment"].as_object().unwrap();
-        TrainConfig::resolve(qedgix::learner::Algorithm::Vdn, qedgix::learner::Preset::Practical, environment, &training, 1).unwrap()
+        TrainConfig::resolve(qedgix::learner::Algorithm::Vdn, qedgix::learner::Preset::Practical, environment, &training, 1)
+            .unwrap()
     };
     let mut whole = Trainer::new(config(800), 1).unwrap();
     assert!(whole.by_ref().last().is_some());

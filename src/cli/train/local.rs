@@ -58,7 +58,9 @@ fn begin(args: &TrainArgs, threads: usize) -> anyhow::Result<Trainer> {
         let bundled = bundled::BUNDLED.iter().find(|(bundled, _)| bundled == name);
         let bytes = match bundled.filter(|_| !Path::new(name).exists()) {
             Some((_, bytes)) => bytes.to_vec(),
-            None => fs::read(name).with_context(|| format!("--init {name}: neither a bundled policy nor a file that can be read"))?,
+            None => {
+                fs::read(name).with_context(|| format!("--init {name}: neither a bundled policy nor a file that can be read"))?
+            }
         };
         let weights = Checkpoint::from_bytes(&bytes).with_context(|| format!("--init {name}"))?;
         trainer.begin_with(&weights).with_context(|| format!("--init {name}"))?;

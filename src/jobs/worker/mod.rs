@@ -22,8 +22,8 @@ use tokio::sync::{mpsc, oneshot};
 
 use self::client::{Client, ClientError};
 use self::early_stop::StopRule;
-pub use self::rival::RivalComparison;
 use self::evaluation::EvaluationTask;
+pub use self::rival::RivalComparison;
 use self::training::{ReportQueue, TrainingTask};
 use super::Directive;
 use super::evaluation::EvaluationSpec;

@@ -81,7 +81,12 @@ impl InitialWeights {
 ///
 /// # Errors
 /// [`Error::Precondition`] when the job has not ended, does not train or has neither. [`Error::Invalid`]: the steps.
-pub(super) async fn continued(app: &App, caller: &Caller, job: &Job, request: ContinueRequest) -> Result<(JobSpec, Beginning), Error> {
+pub(super) async fn continued(
+    app: &App,
+    caller: &Caller,
+    job: &Job,
+    request: ContinueRequest,
+) -> Result<(JobSpec, Beginning), Error> {
     let wrong_state = |why: &str| {
         let message = format!("job {} {why}", job.id);
         Error::Precondition { code: ErrorCode::WrongState, message }

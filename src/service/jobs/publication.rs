@@ -28,7 +28,11 @@ pub(super) async fn check(app: &App, caller: &Caller, spec: &JobSpec) -> Result<
     }
     if let Some(rival) = rule.better_than.as_ref().filter(|rival| !baselines::is_name(rival)) {
         let unknown = || {
-            Invalid::new("publish.if.better_than", format!("{rival:?}"), "a policy of this server, or the one that the job publishes")
+            Invalid::new(
+                "publish.if.better_than",
+                format!("{rival:?}"),
+                "a policy of this server, or the one that the job publishes",
+            )
         };
         let found: PolicySpec = rival.parse().map_err(|_| unknown())?;
         if app.registry.describe(&found).is_err() && name != Some(&found.name) {

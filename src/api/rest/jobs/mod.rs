@@ -27,8 +27,8 @@ use crate::service::{App, Error, PageRequest, checkpoints, jobs};
 use crate::store::{JobAction, JobKind, JobState};
 use crate::train_config::Algorithm;
 use request::{JobContinuation, JobEdit, JobRequest};
-pub(super) use types::{MetricRow, Progress};
 use types::{Attempt, CSV_HEADER, Checkpoint, Job, JobSummary, add_csv};
+pub(super) use types::{MetricRow, Progress};
 
 type AppState = State<Arc<App>>;
 
@@ -92,7 +92,8 @@ async fn submit(
 fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, Invalid> {
     const KEY: HeaderName = HeaderName::from_static("idempotency-key");
     let text = |value: &HeaderValue| value.to_str().map(str::to_owned);
-    let key = headers.get(KEY).map(|value| text(value).map_err(|_| Invalid::new("idempotency-key", format!("{value:?}"), "ASCII")));
+    let key =
+        headers.get(KEY).map(|value| text(value).map_err(|_| Invalid::new("idempotency-key", format!("{value:?}"), "ASCII")));
     key.transpose()
 }
 

@@ -9,8 +9,8 @@ use utoipa::openapi::RefOr;
 use utoipa::openapi::schema::Schema;
 
 use crate::api::config_schemas::{partial_training, schema};
-use crate::api::rest::schemas;
 use crate::api::json;
+use crate::api::rest::schemas;
 use crate::env::EnvConfig;
 use crate::jobs::evaluation::EvaluationRequest;
 use crate::jobs::spec;
