@@ -1,4 +1,5 @@
-//! [`Invalid`]: the error of every layer that checks input. It holds the field, the value received and what is accepted.
+//! [`Invalid`]: the error of every layer that checks input. It holds the field, the value received and what is accepted. Its message
+//! also names the accepted word that a misspelled one is nearest to.
 
 use std::fmt::{self, Display};
 
@@ -88,6 +89,16 @@ impl Invalid {
         self.kind != InvalidKind::Value
     }
 
+    /// The accepted word that the value, or the name of the unknown field, is nearest to: `expected` is a list `one of a, b, ...`.
+    pub fn suggestion(&self) -> Option<&str> {
+        let (_, known) = self.expected.split_once("one of ")?;
+        let word = match self.kind {
+            InvalidKind::UnknownField => self.field.rsplit('.').next()?,
+            _ => self.value.as_deref()?.trim_matches('"'),
+        };
+        nearest(word, known.split(", "))
+    }
+
     /// The same error with `prefix.` in front of the field.
     #[must_use]
     pub fn with_prefix(mut self, prefix: &str) -> Self {
@@ -100,14 +111,28 @@ impl Display for Invalid {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { field, value, expected, kind } = self;
         match (kind, value) {
-            (InvalidKind::UnknownField, _) => write!(f, "{field}: unknown field, expected {expected}"),
-            (_, Some(value)) => write!(f, "{field}: got {value}, expected {expected}"),
-            (_, None) => write!(f, "{field}: missing, expected {expected}"),
+            (InvalidKind::UnknownField, _) => write!(f, "{field}: unknown field, expected {expected}")?,
+            (_, Some(value)) => write!(f, "{field}: got {value}, expected {expected}")?,
+            (_, None) => write!(f, "{field}: missing, expected {expected}")?,
         }
+        self.suggestion().map_or(Ok(()), |word| write!(f, "; did you mean {word}?"))
     }
 }
 
 impl std::error::Error for Invalid {}
+
+/// The word of `known` that `word` was most likely meant to be: one that a few letters more, less, other or swapped make of it.
+pub fn nearest<'a>(word: &str, known: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
+    // Long words are cut by whoever sent them wrong, not misspelled.
+    let length = word.chars().count();
+    if !(2..=64).contains(&length) {
+        return None;
+    }
+    let lowercase = word.to_lowercase();
+    let distance = |other: &str| strsim::damerau_levenshtein(&lowercase, &other.to_lowercase());
+    let others = known.into_iter().filter(|other| *other != word).map(|other| (distance(other), other));
+    others.filter(|(distance, _)| *distance <= (length / 3).max(1)).min_by_key(|(distance, _)| *distance).map(|(_, other)| other)
+}
 
 fn cut(value: String) -> String {
     if value.chars().count() <= Invalid::MAX_VALUE_LEN {
@@ -201,6 +226,30 @@ mod tests {
         ] {
             assert_eq!(parse(path, message), expected, "{message}");
         }
+    }
+
+    #[test]
+    fn the_nearest_word_is_suggested() {
+        let known = ["qmix", "vdn", "sweep", "sweep-shared", "learning_rate"];
+        for (word, expected) in [
+            ("qmx", Some("qmix")),
+            ("QMIX", Some("qmix")),
+            ("swep", Some("sweep")),
+            ("sweep_shared", Some("sweep-shared")),
+            ("learing_rate", Some("learning_rate")),
+            ("vnd", Some("vdn")),
+            ("sweeps", Some("sweep")),
+            ("ppo", None),
+            ("", None),
+            ("q", None),
+        ] {
+            assert_eq!(nearest(word, known), expected, "{word}");
+        }
+        assert_eq!(nearest(&"x".repeat(1_000_000), known), None);
+        let field = Invalid::unknown_field("training.learing_rate", "one of gamma, learning_rate");
+        assert_eq!(field.suggestion(), Some("learning_rate"));
+        assert_eq!(Invalid::new("algorithm", "\"qmx\"", "one of qmix, vdn").suggestion(), Some("qmix"));
+        assert_eq!(Invalid::new("uavs", 5000, "at most 4096").suggestion(), None);
     }
 
     #[test]

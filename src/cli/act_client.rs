@@ -2,6 +2,8 @@
 
 use anyhow::{Context, ensure};
 use axum::http::HeaderValue;
+use futures::{StreamExt, TryStreamExt, stream};
+use indicatif::ProgressBar;
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::service::Interceptor;
 use tonic::service::interceptor::InterceptedService;
@@ -49,24 +51,29 @@ pub async fn connect(address: &str, args: &ConnectArgs) -> anyhow::Result<Policy
     Ok(PolicyServiceClient::with_interceptor(channel, ApiKeyInterceptor(api_key)))
 }
 
-/// Runs one episode per layout seed and returns the metrics of each.
+/// Episodes that fly at the same time, each in a session of its own.
+const AT_ONCE: usize = 16;
+
+/// Runs one episode per layout seed and returns the metrics of each. Advances `bar` by one per episode.
 ///
 /// # Errors
 /// The server refuses a session or a step.
 pub async fn run_episodes(
-    server: &mut PolicyClient,
+    server: &PolicyClient,
     policy: &str,
     env: &EnvConfig,
     seeds: &[u64],
+    bar: &ProgressBar,
 ) -> anyhow::Result<Vec<EpisodeMetrics>> {
-    let mut metrics = Vec::with_capacity(seeds.len());
-    for &seed in seeds {
-        metrics.push(run_episode(server, policy, env, seed).await.with_context(|| format!("policy {policy}, layout {seed}"))?);
-    }
-    Ok(metrics)
+    let episodes = seeds.iter().map(|&seed| async move {
+        let metrics = run_episode(server.clone(), policy, env, seed).await;
+        bar.inc(1);
+        metrics.with_context(|| format!("policy {policy}, layout {seed}"))
+    });
+    stream::iter(episodes).buffered(AT_ONCE).try_collect().await
 }
 
-async fn run_episode(server: &mut PolicyClient, policy: &str, env: &EnvConfig, seed: u64) -> anyhow::Result<EpisodeMetrics> {
+async fn run_episode(mut server: PolicyClient, policy: &str, env: &EnvConfig, seed: u64) -> anyhow::Result<EpisodeMetrics> {
     let open = v1::OpenSessionRequest { policy: policy.to_owned(), seed: Some(seed), ..Default::default() };
     let session_id = server.open_session(open).await?.into_inner().session_id;
     let mut episode = Episode::new(env, seed)?;

@@ -1,7 +1,7 @@
 //! `qedgix demo`: starts a server on an empty data directory, runs the bundled policies and the baselines through gRPC `Act`, trains a
-//! policy by a job over REST, runs it through the same `Act`, and prints one table.
+//! policy by a job over REST, runs it through the same `Act`, and prints one table. Nothing is left behind.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Context;
@@ -12,8 +12,9 @@ use super::act_client::PolicyClient;
 use super::client::Client;
 use super::connect::ConnectArgs;
 use super::in_process_server::InProcessServer;
-use super::output::outln;
+use super::output::{Exit, outln};
 use super::run_args::{all_cores, count};
+use super::signals::StopSignals;
 use super::{act_client, progress, table, train};
 use crate::env::EnvConfig;
 use crate::learner::{Algorithm, Summary, difference, layout_list, summarize};
@@ -28,10 +29,10 @@ pub struct DemoArgs {
     #[arg(long)]
     keep: bool,
     /// Environment steps of the training job
-    #[arg(long, env = "QEDGIX_STEPS", default_value_t = 160_000, value_name = "STEPS", value_parser = count)]
+    #[arg(long, env = "QEDGIX_STEPS", default_value_t = 220_000, value_name = "STEPS", value_parser = count)]
     steps: u64,
     /// Number of layouts of eval-v1 on which policies are compared
-    #[arg(long, env = "QEDGIX_EPISODES", default_value_t = 32, value_name = "LAYOUTS")]
+    #[arg(long, env = "QEDGIX_EPISODES", default_value_t = 256, value_name = "LAYOUTS")]
     episodes: usize,
     /// Data directory of the server [default: a temporary directory, removed at the end]
     #[arg(long, env = "QEDGIX_DATA_DIR", value_name = "DIR")]
@@ -41,29 +42,46 @@ pub struct DemoArgs {
 /// Name of the job and of the policy that it publishes.
 const JOB: &str = "demo-job";
 
-/// Runs the command.
+/// Runs the command. ctrl-c and SIGTERM stop the server and remove what was made, as the end of the demo does.
 ///
 /// # Errors
 /// The server cannot be started, a request fails, or the job fails.
 pub async fn run(args: DemoArgs) -> anyhow::Result<()> {
-    let temporary = args.data_dir.is_none();
-    let data_dir =
-        args.data_dir.clone().unwrap_or_else(|| std::env::temp_dir().join(format!("qedgix-demo-{}", uuid::Uuid::now_v7())));
-    let result = run_in(&args, data_dir.clone()).await;
-    if temporary {
+    let mut signals = StopSignals::new()?;
+    let temporary = || std::env::temp_dir().join(format!("qedgix-demo-{}", uuid::Uuid::now_v7()));
+    let data_dir = args.data_dir.clone().unwrap_or_else(temporary);
+    let server = InProcessServer::start(&data_dir).await;
+    if server.is_err() && args.data_dir.is_none() {
         std::fs::remove_dir_all(&data_dir).ok();
+    }
+    let server = server?;
+    let mut result = tokio::select! {
+        shown = show(&args, &server, &data_dir) => shown,
+        code = signals.next() => Err(Exit::new(code, "").into()),
+    };
+    if args.keep && result.is_ok() {
+        signals.next().await;
+    }
+    // A second signal ends the process at once.
+    let stopped = tokio::select! {
+        stopped = server.stop() => stopped,
+        code = signals.next() => Err(Exit::new(code, "").into()),
+    };
+    result = result.and(stopped);
+    if args.data_dir.is_none() {
+        result = result.and(std::fs::remove_dir_all(&data_dir).with_context(|| format!("cannot remove {}", data_dir.display())));
     }
     result
 }
 
-async fn run_in(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
+/// Everything between the start of the server and its end.
+async fn show(args: &DemoArgs, server: &InProcessServer, data_dir: &Path) -> anyhow::Result<()> {
     let begin = Instant::now();
-    let server = InProcessServer::start(&data_dir).await?;
     outln!(
-        "Server on an empty data directory\n  gRPC  {}\n  REST  http://{}\n  data  {}\n",
+        "Server on an empty data directory\n  gRPC       {}\n  REST       http://{http}\n  dashboard  http://{http}/\n  data       {}\n",
         server.grpc,
-        server.http,
-        data_dir.display()
+        data_dir.display(),
+        http = server.http,
     )?;
 
     let local = ConnectArgs::default();
@@ -98,8 +116,8 @@ async fn run_in(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
         "environment": {},
         "training": {
             "steps": args.steps,
-            "eval_every": (args.steps / 12).max(1),
-            "epsilon_anneal": (args.steps / 3).max(1),
+            "eval_every": (args.steps / 11).max(1),
+            "epsilon_anneal": (args.steps / 4).max(1),
         },
         "threads": all_cores(),
     });
@@ -113,22 +131,20 @@ async fn run_in(args: &DemoArgs, data_dir: PathBuf) -> anyhow::Result<()> {
     comparison.run(policy).await?;
 
     outln!("\nMean AoI in slots (lower is better)\n{}", table::policy_table(&comparison.rows))?;
-    if let [(first, bundled), .., (last, trained)] = &comparison.episodes[..] {
-        let d = difference(trained, bundled)?.mean_aoi;
-        outln!("{last} minus {first} on the same layouts: {:+.2} (95 % interval {:+.2} to {:+.2})", d.mean, d.low, d.high)?;
-    }
+    comparison.print_differences(policy)?;
     outln!("Finished in {:.0} s.", begin.elapsed().as_secs_f64())?;
     if args.keep {
         outln!(
-            "\nThe server keeps running: gRPC {}, REST http://{http}. The dashboard is http://{http}/, and the trained policy flies beside \
-             qedgix at http://{http}/#/player?policy={policy}&against=qedgix. Stop it with ctrl-c.",
-            server.grpc,
+            "\nThe server keeps running; stop it with ctrl-c. Watch {policy} fly beside the best rule:\n  \
+             http://{http}/#/player?policy={policy}&against={RULE}\nthe curve of its training:\n  http://{http}/#/jobs/{id}",
             http = server.http
         )?;
-        tokio::signal::ctrl_c().await?;
     }
-    server.stop().await
+    Ok(())
 }
+
+/// The best rule that knows no more than the trained policy: what UAVs detect, and share within the communication range.
+const RULE: &str = "sweep-shared";
 
 /// The policies that have run so far.
 struct Comparison {
@@ -143,15 +159,26 @@ impl Comparison {
     /// Runs a policy on all layouts and prints its mean AoI.
     async fn run(&mut self, policy: &str) -> anyhow::Result<()> {
         let begin = Instant::now();
-        let bar = progress::spinner(policy);
-        let episodes = act_client::run_episodes(&mut self.server, policy, &self.env, &self.seeds).await?;
+        let bar = progress::bar(self.seeds.len() as u64, "layouts").with_message(policy.to_owned());
+        let episodes = act_client::run_episodes(&self.server, policy, &self.env, &self.seeds, &bar).await?;
         bar.finish_and_clear();
         let acts = (self.seeds.len() * self.env.slots) as f64;
         let summary = summarize(&episodes)?;
-        let each = begin.elapsed().as_secs_f64() / acts * 1e3;
-        outln!("   {policy:<16} mean AoI {:5.2}   {each:.2} ms per Act (round trip)", summary.mean_aoi.mean)?;
+        let rate = acts / begin.elapsed().as_secs_f64();
+        outln!("   {policy:<16} mean AoI {:5.2}   {rate:6.0} Acts per second", summary.mean_aoi.mean)?;
         self.rows.push((policy.to_owned(), summary));
         self.episodes.push((policy.to_owned(), episodes));
+        Ok(())
+    }
+
+    /// Prints how much better or worse the trained policy is than rules that know no more, and than chance.
+    fn print_differences(&self, policy: &str) -> anyhow::Result<()> {
+        let episodes = |name: &str| self.episodes.iter().find(|(policy, _)| policy == name).map(|(_, episodes)| episodes);
+        for rule in [RULE, "sweep", "random"] {
+            let Some((trained, others)) = episodes(policy).zip(episodes(rule)) else { continue };
+            let d = difference(trained, others)?.mean_aoi;
+            outln!("{policy} minus {rule:<12} {:+7.2}   (95 % interval {:+.2} to {:+.2}, same layouts)", d.mean, d.low, d.high)?;
+        }
         Ok(())
     }
 }

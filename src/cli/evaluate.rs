@@ -7,10 +7,12 @@ use anyhow::{Context, ensure};
 use clap::Args;
 
 use super::connect::ConnectArgs;
-use super::output::outln;
+use super::files::read_if_exists;
+use super::output::{errln, outln};
 use super::{act_client, ports, progress, report, run_args::all_cores, table};
 use crate::checkpoint::Checkpoint;
 use crate::env::{EnvConfig, LostUav, UserSlots};
+use crate::invalid::Invalid;
 use crate::learner::{
     Comparison, Disturbance, LayoutList, PolicyEvaluation, TracedEvaluation, Trajectory, evaluate_list, evaluate_traced,
     layout_list,
@@ -108,20 +110,21 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
     let names: Vec<(&str, bool)> =
         args.policy.iter().map(|name| (name.as_str(), false)).chain(references.map(|name| (name, true))).collect();
 
-    let mut server = match &args.server {
+    let server = match &args.server {
         Some(address) => {
             ports::expect_grpc(address, &args.connect).await?;
             Some(act_client::connect(address, &args.connect).await?)
         }
         None => None,
     };
-    let bar = progress::bar(names.len() as u64, "policies");
+    let bar = progress::bar((names.len() * seeds.len()) as u64, "layouts");
     let mut evaluations = Vec::new();
-    for (name, reference) in names {
-        bar.set_message(name.to_owned());
-        let evaluation = match &mut server {
+    for (number, (name, reference)) in names.iter().copied().enumerate() {
+        bar.set_message(format!("{name}, policy {} of {}", number + 1, names.len()));
+        bar.set_position((number * seeds.len()) as u64);
+        let evaluation = match &server {
             Some(server) if !reference => {
-                let episodes = act_client::run_episodes(server, name, &env, &seeds).await?;
+                let episodes = act_client::run_episodes(server, name, &env, &seeds, &bar).await?;
                 TracedEvaluation { episodes, aoi: Vec::new(), trajectory: Trajectory::default() }
             }
             _ => {
@@ -139,7 +142,9 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
             }
         };
         evaluations.push(PolicyEvaluation::new(name, reference, evaluation)?);
-        bar.inc(1);
+        if bar.is_hidden() && names.len() > 1 {
+            errln!("{name}: policy {} of {} evaluated", number + 1, names.len());
+        }
     }
     bar.finish_and_clear();
 
@@ -286,9 +291,10 @@ pub fn open(name: &str, env: &EnvConfig) -> anyhow::Result<Arc<dyn Policy>> {
     }
     let bytes = match bundled::BUNDLED.iter().find(|(bundled, _)| *bundled == name) {
         Some((_, bytes)) => bytes.to_vec(),
-        None => std::fs::read(Path::new(name)).with_context(|| {
+        None => read_if_exists(Path::new(name))?.ok_or_else(|| {
             let known = baselines::LIST.iter().map(|b| b.name).chain(bundled::BUNDLED.iter().map(|(name, _)| *name));
-            format!("{name} is neither a checkpoint file nor one of {}", known.collect::<Vec<_>>().join(", "))
+            let known = known.collect::<Vec<_>>().join(", ");
+            Invalid::new("--policy", format!("{name:?}"), format!("a checkpoint file, or one of {known}"))
         })?,
     };
     let checkpoint = Checkpoint::from_bytes(&bytes).with_context(|| format!("{name} is not a checkpoint"))?;

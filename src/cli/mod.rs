@@ -13,6 +13,7 @@ mod files;
 mod in_process_server;
 mod jobs;
 mod keys;
+mod manual;
 mod output;
 mod policies;
 mod ports;
@@ -25,6 +26,7 @@ mod server;
 mod signals;
 mod table;
 mod train;
+mod variables;
 mod worker;
 
 use std::process::ExitCode;
@@ -74,6 +76,10 @@ enum Command {
     Restore(backup::RestoreArgs),
     /// Measure the speed of Act and of the learner on this machine
     Bench(bench::BenchArgs),
+    /// Print the completions of a shell
+    Completions(manual::CompletionsArgs),
+    /// Write the manual pages
+    Man(manual::ManArgs),
     /// Run one job for a server (servers start their workers themselves)
     Worker(worker::WorkerArgs),
 }
@@ -89,6 +95,7 @@ pub fn run() -> ExitCode {
         let message = format!("{VECTOR_WIDTH_VARIABLE}={value}: expected one of {names}\n");
         return output::print_usage(&Cli::command().error(ErrorKind::InvalidValue, message));
     }
+    variables::warn_of_misspelled(&Cli::command());
     match cli.command {
         Command::Serve(args) => block_on(serve::run(args)),
         Command::Demo(args) => block_on(demo::run(args)),
@@ -103,6 +110,8 @@ pub fn run() -> ExitCode {
         Command::Backup(args) => block_on(backup::backup(args)),
         Command::Restore(args) => block_on(backup::restore(args)),
         Command::Bench(args) => block_on(bench::run(args)),
+        Command::Completions(args) => output::exit_code(manual::completions(&args, &mut Cli::command())),
+        Command::Man(args) => output::exit_code(manual::man(&args, Cli::command())),
         // A worker lowers its priority before it has threads, so it creates its own runtime.
         Command::Worker(args) => output::exit_code(worker::run(&args)),
     }

@@ -171,7 +171,11 @@ pub fn set(items: &[String], environment: &mut Map<String, Value>, training: &mu
 /// # Errors
 /// The name is unknown; the error lists the known names.
 pub fn named<T: DeserializeOwned>(text: &str) -> Result<T, String> {
-    serde_json::from_value(Value::String(text.to_owned())).map_err(|e| e.to_string())
+    serde_json::from_value(Value::String(text.to_owned())).map_err(|e| {
+        let invalid = Invalid::from_parser("", &e);
+        let meant = invalid.suggestion().map_or_else(String::new, |word| format!("; did you mean {word}?"));
+        format!("expected {}{meant}", invalid.expected)
+    })
 }
 
 /// The default number of threads: all cores.

@@ -224,11 +224,11 @@ fn refuse_huge_pages() {
 
 fn print_start(config: &Config, endpoints: Endpoints) -> Result<(), OutputError> {
     outln!("qedgix {}", env!("CARGO_PKG_VERSION"))?;
-    outln!("gRPC  {}", endpoints.grpc)?;
+    outln!("gRPC       {}", endpoints.grpc)?;
     let scheme = if config.tls.is_some() { "https" } else { "http" };
-    outln!("REST  {scheme}://{}", endpoints.http)?;
-    outln!("page  {scheme}://{}/", endpoints.http)?;
-    outln!("data  {}", config.data_dir.display())
+    outln!("REST       {scheme}://{}", endpoints.http)?;
+    outln!("dashboard  {scheme}://{}/", endpoints.http)?;
+    outln!("data       {}", config.data_dir.display())
 }
 
 /// Maximum time to send the last spans to the collector.

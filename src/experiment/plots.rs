@@ -5,7 +5,27 @@ use super::{Experiment, ExperimentSummary, PlotKind, Run, TrainingCurve};
 use crate::learner::Interval;
 use crate::plot::{self, Bar, Chart, Series, Trajectories, bars, lines};
 
-const AOI: &str = "mean AoI (slots)";
+fn aoi_on(layouts: &str) -> String {
+    format!("mean AoI on {layouts} (slots)")
+}
+
+/// What the error bars of results are.
+fn intervals_note(summary: &ExperimentSummary) -> &'static str {
+    if summary.seeds.len() > 1 {
+        "Bars: 95 % intervals over seeds and layouts."
+    } else {
+        "Bars: 95 % intervals over layouts; one seed."
+    }
+}
+
+/// What curves, bands and levels of a convergence plot are.
+fn convergence_note(summary: &ExperimentSummary) -> String {
+    let seeds = summary.seeds.len();
+    let curves =
+        if seeds > 1 { format!("Means of {seeds} seeds, bands from the best to the worst.") } else { "One seed.".to_owned() };
+    let levels = if summary.baselines.is_empty() { "" } else { " Horizontal lines: baselines." };
+    curves + levels
+}
 
 /// File name and SVG text of every plot. `curves` are in the order of the runs; `trajectories` are of the first seed's runs.
 pub fn plots(
@@ -21,8 +41,8 @@ pub fn plots(
     }
 }
 
-/// Per point, a plot of the mean AoI on the validation layouts (mean over seeds, with a band from the best to the worst seed), and
-/// a bar plot of the results of the best weights.
+/// Per point, a plot of the mean AoI on the validation layouts (mean over seeds, with a band from the best to the worst seed) with the
+/// baselines as lines, and a bar plot of the results of the best weights.
 fn convergence(experiment: &Experiment, summary: &ExperimentSummary, curves: &[TrainingCurve]) -> Vec<(String, String)> {
     let mut files = Vec::new();
     for (p, point) in experiment.points.iter().enumerate() {
@@ -47,8 +67,12 @@ fn convergence(experiment: &Experiment, summary: &ExperimentSummary, curves: &[T
         let chart = Chart {
             title: title.clone(),
             x: "environment steps".into(),
-            y: format!("{AOI} on validation layouts"),
+            y: "validation mean AoI (slots)".into(),
             series: series.collect(),
+            levels: (summary.baselines.iter().filter(|b| b.point == point.name))
+                .map(|b| (format!("{} on {}", b.name, summary.layouts), b.mean_aoi.mean))
+                .collect(),
+            note: convergence_note(summary),
             markers: false,
         };
         files.push((file_name("convergence", &point.name), lines(&chart)));
@@ -58,7 +82,10 @@ fn convergence(experiment: &Experiment, summary: &ExperimentSummary, curves: &[T
             .chain(summary.baselines.iter().filter(|b| b.point == point.name).map(|b| bar(&b.name, &b.mean_aoi)))
             .collect();
         let title = format!("{title}: best weights");
-        files.push((file_name("reached", &point.name), bars(&title, &format!("{AOI} on {}", summary.layouts), &reached)));
+        files.push((
+            file_name("reached", &point.name),
+            bars(&title, &aoi_on(&summary.layouts), intervals_note(summary), &reached),
+        ));
     }
     files
 }
@@ -82,8 +109,10 @@ fn parameter(experiment: &Experiment, summary: &ExperimentSummary) -> String {
     lines(&Chart {
         title: experiment.title.clone(),
         x: experiment.x.clone(),
-        y: format!("{AOI} on {}", summary.layouts),
+        y: aoi_on(&summary.layouts),
         series: series.chain(baselines).collect(),
+        levels: Vec::new(),
+        note: intervals_note(summary).to_owned(),
         markers: true,
     })
 }

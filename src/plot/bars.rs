@@ -3,38 +3,47 @@
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, VPos};
 
-use super::canvas::{self, INK, SIZE, colour, shorten, text};
+use super::canvas::{self, Axes, BOTTOM, HEIGHT, INK, Key, Legend, TEXT, TOP, WIDTH, Words, fitting, text};
 use super::data::Bar;
+use super::palette::looks;
 use super::scale::{drawable, extent, value};
 
 /// Height of a bar in pixels.
-const ROW: u32 = 38;
+const ROW: u32 = 30;
 /// Width of the labels in pixels.
-const NAMES: u32 = 190;
+const NAMES: u32 = 158;
 
-/// Bars as SVG. `value_label` labels the axis of the values, with the unit. The height depends on the number of bars.
-pub fn bars(title: &str, value_label: &str, bars: &[Bar]) -> String {
+/// Bars as SVG. `value_label` labels the axis of the values, with the unit, and `note` says what the error bars are. The height depends on
+/// the number of bars.
+pub fn bars(title: &str, value_label: &str, note: &str, bars: &[Bar]) -> String {
     let ends = bars.iter().flat_map(|b| [b.mean, b.low, b.high]);
-    let Some(range) = extent(ends.clone()) else { return canvas::no_data(SIZE, title) };
+    let Some(range) = extent(ends.clone()) else { return canvas::no_data((WIDTH, HEIGHT), title) };
     let range = extent([0.0, range.start, range.end].into_iter()).unwrap_or(0.0..1.0);
     // Space for the value behind the longest bar, and before a negative bar.
     let span = range.end - range.start;
-    let axis = if range.start < 0.0 { range.start - 0.04 * span } else { 0.0 }..range.end + 0.14 * span;
+    let axis = if range.start < 0.0 { range.start - 0.04 * span } else { 0.0 }..range.end + 0.19 * span;
     let rows = bars.len().min(MAX_BARS);
-    let size = (SIZE.0, canvas::TOP + 62 + ROW * rows as u32);
-    canvas::draw(size, |sheet| {
+    let legend = Legend::new(vec![(Key::Note, note.to_owned())]);
+    let looks = looks(bars[..rows].iter().map(|bar| bar.name.as_str()));
+    let size = (WIDTH, TOP + BOTTOM + 6 + ROW * rows as u32 + legend.height());
+    let means: Vec<String> = bars[..rows].iter().map(|bar| format!("{} {}", bar.name, value(bar.mean))).collect();
+    let words = Words { title, description: format!("{value_label}: {}. {note}", means.join("; ")) };
+    canvas::draw(size, &words, |sheet| {
         canvas::heading(sheet, title)?;
         // Bar i is at y = -i, so that the first is on top.
-        let mut plot = canvas::axes(sheet, [axis, 0.5 - rows as f64..0.5], [value_label, ""], (NAMES, 24))?;
-        let left = 12 + NAMES as i32;
+        let ranges = [axis, 0.5 - rows as f64..0.5];
+        let axes = Axes { ranges, names: [value_label, ""], x_ticks: None, left: NAMES, right: 16, below: legend.height() };
+        let mut plot = canvas::axes(sheet, axes)?;
+        let left = 10 + NAMES as i32;
         for (i, bar) in bars[..rows].iter().enumerate() {
             let at = -(i as f64);
             let row = plot.backend_coord(&(0.0, at)).1;
-            sheet.draw(&Text::new(shorten(&bar.name, 26), (left - 10, row), text(15, INK, HPos::Right, VPos::Center)))?;
+            let name = fitting(&bar.name, NAMES as i32 - 4, TEXT);
+            sheet.draw(&Text::new(name, (left - 8, row), text(TEXT, INK, HPos::Right, VPos::Center)))?;
             if !drawable(bar.mean) {
                 continue;
             }
-            plot.draw_series([Rectangle::new([(0.0, at - 0.3), (bar.mean, at + 0.3)], colour(i).mix(0.75).filled())])?;
+            plot.draw_series([Rectangle::new([(0.0, at - 0.3), (bar.mean, at + 0.3)], looks[i].colour().mix(0.75).filled())])?;
             let interval = [bar.low.min(bar.high), bar.low.max(bar.high)];
             let known = interval.iter().all(|&x| drawable(x));
             if known {
@@ -45,10 +54,10 @@ pub fn bars(title: &str, value_label: &str, bars: &[Bar]) -> String {
             }
             let end = if known { bar.mean.max(interval[1]) } else { bar.mean }.max(0.0);
             let behind = plot.backend_coord(&(end, at)).0 + 9;
-            sheet.draw(&Text::new(value(bar.mean), (behind, row), text(15, INK, HPos::Left, VPos::Center)))?;
+            sheet.draw(&Text::new(value(bar.mean), (behind, row), text(TEXT, INK, HPos::Left, VPos::Center)))?;
         }
         plot.draw_series([PathElement::new([(0.0, 0.5 - rows as f64), (0.0, 0.5)], INK)])?;
-        Ok(())
+        legend.draw(sheet)
     })
 }
 

@@ -22,8 +22,12 @@ pub struct Chart {
     pub x: String,
     /// Label of the y axis, with the unit.
     pub y: String,
-    /// The curves; their order fixes their colours.
+    /// The curves. Names of algorithms and baselines fix their colours.
     pub series: Vec<Series>,
+    /// Values that do not depend on x, drawn as horizontal lines.
+    pub levels: Vec<(String, f64)>,
+    /// What bands, bars and levels are, as a sentence below the legend.
+    pub note: String,
     /// Draws a marker at every point, and bands as error bars: for few x values.
     pub markers: bool,
 }

@@ -4,26 +4,39 @@ use std::ops::Range;
 
 use plotters::prelude::*;
 
-use super::canvas::{self, Drawn, Key, Plot, SIDE, SIZE, colour, dashed};
+use super::canvas::{self, Axes, Drawn, HEIGHT, Key, Legend, Plot, Sheet, WIDTH, Words};
 use super::data::{Chart, Series};
+use super::palette::{Look, looks};
 use super::scale::{drawable, extent, value_axis};
+
+/// Most different x values that are ticks of a chart with markers.
+const MAX_TICKS: usize = 8;
 
 /// Curves with bands, or with markers and error bars, as SVG.
 pub fn lines(chart: &Chart) -> String {
     let all = || chart.series.iter().flat_map(|s| drawable_points(&s.points));
     let bands = chart.series.iter().flat_map(drawable_pieces).flatten().filter_map(|(_, band)| band).flatten();
-    let (Some(x), Some(y)) = (extent(all().map(|p| p[0])), extent(all().map(|p| p[1]).chain(bands))) else {
-        return canvas::no_data(SIZE, &chart.title);
+    let levels = chart.levels.iter().map(|(_, value)| *value);
+    let (Some(x), Some(y)) = (extent(all().map(|p| p[0])), extent(all().map(|p| p[1]).chain(bands).chain(levels))) else {
+        return canvas::no_data((WIDTH, HEIGHT), &chart.title);
     };
-    // Markers do not touch the frame.
-    let x = if chart.markers { with_margin(&x) } else { x };
-    plot(chart, [x, value_axis(&y)])
+    // With few x values, such as numbers of UAVs, exactly these are ticks. Markers do not touch the frame.
+    let (x, ticks) = if chart.markers { (with_margin(&x), own_ticks(all().map(|p| p[0]).collect(), &x)) } else { (x, None) };
+    plot(chart, [x, value_axis(&y)], ticks)
+}
+
+/// The x values themselves, if they are few and far enough from each other for their labels.
+fn own_ticks(mut values: Vec<f64>, x: &Range<f64>) -> Option<Vec<f64>> {
+    values.sort_by(f64::total_cmp);
+    values.dedup();
+    let apart = values.windows(2).all(|pair| pair[1] - pair[0] >= 0.09 * (x.end - x.start));
+    (values.len() <= MAX_TICKS && apart).then_some(values)
 }
 
 /// The empirical distribution of each series as SVG: the share of its values that are at most x.
 pub fn distribution(title: &str, x: &str, series: &[(String, Vec<f64>)]) -> String {
     let Some(range) = extent(series.iter().flat_map(|(_, values)| values.iter().copied())) else {
-        return canvas::no_data(SIZE, title);
+        return canvas::no_data((WIDTH, HEIGHT), title);
     };
     let axis = value_axis(&range);
     let curves = series.iter().map(|(name, values)| {
@@ -38,34 +51,58 @@ pub fn distribution(title: &str, x: &str, series: &[(String, Vec<f64>)]) -> Stri
         x: x.to_owned(),
         y: "share of layouts at or below".to_owned(),
         series: curves.collect(),
-        markers: false,
+        ..Chart::default()
     };
-    plot(&chart, [axis, 0.0..1.02])
+    plot(&chart, [axis, 0.0..1.02], None)
 }
 
-fn plot(chart: &Chart, ranges: [Range<f64>; 2]) -> String {
-    canvas::draw(SIZE, |sheet| {
+fn plot(chart: &Chart, ranges: [Range<f64>; 2], x_ticks: Option<Vec<f64>>) -> String {
+    let names = chart.series.iter().map(|s| s.name.as_str()).chain(chart.levels.iter().map(|(name, _)| name.as_str()));
+    let looks = looks(names);
+    let (of_series, of_levels) = looks.split_at(chart.series.len());
+    let mut entries: Vec<_> =
+        chart.series.iter().zip(of_series).map(|(s, look)| (Key::Line(*look, chart.markers), s.name.clone())).collect();
+    entries.extend(chart.levels.iter().zip(of_levels).map(|((name, _), look)| (Key::Line(*look, false), name.clone())));
+    entries.push((Key::Note, chart.note.clone()));
+    let legend = Legend::new(entries);
+    let words = Words { title: &chart.title, description: description(chart) };
+    canvas::draw((WIDTH, HEIGHT + legend.height()), &words, |sheet| {
         canvas::heading(sheet, &chart.title)?;
-        let mut plot = canvas::axes(sheet, ranges, [&chart.x, &chart.y], (54, SIDE))?;
-        for (i, series) in chart.series.iter().enumerate() {
-            intervals(&mut plot, i, series, chart.markers)?;
+        let x = ranges[0].clone();
+        let axes = Axes { ranges, names: [&chart.x, &chart.y], x_ticks, left: 58, right: 16, below: legend.height() };
+        let mut plot = canvas::axes(sheet, axes)?;
+        for (series, look) in chart.series.iter().zip(of_series) {
+            intervals(&mut plot, *look, series, chart.markers)?;
+        }
+        for ((_, value), look) in chart.levels.iter().zip(of_levels).filter(|((_, value), _)| drawable(*value)) {
+            stroke(&mut plot, *look, &[(x.start, *value), (x.end, *value)])?;
         }
         // Curves are drawn over all bands.
-        for (i, series) in chart.series.iter().enumerate() {
-            curve(&mut plot, i, series, chart.markers)?;
+        for (series, look) in chart.series.iter().zip(of_series) {
+            curve(&mut plot, sheet, (*look, chart.markers), series)?;
         }
-        let entries: Vec<_> =
-            chart.series.iter().enumerate().map(|(i, s)| (Key::Line(i, chart.markers), s.name.clone())).collect();
-        canvas::legend(sheet, &entries)
+        legend.draw(sheet)
     })
 }
 
-/// The intervals of series `i`, as areas or error bars.
-fn intervals(plot: &mut Plot, i: usize, series: &Series, bars: bool) -> Drawn {
+/// What the plot shows, in words.
+fn description(chart: &Chart) -> String {
+    let ends = |s: &Series| match (s.points.first(), s.points.last()) {
+        (Some(first), Some(last)) => format!("{} from {:.2} to {:.2}", s.name, first[1], last[1]),
+        _ => format!("{} without data", s.name),
+    };
+    let levels = chart.levels.iter().map(|(name, value)| format!("{name} at {value:.2}"));
+    let all: Vec<String> = chart.series.iter().map(ends).chain(levels).collect();
+    let end = if chart.note.is_empty() { String::new() } else { format!(" {}", chart.note) };
+    format!("{} against {}: {}.{end}", chart.y, chart.x, all.join("; "))
+}
+
+/// The intervals of a series, as areas or error bars.
+fn intervals(plot: &mut Plot, look: Look, series: &Series, bars: bool) -> Drawn {
     for piece in drawable_pieces(series) {
         let banded: Vec<([f64; 2], [f64; 2])> = piece.into_iter().filter_map(|(p, band)| Some((p, band?))).collect();
         if bars {
-            let style = colour(i).stroke_width(2);
+            let style = look.colour().stroke_width(2);
             plot.draw_series(
                 banded.iter().map(|(p, b)| ErrorBar::new_vertical(p[0], b[0], p[1].clamp(b[0], b[1]), b[1], style, 8)),
             )?;
@@ -73,25 +110,33 @@ fn intervals(plot: &mut Plot, i: usize, series: &Series, bars: bool) -> Drawn {
             let upper = banded.iter().map(|(p, b)| (p[0], b[1]));
             let lower = banded.iter().rev().map(|(p, b)| (p[0], b[0]));
             let outline: Vec<(f64, f64)> = upper.chain(lower).collect();
-            plot.draw_series([Polygon::new(outline, colour(i).mix(0.18))])?;
+            plot.draw_series([Polygon::new(outline, look.colour().mix(0.18))])?;
         }
     }
     Ok(())
 }
 
-fn curve(plot: &mut Plot, i: usize, series: &Series, markers: bool) -> Drawn {
-    let style = colour(i).stroke_width(2);
+fn curve(plot: &mut Plot, sheet: &Sheet, (look, markers): (Look, bool), series: &Series) -> Drawn {
     for piece in drawable_pieces(series) {
-        let points = piece.iter().map(|(p, _)| (p[0], p[1]));
+        let points: Vec<(f64, f64)> = piece.iter().map(|(p, _)| (p[0], p[1])).collect();
+        stroke(plot, look, &points)?;
         if markers || piece.len() == 1 {
-            plot.draw_series(points.clone().map(|p| Circle::new(p, 4, colour(i).filled())))?;
-        }
-        if dashed(i) {
-            plot.draw_series(DashedLineSeries::new(points, 7, 4, style))?;
-        } else {
-            plot.draw_series(LineSeries::new(points, style))?;
+            for point in &points {
+                canvas::marker(sheet, look, plot.backend_coord(point))?;
+            }
         }
     }
+    Ok(())
+}
+
+fn stroke(plot: &mut Plot, look: Look, points: &[(f64, f64)]) -> Drawn {
+    let style = look.colour().stroke_width(2);
+    match look.dash {
+        Some((stroke, gap)) => {
+            plot.draw_series(DashedLineSeries::new(points.iter().copied(), stroke as u32, gap as u32, style))?
+        }
+        None => plot.draw_series(LineSeries::new(points.iter().copied(), style))?,
+    };
     Ok(())
 }
 

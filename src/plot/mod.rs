@@ -1,12 +1,14 @@
 //! Plots: data in, SVG text out. No files, no clock, no fonts of the machine: the same data gives the same bytes.
 //!
-//! Every plot has a white background, one colour per series that colour-blind readers can distinguish, and a legend beside it.
-//! Numbers that are not finite, or above 1e12, are left out. A plot without data says "no data".
+//! Every plot has the colours of `palette`, a legend below it that explains bands and bars, a title and a description for screen readers,
+//! and is dark on dark pages (docs/figures.md). Numbers that are not finite, or above 1e12, are left out. A plot without data says
+//! "no data".
 
 mod bars;
 mod canvas;
 mod data;
 mod lines;
+mod palette;
 mod scale;
 mod trajectories;
 

@@ -25,6 +25,17 @@ pub(super) fn value_axis(extent: &Range<f64>) -> Range<f64> {
     low..extent.end + margin
 }
 
+/// At most `count` round numbers in `range`: multiples of 1, 2 or 5 times a power of ten.
+pub(super) fn ticks(range: &Range<f64>, count: usize) -> Vec<f64> {
+    let span = range.end - range.start;
+    let least = span / count.max(1) as f64;
+    let power = 10f64.powf(least.log10().floor());
+    let step = [1.0, 2.0, 5.0, 10.0].map(|factor| factor * power).into_iter().find(|step| *step >= least * (1.0 - 1e-9));
+    let Some(step) = step.filter(|step| step.is_normal()) else { return vec![range.start] };
+    let (first, last) = ((range.start / step).ceil(), (range.end / step + 1e-9).floor());
+    (0..=count).map(|i| first + i as f64).take_while(|&i| i <= last).map(|i| i * step).collect()
+}
+
 /// The label of a tick: few digits, with k and M for thousands and millions.
 pub(super) fn tick(x: f64) -> String {
     let (scaled, unit) = match x.abs() {

@@ -4,14 +4,15 @@ use super::*;
 
 fn chart(points: Vec<[f64; 2]>, band: Option<Vec<[f64; 2]>>, markers: bool) -> Chart {
     let series = Series { name: "a <b> & \"c\"".into(), points, band };
-    Chart { title: "t <&>".into(), x: "x".into(), y: "AoI (slots)".into(), series: vec![series], markers }
+    Chart { title: "t <&>".into(), x: "x".into(), y: "AoI (slots)".into(), series: vec![series], markers, ..Chart::default() }
 }
 
 /// Every tag is closed and no text breaks out of its element.
 fn assert_well_formed(svg: &str) {
     assert!(svg.starts_with("<svg") && svg.trim_end().ends_with("</svg>"), "{svg}");
     assert_eq!(svg.matches("<text").count(), svg.matches("</text>").count());
-    assert!(!svg.contains("<b>") && !svg.contains("NaN") && !svg.contains("inf"), "{svg}");
+    assert!(!svg.contains("<b>") && !svg.contains("NaN") && !svg.contains("inf\""), "{svg}");
+    assert!(svg.contains(" role=\"img\"><title>") && svg.contains("</desc>"), "{svg}");
 }
 
 #[test]
@@ -29,8 +30,8 @@ fn plots_without_data_say_no_data() {
         lines(&Chart::default()),
         lines(&chart(Vec::new(), None, true)),
         lines(&chart(vec![[f64::NAN, 1.0], [1.0, f64::INFINITY]], None, false)),
-        bars("t", "y", &[]),
-        bars("t", "y", &[Bar { name: "a".into(), mean: f64::NAN, low: f64::NAN, high: f64::NAN }]),
+        bars("t", "y", "n", &[]),
+        bars("t", "y", "n", &[Bar { name: "a".into(), mean: f64::NAN, low: f64::NAN, high: f64::NAN }]),
         distribution("t", "x", &[("a".into(), Vec::new())]),
         distribution("t", "x", &[]),
         trajectories("t", &Trajectories::default()),
@@ -51,7 +52,7 @@ fn numbers_of_every_kind_give_well_formed_plots() {
                 let points = vec![[a, b], [b, a], [0.5, a], [a, a]];
                 assert_well_formed(&lines(&chart(points.clone(), Some(points), markers)));
             }
-            assert_well_formed(&bars("t", "y", &[Bar { name: "a".into(), mean: a, low: b, high: a }]));
+            assert_well_formed(&bars("t", "y", "n", &[Bar { name: "a".into(), mean: a, low: b, high: a }]));
             assert_well_formed(&distribution("t", "x", &[("a".into(), vec![a, b]), ("b".into(), vec![])]));
             let shown =
                 Trajectories { uavs: vec![vec![[a, b], [b, b], [0.0, a]], vec![]], users: vec![[a, a]], transmission_range: b };
@@ -78,6 +79,66 @@ fn a_distribution_is_a_curve_of_shares() {
 
 #[test]
 fn bars_show_their_values() {
-    let svg = bars("t", "y", &[Bar { name: "a".into(), mean: 4.937, low: 4.5, high: 5.5 }]);
+    let svg = bars("t", "y", "n", &[Bar { name: "a".into(), mean: 4.937, low: 4.5, high: 5.5 }]);
     assert!(svg.contains("4.94"), "{svg}");
+}
+
+/// The sizes of all texts, and the ends of the longest as far as they can be known without a font.
+fn texts(svg: &str) -> Vec<(f64, f64, String)> {
+    let elements = svg.split("<text ").skip(1).map(|rest| rest.split("</text>").next().unwrap_or_default());
+    let attribute = |element: &str, name: &str| {
+        let value = element.split(&format!("{name}=\"")).nth(1)?.split('"').next()?;
+        value.trim_end_matches("px").parse::<f64>().ok()
+    };
+    elements
+        .map(|e| (attribute(e, "font-size").unwrap(), attribute(e, "x").unwrap(), e.lines().nth(1).unwrap_or("").to_owned()))
+        .collect()
+}
+
+#[test]
+fn text_is_readable_in_a_column_of_a_paper() {
+    let many = (0..9).map(|i| Series {
+        name: format!("a policy with a long name, number {i}"),
+        points: vec![[0.0, f64::from(i)], [1e5, 2.0]],
+        band: None,
+    });
+    let chart = Chart {
+        title: "A title that is much longer than a figure is wide, so that it has to be shortened somewhere".into(),
+        note: "A note that explains the bands, and that is longer than a line of the figure is wide, so that it is broken."
+            .into(),
+        series: many.collect(),
+        levels: vec![("sweep on eval-v1".into(), 3.0)],
+        ..chart(Vec::new(), None, false)
+    };
+    let bar = Bar { name: "runs/2026-01-01/a-policy-with-a-long-name.safetensors".into(), mean: 4.0, low: 3.0, high: 5.0 };
+    let shown = Trajectories { uavs: vec![vec![[0.5; 2], [0.6; 2]]; 12], users: vec![[0.1, 0.2]; 3], transmission_range: 0.1 };
+    for svg in [lines(&chart), bars("t", "y", "n", &[bar]), trajectories("t", &shown)] {
+        assert_well_formed(&svg);
+        for (size, x, text) in texts(&svg) {
+            // 504 pixels in 3.5 inches, 72 points each, and the usual ratio of plotters between size and pixels.
+            assert!(size >= 14.0 / 1.24, "{text}: {size}");
+            assert!((0.0..504.0).contains(&x), "{text}");
+        }
+    }
+    assert!(lines(&chart).contains("more"));
+}
+
+#[test]
+fn ticks_are_at_whole_uavs() {
+    let series = Series { name: "Qedgix".into(), points: vec![[2.0, 9.0], [3.0, 6.0], [4.0, 5.0], [6.0, 3.0]], band: None };
+    let svg = lines(&Chart { series: vec![series], ..chart(Vec::new(), None, true) });
+    let labels: Vec<String> = texts(&svg).into_iter().map(|(_, _, text)| text.trim().to_owned()).collect();
+    for whole in ["2", "3", "4", "6"] {
+        assert!(labels.iter().any(|label| label == whole), "{labels:?}");
+    }
+    assert!(!labels.iter().any(|label| label == "2.5" || label == "5.5"), "{labels:?}");
+}
+
+#[test]
+fn ticks_are_round_and_few() {
+    assert_eq!(super::scale::ticks(&(0.0..80.0), 6), [0.0, 20.0, 40.0, 60.0, 80.0]);
+    for range in [0.0..1e-300, -1e12..1e12, 3.0..3.000001, 0.0..1.02] {
+        let ticks = super::scale::ticks(&range, 7);
+        assert!(ticks.len() <= 8 && !ticks.is_empty() && ticks.iter().all(|tick| tick.is_finite()), "{range:?}: {ticks:?}");
+    }
 }

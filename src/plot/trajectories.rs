@@ -3,23 +3,24 @@
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, VPos};
 
-use super::canvas::{self, Drawn, INK, Key, Plot, SIDE, Sheet, colour, text};
+use super::canvas::{self, Axes, BOTTOM, Drawn, INK, Key, Legend, Plot, QUIET, TEXT, WIDTH, Words, text};
 use super::data::Trajectories;
+use super::palette::Look;
 use super::scale::{drawable, extent};
 use crate::env::Point;
 
-/// Side of the plot in pixels; one scale for x and y.
-const PLOT: u32 = 490;
-/// Width and height in pixels, with title, legend and axes.
-const SIZE: (u32, u32) = (12 + AXIS + PLOT + SIDE, canvas::TOP + PLOT + 46 + 8);
 /// Width of the y axis in pixels.
-const AXIS: u32 = 54;
+const AXIS: u32 = 58;
+/// Side of the plot in pixels; one scale for x and y.
+const PLOT: u32 = WIDTH - 10 - AXIS - 16;
+/// Width and height in pixels, without the legend.
+const SIZE: (u32, u32) = (WIDTH, canvas::TOP + PLOT + BOTTOM + 6);
 /// Slots between two arrows.
 const ARROW_INTERVAL: usize = 4;
 /// Users are numbered if there are at most this many.
 const MAX_NUMBERED: usize = 60;
-const USER: RGBColor = RGBColor(0x55, 0x55, 0x55);
-const START: RGBColor = RGBColor(0x22, 0x22, 0x22);
+const USER: RGBColor = QUIET;
+const START: RGBColor = INK;
 
 /// Users, circles and paths as SVG, over the unit square and the area around it that UAVs reached.
 pub fn trajectories(title: &str, shown: &Trajectories) -> String {
@@ -35,15 +36,19 @@ pub fn trajectories(title: &str, shown: &Trajectories) -> String {
     let range = range.start - margin..range.end + margin;
     let scale = f64::from(PLOT) / (range.end - range.start);
     let circle = if shown.transmission_range > 0.0 { (shown.transmission_range * scale).min(4e3) as i32 } else { 0 };
-    canvas::draw(SIZE, |sheet| {
+    let legend = Legend::new(entries(paths.len()));
+    let words =
+        Words { title, description: format!("The paths of {} UAVs over {} users, from above.", paths.len(), users.len()) };
+    canvas::draw((SIZE.0, SIZE.1 + legend.height()), &words, |sheet| {
         canvas::heading(sheet, title)?;
         let names = ["x (sides of the square)", "y (sides of the square)"];
-        let mut plot = canvas::axes(sheet, [range.clone(), range.clone()], names, (AXIS, SIDE))?;
-        let area = plot.plotting_area().clone();
-        area.draw(&Rectangle::new([(0.0, 0.0), (1.0, 1.0)], INK.mix(0.6)))?;
+        let ranges = [range.clone(), range.clone()];
+        let axes = Axes { ranges, names, x_ticks: None, left: AXIS, right: 16, below: legend.height() };
+        let mut plot = canvas::axes(sheet, axes)?;
+        plot.plotting_area().draw(&Rectangle::new([(0.0, 0.0), (1.0, 1.0)], INK.mix(0.6)))?;
         for (_, [x, y]) in &users {
-            area.draw(&Circle::new((*x, *y), circle, USER.mix(0.07).filled()))?;
-            area.draw(&Circle::new((*x, *y), circle, USER.mix(0.45)))?;
+            plot.plotting_area().draw(&Circle::new((*x, *y), circle, USER.mix(0.07).filled()))?;
+            plot.plotting_area().draw(&Circle::new((*x, *y), circle, USER.mix(0.45)))?;
         }
         for (i, path) in paths.iter().enumerate() {
             let line = colour(i).mix(0.75).stroke_width(2);
@@ -51,20 +56,20 @@ pub fn trajectories(title: &str, shown: &Trajectories) -> String {
             arrows(&mut plot, i, path, 6.0 / scale)?;
         }
         for (number, [x, y]) in &users {
-            area.draw(&Circle::new((*x, *y), 5, USER.filled()))?;
+            plot.plotting_area().draw(&Circle::new((*x, *y), 5, USER.filled()))?;
             if users.len() <= MAX_NUMBERED {
-                let label =
-                    EmptyElement::at((*x, *y)) + Text::new(number.to_string(), (8, -10), text(15, INK, HPos::Left, VPos::Center));
-                area.draw(&label)?;
+                let label = EmptyElement::at((*x, *y))
+                    + Text::new(number.to_string(), (8, -10), text(TEXT, INK, HPos::Left, VPos::Center));
+                plot.plotting_area().draw(&label)?;
             }
         }
         for (i, path) in paths.iter().enumerate() {
             let (Some(first), Some(last)) = (path.first(), path.last()) else { continue };
-            area.draw(&Circle::new((first[0], first[1]), 7, START.stroke_width(2)))?;
-            area.draw(&Circle::new((last[0], last[1]), 7, WHITE.filled()))?;
-            area.draw(&Circle::new((last[0], last[1]), 5, colour(i).filled()))?;
+            plot.plotting_area().draw(&Circle::new((first[0], first[1]), 7, START.stroke_width(2)))?;
+            plot.plotting_area().draw(&Circle::new((last[0], last[1]), 7, WHITE.filled()))?;
+            plot.plotting_area().draw(&Circle::new((last[0], last[1]), 5, colour(i).filled()))?;
         }
-        draw_legend(sheet, paths.len())
+        legend.draw(sheet)
     })
 }
 
@@ -86,14 +91,20 @@ fn arrows(plot: &mut Plot, i: usize, path: &[Point], size: f64) -> Drawn {
     Ok(())
 }
 
-fn draw_legend(sheet: &Sheet, uavs: usize) -> Drawn {
+fn entries(uavs: usize) -> Vec<(Key, String)> {
     let mut entries = vec![
         (Key::Ring(START, 7), "start".to_owned()),
         (Key::Dot(USER, 5), "user".to_owned()),
-        (Key::Ring(USER, 9), "collects within".to_owned()),
+        (Key::Ring(USER, 9), "collected within".to_owned()),
     ];
-    entries.extend((0..uavs).map(|i| (Key::Line(i, true), format!("UAV {i}, ends at dot"))));
-    canvas::legend(sheet, &entries)
+    entries.extend((0..uavs).map(|i| (Key::Line(Look::of_index(i), true), format!("UAV {i}"))));
+    entries.push((Key::Note, "Arrows point along the flight, every fourth slot; a path ends at its dot.".to_owned()));
+    entries
+}
+
+/// The colour of UAV `i`.
+fn colour(i: usize) -> RGBColor {
+    Look::of_index(i).colour()
 }
 
 fn visible(p: &Point) -> bool {

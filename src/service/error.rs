@@ -14,12 +14,14 @@ pub enum Error {
     #[error(transparent)]
     Invalid(#[from] Invalid),
     /// The resource does not exist.
-    #[error("no {what} {id:?}")]
+    #[error("no {what} {id:?}{}", near.as_ref().map_or_else(String::new, |near| format!("; did you mean {near}?")))]
     NotFound {
         /// `policy`, `session`, `job`, ...
         what: &'static str,
         /// The name or id requested.
         id: String,
+        /// An existing name that is similar.
+        near: Option<String>,
     },
     /// The resource is in a state that does not allow the operation.
     #[error("{message}")]
@@ -139,7 +141,7 @@ impl Error {
 
     /// There is no `what` with this `id`.
     pub fn not_found(what: &'static str, id: impl Into<String>) -> Self {
-        Self::NotFound { what, id: id.into() }
+        Self::NotFound { what, id: id.into(), near: None }
     }
 }
 

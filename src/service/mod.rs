@@ -78,7 +78,7 @@ impl From<crate::serving::Error> for Error {
         use crate::serving::Error as E;
         match error {
             E::Invalid(e) => Self::Invalid(e),
-            E::NotFound { what, id } => Self::NotFound { what, id },
+            E::NotFound { what, id, near } => Self::NotFound { what, id, near },
             E::Precondition { code, message } => Self::Precondition { code, message },
             E::Conflict(message) => Self::Conflict { code: ErrorCode::AlreadyExists, message },
             E::Busy(message) => Self::busy(message),

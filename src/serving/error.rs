@@ -10,12 +10,14 @@ pub enum Error {
     #[error(transparent)]
     Invalid(#[from] Invalid),
     /// The resource does not exist and did not expire recently.
-    #[error("no {what} {id:?}")]
+    #[error("no {what} {id:?}{}", near.as_ref().map_or_else(String::new, |near| format!("; did you mean {near}?")))]
     NotFound {
         /// `policy`, `session`, ...
         what: &'static str,
         /// The name requested.
         id: String,
+        /// An existing name that is similar.
+        near: Option<String>,
     },
     /// The resource is in a state that does not allow the operation.
     #[error("{message}")]
@@ -42,7 +44,7 @@ pub enum Error {
 impl Error {
     /// There is no `what` with this `id`.
     pub fn not_found(what: &'static str, id: impl Into<String>) -> Self {
-        Self::NotFound { what, id: id.into() }
+        Self::NotFound { what, id: id.into(), near: None }
     }
 
     /// The resource is in a state that does not allow the operation.

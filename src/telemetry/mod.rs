@@ -27,6 +27,11 @@ pub struct LogConfig {
     pub access: bool,
 }
 
+/// Whether logs have colours: on a terminal, unless NO_COLOR is set (no-color.org).
+fn coloured() -> bool {
+    std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
+}
+
 /// Writes logs to standard error, filtered by `QEDGIX_LOG` (default: `info`), and request spans to `traces`.
 /// Further calls have no effect.
 pub fn init_logs(config: LogConfig, traces: Option<&TraceExporter>) {
@@ -39,7 +44,7 @@ pub fn init_logs(config: LogConfig, traces: Option<&TraceExporter>) {
     let lines: Box<dyn Layer<Registry> + Send + Sync> = if config.json {
         lines.json().with_span_list(false).boxed()
     } else {
-        lines.with_ansi(std::io::stderr().is_terminal()).fmt_fields(text_format::TextFields).boxed()
+        lines.with_ansi(coloured()).fmt_fields(text_format::TextFields).boxed()
     };
     let installed = match traces {
         // One filter for the whole subscriber makes disabled log statements cheapest.

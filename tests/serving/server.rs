@@ -177,8 +177,9 @@ fn the_binary_prints_its_addresses_and_drains_on_sigterm() {
     let mut stdout = std::io::BufReader::new(first.0.stdout.take().unwrap()).lines().map(Result::unwrap);
     assert!(stdout.next().unwrap().starts_with("qedgix "));
     let grpc = stdout.next().unwrap();
-    assert!(grpc.starts_with("gRPC  127.0.0.1:") && !grpc.ends_with(":0"), "{grpc}");
-    assert!(stdout.next().unwrap().starts_with("REST  http://127.0.0.1:"));
+    assert!(grpc.starts_with("gRPC       127.0.0.1:") && !grpc.ends_with(":0"), "{grpc}");
+    assert!(stdout.next().unwrap().starts_with("REST       http://127.0.0.1:"));
+    assert!(stdout.next().unwrap().starts_with("dashboard  http://127.0.0.1:"));
 
     let (code, text) = Process::start(dir.path(), &[]).ended();
     assert_eq!(code, Some(1));

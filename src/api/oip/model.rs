@@ -48,7 +48,7 @@ pub(super) fn policy_spec(name: &str, version: &str) -> Result<PolicySpec, Inval
 /// The error of a policy as the error of a model.
 pub(super) fn model_error(error: Error) -> Error {
     match error {
-        Error::NotFound { what: "policy", id } => Error::NotFound { what: "model", id },
+        Error::NotFound { what: "policy", id, near } => Error::NotFound { what: "model", id, near },
         Error::Invalid(e) if e.field == "policy" => Invalid { field: "model_name".into(), ..e }.into(),
         other => other,
     }
@@ -176,7 +176,7 @@ fn check_repository(name: &str) -> Result<(), Invalid> {
 
 fn repository_error(error: Error) -> Error {
     match error {
-        Error::NotFound { what: "policy", id } => Error::NotFound { what: "model", id },
+        Error::NotFound { what: "policy", id, near } => Error::NotFound { what: "model", id, near },
         other => other,
     }
 }

@@ -257,6 +257,7 @@ fn group_table(metric: &str, fields: &[String], groups: &[Group]) -> String {
 
 /// The mean curve of each group over the steps that all its seeds reached.
 fn chart(metric: &str, groups: &[Group]) -> Chart {
+    let several = groups.iter().any(|group| group.curves.len() > 1);
     let series = groups.iter().map(|group| {
         let by_step: Vec<BTreeMap<u64, f64>> =
             group.curves.iter().map(|curve| curve.iter().map(|point| (point[0] as u64, point[1])).collect()).collect();
@@ -276,9 +277,10 @@ fn chart(metric: &str, groups: &[Group]) -> Chart {
     Chart {
         title: metric.to_owned(),
         x: "environment steps".to_owned(),
-        y: format!("{metric}{unit}: mean, smallest and largest"),
+        y: format!("{metric}{unit}"),
         series: series.collect(),
-        markers: false,
+        note: if several { "Means over seeds, bands from the smallest to the largest.".to_owned() } else { String::new() },
+        ..Chart::default()
     }
 }
 

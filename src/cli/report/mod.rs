@@ -29,6 +29,9 @@ pub fn write(directory: &Path, comparison: &Comparison, command: &str) -> anyhow
     Ok(())
 }
 
+/// What the error bars of a report are.
+const INTERVALS: &str = "Bars: 95 % intervals over layouts.";
+
 fn page(comparison: &Comparison, command: &str) -> anyhow::Result<ReportPage> {
     let evaluations = comparison.best_first();
     let mut sections = vec![conditions(comparison), policies(&evaluations)];
@@ -90,7 +93,7 @@ fn policies(evaluations: &[&PolicyEvaluation]) -> ReportSection {
         plots: vec![ReportPlot {
             file: "means.svg".to_owned(),
             caption: "Mean AoI with its 95 % interval.".to_owned(),
-            svg: plot::bars("Mean AoI", "mean AoI (slots)", &bars),
+            svg: plot::bars("Mean AoI", "mean AoI (slots)", INTERVALS, &bars),
         }],
     }
 }
@@ -114,7 +117,7 @@ fn gaps(name: &str, gaps: &[Pair]) -> Option<ReportSection> {
         plots: vec![ReportPlot {
             file: format!("gap-{name}.svg"),
             caption: format!("Gap to {name} with its 95 % interval."),
-            svg: plot::bars(&format!("Gap to {name}"), &format!("mean AoI minus that of {name} (slots)"), &bars),
+            svg: plot::bars(&format!("Gap to {name}"), &format!("mean AoI minus that of {name} (slots)"), INTERVALS, &bars),
         }],
     })
 }
@@ -144,7 +147,7 @@ fn over_slots(evaluations: &[&PolicyEvaluation]) -> ReportSection {
         x: "slot".to_owned(),
         y: "mean AoI (slots)".to_owned(),
         series: series.collect(),
-        markers: false,
+        ..Chart::default()
     };
     ReportSection {
         title: "Over slots".to_owned(),

@@ -33,23 +33,26 @@ pub(super) struct ReportPlot {
 }
 
 const STYLE: &str = "
-:root { color-scheme: light; }
-body { margin: 0 auto; max-width: 94rem; padding: 2rem 1.5rem 4rem; background: #fff; color: #222;
+:root { color-scheme: light dark; --paper: #fff; --ink: #222; --line: #e4e4e4; --quiet: #666; --code: #f6f6f6; }
+@media (prefers-color-scheme: dark) {
+  :root { --paper: #15181c; --ink: #e6e6e6; --line: #31363d; --quiet: #9aa0a8; --code: #1f242a; }
+}
+body { margin: 0 auto; max-width: 94rem; padding: 2rem 1.5rem 4rem; background: var(--paper); color: var(--ink);
   font: 16px/1.5 system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif; }
 h1 { font-size: 1.8rem; margin: 0 0 1rem; }
-h2 { font-size: 1.25rem; margin: 2.5rem 0 .5rem; padding-top: 1rem; border-top: 1px solid #e4e4e4; }
+h2 { font-size: 1.25rem; margin: 2.5rem 0 .5rem; padding-top: 1rem; border-top: 1px solid var(--line); }
 p { max-width: 48rem; margin: .5rem 0 1rem; }
-pre { background: #f6f6f6; padding: .7rem 1rem; border-radius: 6px; white-space: pre-wrap; overflow-wrap: anywhere; }
+pre { background: var(--code); padding: .7rem 1rem; border-radius: 6px; white-space: pre-wrap; overflow-wrap: anywhere; }
 .wide { overflow-x: auto; max-width: 100%; }
 table { border-collapse: collapse; margin: 0 0 1.2rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .35rem .9rem; text-align: left; border-bottom: 1px solid #e4e4e4; min-width: 4.5rem; overflow-wrap: anywhere; }
-th { border-bottom: 2px solid #999; font-weight: 600; }
+th, td { padding: .35rem .9rem; text-align: left; border-bottom: 1px solid var(--line); min-width: 4.5rem; overflow-wrap: anywhere; }
+th { border-bottom: 2px solid var(--quiet); font-weight: 600; }
 .n { text-align: right; white-space: nowrap; }
 .row { display: flex; flex-wrap: wrap; gap: 1rem 2rem; align-items: flex-start; }
 figure { margin: 0; max-width: 100%; }
 figure svg { max-width: 100%; height: auto; display: block; }
-figcaption { color: #555; font-size: .9rem; padding-left: 1rem; overflow-wrap: anywhere; }
-footer { margin-top: 3rem; color: #777; font-size: .9rem; }
+figcaption { color: var(--quiet); font-size: .9rem; padding-left: 1rem; overflow-wrap: anywhere; }
+footer { margin-top: 3rem; color: var(--quiet); font-size: .9rem; }
 ";
 
 /// The report as HTML.

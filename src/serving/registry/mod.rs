@@ -22,6 +22,7 @@ pub use self::policy::{LoadedPolicy, PolicyInfo, PolicyKind};
 use super::bundled::is_bundled;
 use super::{Error, PolicyRef, PolicySpec, VersionSelector};
 use crate::error_code::ErrorCode;
+use crate::invalid::nearest;
 
 /// The version that a request names.
 #[derive(Clone, Debug)]
@@ -159,6 +160,16 @@ impl Default for Registry {
         Self::new(DEFAULT_MEMORY)
     }
 }
+
+/// The error about a policy that `spec` does not resolve to, with an existing name that is similar.
+fn not_found(entries: &Entries, spec: &PolicySpec) -> Error {
+    let known = entries.keys().take(MAX_COMPARED).map(String::as_str);
+    let near = if entries.contains_key(&spec.name) { None } else { nearest(&spec.name, known) };
+    Error::NotFound { what: "policy", id: spec.to_string(), near: near.map(str::to_owned) }
+}
+
+/// Maximum number of names that an unknown one is compared with.
+const MAX_COMPARED: usize = 256;
 
 impl Registry {
     /// An empty registry that keeps versions of together `memory` bytes in memory.
@@ -334,7 +345,7 @@ impl Registry {
     pub fn resolve(&self, spec: &PolicySpec) -> Result<Resolved, Error> {
         let entries = self.read();
         let found = entries.get(&spec.name).and_then(|entry| entry.resolve(&spec.version));
-        found.ok_or_else(|| Error::not_found("policy", spec.to_string()))?.resolve(&self.memory)
+        found.ok_or_else(|| not_found(&entries, spec))?.resolve(&self.memory)
     }
 
     /// Finds the version with this digest, so that an episode stays on the version that it began with. If `spec` has a version
@@ -345,7 +356,7 @@ impl Registry {
     pub fn find_by_digest(&self, spec: &PolicySpec, digest: &[u8; 32]) -> Result<Option<Resolved>, Error> {
         let entries = self.read();
         let found = entries.get(&spec.name).and_then(|entry| Some((entry, entry.resolve(&spec.version)?)));
-        let (entry, current) = found.ok_or_else(|| Error::not_found("policy", spec.to_string()))?;
+        let (entry, current) = found.ok_or_else(|| not_found(&entries, spec))?;
         let found = if current.reference.digest == *digest {
             Some(current)
         } else if matches!(spec.version, VersionSelector::Version(_)) {
@@ -370,7 +381,7 @@ impl Registry {
     pub fn describe(&self, spec: &PolicySpec) -> Result<VersionDetails, Error> {
         let entries = self.read();
         let found = entries.get(&spec.name).and_then(|entry| Some(entry.describe(entry.resolve(&spec.version)?)));
-        found.ok_or_else(|| Error::not_found("policy", spec.to_string()))
+        found.ok_or_else(|| not_found(&entries, spec))
     }
 
     /// Aliases of `name`, with the versions that they point to.
