@@ -94,7 +94,10 @@ pub(super) fn looks<'a>(names: impl IntoIterator<Item = &'a str>) -> Vec<Look> {
     let mut free = (0..TONES.len()).filter(|place| !taken.contains(place)).cycle();
     let mut seen = [0; PLACES.len()];
     let look = |known: Option<usize>| {
-        let Some(known) = known else { return Look { place: free.next().unwrap_or(0), ..Look::of_repetition(0) } };
+        let Some(known) = known else {
+            // With every hue taken, dots tell it from the algorithm of the first.
+            return free.next().map_or(Look::of_repetition(2), |place| Look { place, ..Look::of_repetition(0) });
+        };
         let look = Look { place: PLACES[known].1, ..Look::of_repetition(seen[known]) };
         seen[known] += 1;
         if known < ALGORITHMS { look } else { Look { dash: Some((5, 4)), marker: Marker::Square, ..look } }
