@@ -12,6 +12,7 @@ pub mod keys;
 pub mod operations;
 mod paging;
 pub mod policies;
+pub mod progress;
 pub mod sessions;
 mod watch_limit;
 pub mod worker;

@@ -7,8 +7,9 @@ use super::response::timestamp;
 use super::structs::to_struct;
 use crate::invalid::Invalid;
 use crate::jobs::Directive;
-use crate::service::events::{Progress, WatchedEvent};
+use crate::service::events::WatchedEvent;
 use crate::service::jobs::{JobView, ListRequest, Waiting};
+use crate::service::progress::Progress;
 use crate::store::{
     Attempt, Checkpoint, CheckpointKind, JobEventKind, JobKind, JobSpec, JobState, Metric, MetricRow, MetricSummary,
     NewCheckpoint, PublishRule, StoredSpec, WorkerResult,

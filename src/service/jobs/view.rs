@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 
 use jiff::Timestamp;
 
-use crate::service::events::{Progress, SPEED};
+use crate::service::progress::{Progress, SPEED};
 use crate::service::{App, Error};
 use crate::store::{Job, JobSpec, JobState, ListedJob, MetricSummary, UnreadableSpec};
 

@@ -10,8 +10,8 @@ use uuid::Uuid;
 
 use super::request::{EarlyStop, optional_kind};
 use crate::env::EnvConfig;
-use crate::service::events;
 use crate::service::jobs::{self, JobView};
+use crate::service::progress;
 use crate::store::{self, AttemptOutcome, CheckpointKind, InitKind, JobId, JobState, PendingAction, StoredSpec};
 use crate::train_config::{Algorithm, Preset, Training};
 
@@ -138,10 +138,10 @@ pub(in crate::api::rest) struct Progress {
     seconds_left: Option<f64>,
 }
 
-impl From<events::Progress> for Progress {
-    fn from(progress: events::Progress) -> Self {
+impl From<progress::Progress> for Progress {
+    fn from(progress: progress::Progress) -> Self {
         let seconds_left = progress.seconds_left();
-        let events::Progress { step, steps, steps_per_second } = progress;
+        let progress::Progress { step, steps, steps_per_second } = progress;
         Self { step, steps, steps_per_second, seconds_left }
     }
 }
