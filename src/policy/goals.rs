@@ -11,8 +11,12 @@ use crate::env::Point;
 
 /// Number of features of a goal.
 pub const FEATURES: usize = 16;
+/// A UAV that remembers more users considers these many as goals: those that promise the highest AoI per slot of flight.
+pub const MAX_USERS: usize = 64;
 /// Blocks of ground along each side of the square. Each block that is not searched is a goal.
 const BLOCKS: usize = 5;
+/// Maximum number of goals in the ground.
+pub const MAX_BLOCKS: usize = BLOCKS * BLOCKS;
 /// Cells along each side of a block.
 const SIDE: usize = GRID / BLOCKS;
 
@@ -99,6 +103,7 @@ impl Goals {
             ground.unsearched as f64 * CELL_SHARE,
             ln1(users.len() as f64 / view.uavs as f64),
         ];
+        view.keep_best(&mut users);
         for (j, user) in users.iter().enumerate() {
             let goal = view.user(user, &users, j);
             self.push(view, user.position, goal, common, others.clone());
@@ -152,6 +157,27 @@ struct View<'a> {
 }
 
 impl View<'_> {
+    /// Keeps the [`MAX_USERS`] users that promise most, in their order.
+    fn keep_best(&self, users: &mut Vec<RememberedUser>) {
+        if users.len() <= MAX_USERS {
+            return;
+        }
+        let mut rates: Vec<(f64, usize)> = users.iter().enumerate().map(|(j, user)| (self.rate(user), j)).collect();
+        rates.select_nth_unstable_by(MAX_USERS, |a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+        let mut best: Vec<usize> = rates[..MAX_USERS].iter().map(|&(_, j)| j).collect();
+        best.sort_unstable();
+        for (place, &j) in best.iter().enumerate() {
+            users[place] = users[j];
+        }
+        users.truncate(MAX_USERS);
+    }
+
+    /// AoI of a user when the UAV can be there, per slot of that flight.
+    fn rate(&self, user: &RememberedUser) -> f64 {
+        let slots = travel_slots(self.env, self.at, user.position, self.env.transmission_range);
+        (self.slot - f64::from(user.collected) + slots) / slots
+    }
+
     /// Features of user `j` of the remembered users.
     fn user(&self, user: &RememberedUser, users: &[RememberedUser], j: usize) -> [f64; 7] {
         let range = self.env.transmission_range;
@@ -215,5 +241,29 @@ impl Ground {
         let near = |p: &Point| (p[0] - to[0]).powi(2) + (p[1] - to[1]).powi(2) <= range * range;
         let cells: u32 = self.centers.iter().zip(&self.blocks).map(|(center, cells)| if near(center) { *cells } else { 0 }).sum();
         f64::from(cells)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::FleetGraph;
+    use super::super::memory::{memories, uav_memory_len};
+    use super::*;
+
+    #[test]
+    fn of_many_users_the_most_promising_are_goals() {
+        let (env, users) = (EnvParams::default(), 3 * MAX_USERS);
+        // All at one place, with ages that only the last ones exceed.
+        let mut memory = vec![0.0; uav_memory_len(users)];
+        for (j, user) in memory[GRID..].chunks_exact_mut(5).enumerate() {
+            user.copy_from_slice(&[1.0, 0.9, 0.9, if j < 2 * MAX_USERS { 50.0 } else { 10.0 }, 60.0]);
+        }
+        let graph = FleetGraph::from_scene(&[[0.1, 0.1]], &vec![[0.9, 0.9]; users], &vec![1.0; users], 0.28);
+        let mut goals = Goals::default();
+        goals.clear();
+        goals.push_fleet(&env, &graph.sight().unwrap(), 60, memories(&memory, users), (&[0], None));
+        assert_eq!(goals.len(), MAX_USERS + MAX_BLOCKS);
+        let (oldest, user_goals) = (ln1(50.0), goals.features().chunks_exact(FEATURES).take(MAX_USERS));
+        assert!(user_goals.into_iter().all(|features| f64::from(features[3]) > oldest), "AoI on arrival");
     }
 }

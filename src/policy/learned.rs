@@ -11,12 +11,18 @@ use super::agent::{Agent, AgentCache, Dims};
 use super::config::{AgentConfig, Identity, TOKEN};
 use super::features::{Inputs, NO_ACTION};
 use super::geometry::Geometry;
-use super::goals::Goals;
+use super::goals::{self, Goals};
 use super::memory::{self, memories, uav_memory_len};
 use super::{Carry, EnvParams, FleetStep, Policy, Reach, RequiredInput};
-use crate::invalid::Invalid;
+use crate::invalid::{Invalid, in_range};
 use crate::nn::{HIDDEN, Weights, argmax};
 use crate::rng;
+
+/// Maximum M * N of a fleet with memories, which are vectors of fixed length.
+const MAX_REMEMBERED: usize = 1 << 24;
+/// Buffers of a batch that costs more (see [`Policy::work`]) are not kept: they are large, and to allocate them costs little by
+/// comparison.
+const MAX_KEPT_WORK: usize = 1 << 16;
 
 /// A trained agent with prepared weights. Shared by threads.
 #[derive(Debug)]
@@ -96,7 +102,19 @@ impl Policy for LearnedPolicy {
     }
 
     fn check_fleet(&self, uavs: usize, users: usize) -> Result<(), Invalid> {
-        self.agent.check_fleet(uavs, users)
+        self.agent.check_fleet(uavs, users)?;
+        if self.remembers_users() { in_range("users", users, 0..=MAX_REMEMBERED / uavs) } else { Ok(()) }
+    }
+
+    fn work(&self, uavs: usize, users: usize, detections: usize) -> usize {
+        let alone = 32 * uavs + users + detections;
+        if !self.remembers_users() {
+            return alone;
+        }
+        // Each UAV looks at every user and scores its goals; then it may receive as many memories as it detects UAVs.
+        let goals = goals::MAX_USERS.min(users) + goals::MAX_BLOCKS;
+        let received = detections.min(uavs * uavs);
+        alone + uavs * (goals + users / 4) + received * (users / 8 + goals / 32)
     }
 
     fn observers(&self, uavs: usize, users: usize) -> usize {
@@ -161,7 +179,10 @@ impl Policy for LearnedPolicy {
         let taken = pool().pop();
         let mut buffers = taken.unwrap_or_default();
         self.run(fleets, &mut buffers);
-        pool().push(buffers);
+        let size = |fleet: &FleetStep<'_>| self.work(fleet.graph.uavs(), fleet.graph.users(), fleet.graph.detection_count());
+        if fleets.iter().map(size).sum::<usize>() <= MAX_KEPT_WORK {
+            pool().push(buffers);
+        }
     }
 }
 

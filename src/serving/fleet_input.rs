@@ -13,6 +13,9 @@ pub const MAX_NODES: usize = 20_000;
 /// Maximum number of detections of one input, including mirrored and derived ones.
 pub const MAX_DETECTIONS: usize = 1 << 22;
 
+/// Maximum work of one input (see [`Policy::work`]).
+const MAX_WORK: usize = 1 << 27;
+
 /// Reported distances may exceed the detection range by this factor, because sensors are not exact. Beyond, the caller uses other units or
 /// another sensor than the policy was trained with.
 const RANGE_TOLERANCE: f64 = 2.0;
@@ -167,7 +170,21 @@ impl SceneOrGraph {
             // Users detect each other about as often as UAVs detect users.
             Self::Graph(graph) => 2 * graph.detections.iter().map(Vec::len).sum::<usize>(),
         };
+        let work = policy.work(uavs, users, detections);
+        if work > MAX_WORK {
+            let value = format!("{uavs} UAVs and {users} users with about {detections} detections");
+            let expected = "fewer UAVs or users, or shorter ranges: the slot would take about ten seconds or more";
+            return Err(Invalid::new(self.field(), value, expected));
+        }
         Ok(TaskInput::Large { content: Box::new(self), size, sensing, detections })
+    }
+
+    /// The field of the request.
+    fn field(&self) -> &'static str {
+        match self {
+            Self::Scene(_) => "scene",
+            Self::Graph(_) => "graph",
+        }
     }
 
     /// The position of each UAV, where known.

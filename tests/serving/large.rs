@@ -136,4 +136,6 @@ async fn dense_scene_is_refused_only_by_policies_that_need_its_detections() {
     for policy in ["random", "nearest"] {
         client.act(held(policy, Bytes::new(), dense.clone())).await.unwrap();
     }
+    // Each UAV would receive what hundreds of others know of thousands of users.
+    assert_invalid(client.act(held("qedgix", Bytes::new(), scene(1000, 3000, 0))).await, "scene", "1000 UAVs and 3000 users");
 }

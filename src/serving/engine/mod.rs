@@ -2,8 +2,8 @@
 //!
 //! A thread takes the next task (`queue` owns the order: fair by work, among callers and among sizes of fleets), adds waiting tasks of
 //! the same policy version, and computes them in one forward pass; results are bit-identical to computing each alone. By default a
-//! batch consists of the tasks that arrived while the threads were busy; no task waits for others to join. One thread more than
-//! configured exists, and never computes heavy tasks.
+//! batch consists of the tasks that arrived while the threads were busy; no task waits for others to join. Heavy tasks have threads of
+//! their own, as many, with a lower priority: while they compute, others are served as fast as before.
 //!
 //! Handing a task to another thread and its result back takes longer than the forward pass of a small fleet. Small fleets are
 //! therefore computed inline, on the thread of the first caller among them, as long as no more than `threads`
@@ -40,11 +40,17 @@ const MAX_BATCH_WORK: usize = 1 << 17;
 /// Maximum work of a batch that is computed inline: well below a millisecond, because the caller's thread also serves
 /// connections.
 const MAX_INLINE_WORK: usize = 1 << 13;
+/// Length of a memory, in numbers, up to which fleets are computed at the same time: 32 MiB.
+const MAX_SHARED_MEMORY: usize = 1 << 23;
 /// A small task normally yields to other callers before it is computed, so that their tasks can join its batch. This costs as
 /// much as a forward pass. After this many inline batches of one task, small tasks no longer yield.
 const SINGLES_BEFORE_SKIP: u32 = 4;
 /// One in this many small tasks yields nevertheless, to notice other callers.
 const BATCHING_PROBE_INTERVAL: u32 = 16;
+
+/// How much the priority of the threads for heavy tasks is lowered: to a third of the processor time of a thread that serves, while
+/// both want it. Training workers have an even lower one.
+const HEAVY_NICE: i32 = 5;
 
 /// Limits of an engine.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -66,39 +72,26 @@ struct State {
     inline_running: usize,
     /// Light batches that threads are computing.
     light_running: usize,
-    /// Heavy tasks that threads are computing.
-    heavy_running: usize,
     /// Batches that were computed inline, kept for their buffers.
     spare_batches: Vec<TaskBatch>,
     closed: bool,
 }
 
 impl State {
-    /// The lane with the next task that a thread may compute now. `threads` of them compute at once; one more computes light tasks if heavy
-    /// ones occupy all.
-    fn next_lane(&self, threads: usize) -> Option<Lane> {
-        let light = self.light_running == 0 || self.light_running + self.heavy_running < threads;
-        self.queue.next_lane(light, self.heavy_running < threads)
-    }
-
     /// Whether one more batch may be computed inline.
     fn may_run_inline(&self, threads: usize) -> bool {
         self.inline_running + self.light_running < threads
-    }
-
-    fn running(&mut self, lane: Lane) -> &mut usize {
-        match lane {
-            Lane::Light => &mut self.light_running,
-            Lane::Heavy => &mut self.heavy_running,
-        }
     }
 }
 
 /// State that callers and threads share.
 struct EngineState {
     state: Mutex<State>,
-    /// Notified when a thread may have work.
-    queued: Condvar,
+    /// Notified when a thread of the lane may have work.
+    light: Condvar,
+    heavy: Condvar,
+    /// Held while a task is computed that needs much memory.
+    huge: Mutex<()>,
     /// Inline batches of one since the last inline batch of several.
     single_batches: AtomicU32,
     config: EngineConfig,
@@ -111,47 +104,58 @@ impl EngineState {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Waits for work and moves the next task, and tasks of its policy version, into `batch`. Returns their lane, or `None` if the engine
-    /// was dropped.
-    fn next_batch(&self, batch: &mut TaskBatch) -> Option<Lane> {
-        let EngineConfig { threads, max_batch, max_batch_delay, .. } = self.config;
-        let mut state = self.lock();
-        loop {
-            if state.closed {
-                return None;
-            }
-            let Some(lane) = state.next_lane(threads) else {
-                state = self.queued.wait(state).unwrap_or_else(PoisonError::into_inner);
-                continue;
-            };
-            let waiting = state.queue.lane(lane);
-            let rest = waiting.front().map_or(Duration::ZERO, |next| max_batch_delay.saturating_sub(next.since.elapsed()));
-            let joins = |other: &&Queued| waiting.front().is_some_and(|next| other.job.shares_batch_with(&next.job));
-            if lane == Lane::Light && !rest.is_zero() && waiting.iter().filter(joins).count() < max_batch {
-                state = self.queued.wait_timeout(state, rest).unwrap_or_else(PoisonError::into_inner).0;
-                continue;
-            }
-            state.queue.take(lane, max_batch, MAX_BATCH_WORK, &mut batch.queued);
-            *state.running(lane) += 1;
-            // This thread may have consumed the notification for a task that is still in the queue.
-            if state.next_lane(threads).is_some() {
-                self.queued.notify_one();
-            }
-            return Some(lane);
+    /// What the threads of a lane wait for.
+    fn queued(&self, lane: Lane) -> &Condvar {
+        match lane {
+            Lane::Light => &self.light,
+            Lane::Heavy => &self.heavy,
         }
     }
 
-    /// Computes batches until the engine is dropped.
-    fn work(&self) {
+    /// Waits for work and moves the next task of `lane`, and tasks of its policy version, into `batch`. Returns false if the engine was
+    /// dropped.
+    fn next_batch(&self, lane: Lane, batch: &mut TaskBatch) -> bool {
+        let EngineConfig { max_batch, max_batch_delay, .. } = self.config;
+        let mut state = self.lock();
+        loop {
+            if state.closed {
+                return false;
+            }
+            let waiting = state.queue.lane(lane);
+            let Some(next) = waiting.front() else {
+                state = self.queued(lane).wait(state).unwrap_or_else(PoisonError::into_inner);
+                continue;
+            };
+            let rest = max_batch_delay.saturating_sub(next.since.elapsed());
+            let joins = |other: &&Queued| other.job.shares_batch_with(&next.job);
+            if lane == Lane::Light && !rest.is_zero() && waiting.iter().filter(joins).count() < max_batch {
+                state = self.light.wait_timeout(state, rest).unwrap_or_else(PoisonError::into_inner).0;
+                continue;
+            }
+            state.queue.take(lane, max_batch, MAX_BATCH_WORK, &mut batch.queued);
+            state.light_running += usize::from(lane == Lane::Light);
+            // This thread may have consumed the notification for a task that is still in the queue.
+            if !state.queue.lane(lane).is_empty() {
+                self.queued(lane).notify_one();
+            }
+            return true;
+        }
+    }
+
+    /// Computes batches of a lane until the engine is dropped.
+    fn work(&self, lane: Lane) {
         let mut batch = TaskBatch::default();
-        while let Some(lane) = self.next_batch(&mut batch) {
+        while self.next_batch(lane, &mut batch) {
             let work = batch.queued.iter().map(|queued| queued.work).sum();
+            let huge = batch.queued.iter().any(|queued| matches!(&queued.job, Job::Fleet { task, .. } if is_huge(task)));
+            let alone = huge.then(|| self.huge.lock().unwrap_or_else(PoisonError::into_inner));
             let started = Instant::now();
             batch.run(&self.metrics);
+            drop(alone);
             let mut state = self.lock();
-            *state.running(lane) -= 1;
-            if lane == Lane::Heavy {
-                state.queue.measure(work, started.elapsed());
+            match lane {
+                Lane::Light => state.light_running -= 1,
+                Lane::Heavy => state.queue.measure(work, started.elapsed()),
             }
         }
     }
@@ -229,6 +233,11 @@ fn is_small(task: &Task) -> bool {
     task.is_prepared() && task.policy().implementation.is_cheap() && task.work() <= MAX_INLINE_WORK
 }
 
+/// Whether a task needs so much memory that such tasks are computed one after another.
+fn is_huge(task: &Task) -> bool {
+    task.memory_len() > MAX_SHARED_MEMORY
+}
+
 /// The error of a caller whose task was dropped without a reply: a bug in the engine.
 fn lost_request() -> Error {
     Error::Internal("the engine lost a request".into())
@@ -237,13 +246,14 @@ fn lost_request() -> Error {
 /// Wakes a thread when a caller stops waiting, so that its task leaves the queue soon.
 struct AbandonGuard<'a> {
     shared: &'a EngineState,
+    lane: Lane,
     replied: bool,
 }
 
 impl Drop for AbandonGuard<'_> {
     fn drop(&mut self) {
         if !self.replied {
-            self.shared.queued.notify_one();
+            self.shared.queued(self.lane).notify_one();
         }
     }
 }
@@ -260,19 +270,25 @@ impl Engine {
     /// If the system cannot create a thread.
     pub fn start(config: EngineConfig) -> std::io::Result<Self> {
         let queue = Queue::new(config.queue);
-        let state =
-            State { queue, inline_running: 0, light_running: 0, heavy_running: 0, spare_batches: Vec::new(), closed: false };
+        let state = State { queue, inline_running: 0, light_running: 0, spare_batches: Vec::new(), closed: false };
         let shared = Arc::new(EngineState {
             state: Mutex::new(state),
-            queued: Condvar::new(),
+            light: Condvar::new(),
+            heavy: Condvar::new(),
+            huge: Mutex::default(),
             single_batches: AtomicU32::new(0),
             config,
             metrics: EngineMetrics::new(),
         });
         let engine = Self { shared: shared.clone() };
-        for i in 0..=config.threads {
-            let shared = shared.clone();
-            std::thread::Builder::new().name(format!("engine-{i}")).spawn(move || shared.work())?;
+        for i in 0..config.threads {
+            let (light, heavy) = (shared.clone(), shared.clone());
+            std::thread::Builder::new().name(format!("engine-{i}")).spawn(move || light.work(Lane::Light))?;
+            std::thread::Builder::new().name(format!("engine-heavy-{i}")).spawn(move || {
+                // Linux lowers the priority of this thread only. Without permission it stays as it is.
+                let _ = rustix::process::nice(HEAVY_NICE);
+                heavy.work(Lane::Heavy);
+            })?;
         }
         Ok(engine)
     }
@@ -297,9 +313,10 @@ impl Engine {
         if small && !expects_batch && shared.reserve_inline() {
             return shared.run_inline(task);
         }
-        let mut guard = AbandonGuard { shared, replied: false };
         let (reply, mut receiver) = oneshot::channel();
         let (work, policy) = (task.work(), task.policy().clone());
+        let lane = Lane::of(work);
+        let mut guard = AbandonGuard { shared, lane, replied: false };
         shared.enqueue(Queued::new(Job::Fleet { task, reply }, work, owner, deadline)).inspect_err(|_| {
             shared.metrics.policy(&policy.reference.name).failure.increment(1);
         })?;
@@ -321,7 +338,7 @@ impl Engine {
             }
         }
         // Only now is a thread needed.
-        shared.queued.notify_one();
+        shared.queued(lane).notify_one();
         let result = reply_of(receiver, deadline).await;
         guard.replied = !matches!(result, Err(Error::Deadline(_)));
         result
@@ -341,9 +358,10 @@ impl Engine {
     ) -> Result<T, Error> {
         let (reply, receiver) = oneshot::channel();
         let job = Job::Call(Box::new(CallWithReply { work, reply }));
-        let mut guard = AbandonGuard { shared: &self.shared, replied: false };
+        let lane = Lane::of(cost);
+        let mut guard = AbandonGuard { shared: &self.shared, lane, replied: false };
         self.shared.enqueue(Queued::new(job, cost, owner, deadline))?;
-        self.shared.queued.notify_one();
+        self.shared.queued(lane).notify_one();
         let result = reply_of(receiver, deadline).await;
         guard.replied = !matches!(result, Err(Error::Deadline(_)));
         result
@@ -390,7 +408,8 @@ impl Drop for Engine {
     fn drop(&mut self) {
         self.shared.lock().closed = true;
         // Not joined: no caller waits any more, and a policy that hangs must not keep the process alive.
-        self.shared.queued.notify_all();
+        self.shared.light.notify_all();
+        self.shared.heavy.notify_all();
     }
 }
 

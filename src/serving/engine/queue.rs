@@ -5,7 +5,7 @@
 //! flows advance at the same speed in units of work: many large fleets delay small ones, of the same or of other callers, by no
 //! more than the task that is being computed, and within a flow the order is that of arrival.
 //!
-//! Light tasks wait apart from heavy ones, because heavy ones must never occupy all threads.
+//! Light tasks wait apart from heavy ones, which have threads of their own.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::time::Duration;
@@ -13,8 +13,8 @@ use std::time::Duration;
 use super::batch::Queued;
 use crate::serving::{Error, Owner};
 
-/// Cost from which a task is heavy: about 50 ms.
-const HEAVY: usize = 1 << 19;
+/// Cost from which a task is heavy: about 6 ms.
+const HEAVY: usize = 1 << 16;
 /// Number of flows up to which those without tasks are kept.
 const MAX_IDLE_FLOWS: usize = 256;
 /// Estimated time of a unit of work until tasks have been measured.
@@ -186,16 +186,6 @@ impl Queue {
         }
     }
 
-    /// The lane with the next task, of the lanes that may be taken from.
-    pub(super) fn next_lane(&self, light: bool, heavy: bool) -> Option<Lane> {
-        match (self.light.front().filter(|_| light), self.heavy.front().filter(|_| heavy)) {
-            (Some(light), Some(heavy)) => Some(if light.start <= heavy.start { Lane::Light } else { Lane::Heavy }),
-            (Some(_), None) => Some(Lane::Light),
-            (None, Some(_)) => Some(Lane::Heavy),
-            (None, None) => None,
-        }
-    }
-
     /// Moves the next task of `lane`, and following tasks of its policy version, to `tasks`: at most `max_tasks`, which cost at most
     /// `max_work` if they are several.
     pub(super) fn take(&mut self, lane: Lane, max_tasks: usize, max_work: usize, tasks: &mut Vec<Queued>) {
@@ -264,10 +254,19 @@ mod tests {
             self.queue.push(queued, 2).map(|removed| removed.len())
         }
 
+        /// The lane of the task with the earliest start.
+        fn first(&self) -> Option<Lane> {
+            let lanes = [Lane::Light, Lane::Heavy].into_iter();
+            lanes
+                .filter_map(|lane| Some((self.queue.lane(lane).front()?.start, lane)))
+                .min_by_key(|first| first.0)
+                .map(|first| first.1)
+        }
+
         /// The step and the number of UAVs of each task, in the order in which one thread computes them.
         fn order(&mut self) -> Vec<(u64, usize)> {
             let mut order = Vec::new();
-            while let Some(lane) = self.queue.next_lane(true, true) {
+            while let Some(lane) = self.first() {
                 let mut tasks = Vec::new();
                 self.queue.take(lane, 1, usize::MAX, &mut tasks);
                 order.extend(tasks.iter_mut().map(|queued| {
@@ -329,20 +328,9 @@ mod tests {
     }
 
     #[test]
-    fn heavy_tasks_leave_threads_to_light_ones() {
-        let mut waiting = Waiting::new(100);
-        let heavy = HEAVY / UNIT + 1;
-        waiting.push("a", heavy, 0, None).unwrap();
-        assert_eq!(waiting.queue.next_lane(true, true), Some(Lane::Heavy));
-        assert_eq!(waiting.queue.next_lane(true, false), None);
-        waiting.push("a", 3, 1, None).unwrap();
-        assert_eq!(waiting.queue.next_lane(true, false), Some(Lane::Light));
-    }
-
-    #[test]
     fn tasks_that_cannot_begin_before_their_deadline_are_refused() {
         let mut waiting = Waiting::new(100);
-        let heavy = HEAVY / UNIT + 1;
+        let heavy = 8 * HEAVY / UNIT;
         let second = Some(Duration::from_secs(1));
         waiting.push("a", heavy, 0, Some(Duration::from_millis(1))).unwrap();
         for i in 1..60 {

@@ -199,6 +199,12 @@ impl Task {
         self.work
     }
 
+    /// Length of the memory that the policy works on.
+    pub(super) fn memory_len(&self) -> usize {
+        let (uavs, users) = self.change.as_ref().map_or(self.size, |change| change.after);
+        self.policy.implementation.memory_len(uavs, users)
+    }
+
     /// Whether the input is converted and the memory unpacked.
     pub(super) fn is_prepared(&self) -> bool {
         self.unconverted.is_none() && self.memory.is_plain()
