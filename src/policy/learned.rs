@@ -113,7 +113,7 @@ impl Policy for LearnedPolicy {
         }
         // Each UAV looks at every user and scores its goals; then it may receive as many memories as it detects UAVs.
         let goals = goals::MAX_USERS.min(users) + goals::MAX_BLOCKS;
-        let received = detections.min(uavs * uavs);
+        let received = detections * uavs / (uavs + users);
         alone + uavs * (goals + users / 4) + received * (users / 8 + goals / 32)
     }
 

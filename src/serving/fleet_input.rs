@@ -14,7 +14,7 @@ pub const MAX_NODES: usize = 20_000;
 pub const MAX_DETECTIONS: usize = 1 << 22;
 
 /// Maximum work of one input (see [`Policy::work`]).
-const MAX_WORK: usize = 1 << 27;
+const MAX_WORK: usize = 1 << 26;
 
 /// Reported distances may exceed the detection range by this factor, because sensors are not exact. Beyond, the caller uses other units or
 /// another sensor than the policy was trained with.
@@ -173,7 +173,7 @@ impl SceneOrGraph {
         let work = policy.work(uavs, users, detections);
         if work > MAX_WORK {
             let value = format!("{uavs} UAVs and {users} users with about {detections} detections");
-            let expected = "fewer UAVs or users, or shorter ranges: the slot would take about ten seconds or more";
+            let expected = "fewer UAVs or users, or shorter ranges: the slot would take several seconds";
             return Err(Invalid::new(self.field(), value, expected));
         }
         Ok(TaskInput::Large { content: Box::new(self), size, sensing, detections })
