@@ -7,7 +7,7 @@ use plotters::prelude::*;
 use super::canvas::{self, Axes, Drawn, HEIGHT, Key, Legend, Plot, Sheet, WIDTH, Words};
 use super::data::{Chart, Series};
 use super::palette::{Look, looks};
-use super::scale::{drawable, extent, value_axis};
+use super::scale::{drawable, extent, value, value_axis};
 
 /// Most different x values that are ticks of a chart with markers.
 const MAX_TICKS: usize = 8;
@@ -88,10 +88,10 @@ fn plot(chart: &Chart, ranges: [Range<f64>; 2], x_ticks: Option<Vec<f64>>) -> St
 /// What the plot shows, in words.
 fn description(chart: &Chart) -> String {
     let ends = |s: &Series| match (s.points.first(), s.points.last()) {
-        (Some(first), Some(last)) => format!("{} from {:.2} to {:.2}", s.name, first[1], last[1]),
+        (Some(first), Some(last)) => format!("{} from {} to {}", s.name, value(first[1]), value(last[1])),
         _ => format!("{} without data", s.name),
     };
-    let levels = chart.levels.iter().map(|(name, value)| format!("{name} at {value:.2}"));
+    let levels = chart.levels.iter().map(|(name, level)| format!("{name} at {}", value(*level)));
     let all: Vec<String> = chart.series.iter().map(ends).chain(levels).collect();
     let end = if chart.note.is_empty() { String::new() } else { format!(" {}", chart.note) };
     format!("{} against {}: {}.{end}", chart.y, chart.x, all.join("; "))

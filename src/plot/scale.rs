@@ -59,7 +59,10 @@ fn short(x: f64, digits: usize) -> String {
     if text == "-0" { "0".to_owned() } else { text.to_owned() }
 }
 
-/// The label of a value beside a bar.
+/// The label of a value beside a bar, or in a description.
 pub(super) fn value(x: f64) -> String {
+    if !drawable(x) {
+        return "none".to_owned();
+    }
     if x != 0.0 && !(0.01..1e6).contains(&x.abs()) { format!("{x:.2e}") } else { format!("{x:.2}") }
 }
