@@ -91,7 +91,7 @@ const MIGRATIONS: &[(&str, &str)] = &migrations![
     "0009_consecutive_failures.sql",
     "0010_finding_jobs.sql",
     "0011_lifecycle.sql",
-    "0012_jobs_for_a_week.sql",
+    "0012_initial_weights.sql",
 ];
 
 /// Name of the database file inside the data directory.
