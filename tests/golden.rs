@@ -15,8 +15,8 @@ use qedgix::learner::loss::{Loss, TdLambda, Trace};
 use qedgix::nn::{Adam, VECTOR_WIDTH_VARIABLE, VectorWidth};
 use qedgix::policy::mixer::MixerKind;
 use qedgix::policy::{
-    AgentConfig, Aggregation, Dims, EnvParams, Geometry, GeometryConfig, Gnn, HopSearch, Identity, Memory, ObservationKind,
-    TOKEN, flat_observation, flat_state,
+    Advice, AgentConfig, Aggregation, Dims, EnvParams, Geometry, GeometryConfig, Gnn, HopSearch, Identity, Memory,
+    ObservationKind, TOKEN, flat_observation, flat_state,
 };
 use safetensors::{Dtype, SafeTensors};
 
@@ -135,6 +135,7 @@ impl Config {
             hops: 1,
             normalise: false,
             memory: Memory::None,
+            advice: Advice::None,
         };
         if count("token")? != TOKEN {
             return Err(format!("metadata token = {}; expected {TOKEN}", text("token")?));

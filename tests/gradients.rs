@@ -7,7 +7,7 @@ use qedgix::nn::{
     Batch, Graph, GraphLayer, Gru, HIDDEN, LayerCache, LayerScratch, Linear, Mlp, MlpCache, ParameterLayout, Weights,
 };
 use qedgix::policy::mixer::MixerKind;
-use qedgix::policy::{AgentConfig, Aggregation, Dims, EnvParams, Gnn, Identity, Memory, ObservationKind};
+use qedgix::policy::{Advice, AgentConfig, Aggregation, Dims, EnvParams, Gnn, Identity, Memory, ObservationKind};
 use qedgix::rng;
 use rand::RngExt;
 use sample::{AGENT, episodes};
@@ -245,6 +245,8 @@ fn whole_loss() {
         ("qmix", AgentConfig { gnn: Gnn::None, ..AGENT }, MixerKind::Qmix),
         ("qmix with memory", AgentConfig { gnn: Gnn::None, memory: Memory::Own, ..set }, MixerKind::Qmix),
         ("qedgix with shared memory", AgentConfig { memory: Memory::Shared, ..set }, MixerKind::Invariant),
+        ("qmix with advice", AgentConfig { gnn: Gnn::None, memory: Memory::Own, advice: Advice::Sweep, ..set }, MixerKind::Vdn),
+        ("qedgix with advice", AgentConfig { memory: Memory::Shared, advice: Advice::Sweep, ..set }, MixerKind::Invariant),
         ("iql", AgentConfig { gnn: Gnn::None, identity: Identity::Token, ..set }, MixerKind::None),
     ];
     for (name, agent, mixer) in cases {

@@ -9,8 +9,8 @@ use qedgix::learner::{Algorithm, Learner, Preset, TrainConfig};
 use qedgix::nn::{Batch, Graph, GraphLayer, HIDDEN, LayerCache, ParameterLayout, Rows, Weights};
 use qedgix::policy::mixer::{Mixer, MixerCache, MixerKind};
 use qedgix::policy::{
-    Agent, AgentConfig, BatchedAgent, Dims, EnvParams, FleetGraph, FleetStep, Geometry, GeometryConfig, Gnn, HopSearch, Identity,
-    LearnedPolicy, Memory, ObservationKind, Policy, RequiredInput, StepInput, TOKEN,
+    Advice, Agent, AgentConfig, BatchedAgent, Dims, EnvParams, FleetGraph, FleetStep, Geometry, GeometryConfig, Gnn, HopSearch,
+    Identity, LearnedPolicy, Memory, ObservationKind, Policy, RequiredInput, StepInput, TOKEN,
 };
 use qedgix::rng;
 use rand::RngExt;
@@ -84,6 +84,7 @@ fn batching_does_not_change_a_bit_of_the_result() {
         AgentConfig { gnn: Gnn::None, hops: 3, ..SET },
         AgentConfig { gnn: Gnn::None, memory: Memory::Own, ..SET },
         AgentConfig { memory: Memory::Shared, ..SET },
+        AgentConfig { memory: Memory::Shared, advice: Advice::Sweep, ..SET },
     ];
     for config in variants {
         let policy = learned(config);
@@ -156,6 +157,8 @@ fn batched_agent_policy_and_update_compute_the_same_values() {
         AgentConfig { hops: 3, normalise: true, ..plain },
         AgentConfig { memory: Memory::Own, ..plain },
         AgentConfig { memory: Memory::Shared, identity: Identity::Token, ..SET },
+        AgentConfig { memory: Memory::Own, advice: Advice::Sweep, ..plain },
+        AgentConfig { memory: Memory::Shared, advice: Advice::Sweep, ..SET },
     ];
     for config in configs {
         let dims = Dims { env: EnvParams { slots: 6, ..ENV }, ..DIMS };

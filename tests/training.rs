@@ -10,7 +10,7 @@ use qedgix::env::{BatchEnv, EnvConfig, EpisodeMetrics, Layout};
 use qedgix::learner::{
     Algorithm, Event, Learner, Preset, Rollout, SnapshotError, Symmetry, TrainConfig, Trainer, Vary, evaluate, layout_list,
 };
-use qedgix::policy::{Gnn, Memory, ObservationKind};
+use qedgix::policy::{Advice, Gnn, Memory, ObservationKind};
 
 /// A run of a few iterations with updates, target copies, a full replay and evaluations.
 fn small_config(algorithm: Algorithm) -> TrainConfig {
@@ -47,6 +47,7 @@ fn opposite_config(algorithm: Algorithm) -> TrainConfig {
     t.observation = ObservationKind::Flat;
     config.environment.user_speed = 0.02;
     t.memory = if algorithm.gnn() == Gnn::None { Memory::Own } else { Memory::Shared };
+    t.advice = if algorithm == Algorithm::Vdn { Advice::None } else { Advice::Sweep };
     t.teacher = Some("sweep-shared".into());
     config.environment.communication_range = Some(0.5);
     config

@@ -7,7 +7,7 @@ use utoipa::{PartialSchema, ToSchema};
 
 use crate::env::{Boundary, EnvConfig};
 use crate::policy::mixer::MixerKind;
-use crate::policy::{Aggregation, Identity, Memory, ObservationKind};
+use crate::policy::{Advice, Aggregation, Identity, Memory, ObservationKind};
 use crate::store::{AttemptOutcome, CheckpointKind, JobState, PendingAction};
 use crate::train_config::{Algorithm, Preset, Training};
 
@@ -150,6 +150,11 @@ fn training() -> Map<String, Value> {
             string_enum::<Memory>(),
             "What a UAV remembers: the users it detected and the ground it searched; shared: exchanged within the communication range.",
         ),
+        (
+            "advice",
+            string_enum::<Advice>(),
+            "What a rule tells a UAV in every slot, from its memory; sweep: the heading that the rule `sweep` would fly.",
+        ),
         ("mixer", string_enum::<MixerKind>(), "Mixer of the UAVs' values."),
         ("hyper_init", number(0.0, 10.0), "Factor of the initial weights of the hypernetworks' last layers."),
         ("steps", integer(1, STEPS), "Environment steps (slots) to train for."),
@@ -261,6 +266,7 @@ string_enums! {
     Preset { Paper Authors Practical }
     MixerKind { Qmix Invariant Vdn None }
     Memory { None Own Shared }
+    Advice { None Sweep }
     ObservationKind { Flat Set }
     Identity { Onehot Phase Token None }
     Aggregation { Mean Sum }

@@ -16,7 +16,6 @@ use rayon::prelude::*;
 
 use super::episodes::Episodes;
 use crate::nn::{Batch, ParameterLayout, Real, Weights, argmax, norm_squared};
-use crate::policy::memory::memories;
 use crate::policy::mixer::{Mixer, MixerCache, MixerKind};
 use crate::policy::{Agent, AgentCache, AgentConfig, Dims, Geometry, Goals, Inputs, NO_ACTION, TOKEN, flat_state};
 
@@ -344,8 +343,8 @@ impl<T: Real> Workspace<T> {
                 if memory_len > 0 {
                     let memory = &mut self.memory[(e - range.start) * memory_len..][..memory_len];
                     let sight = self.geometry.last_sight(aoi);
-                    agent.remember(env, &sight, t as u64, memory, &mut self.received);
-                    self.goals.push_fleet(env, &sight, t as u64, memories(memory, n), (&self.last[self.last.len() - m..], None));
+                    let last = &self.last[self.last.len() - m..];
+                    agent.remember((env, &sight, t as u64), (last, None), memory, &mut self.received, &mut self.goals);
                 }
                 self.identity_token.extend_from_slice(&ep.identity_token[e * m * TOKEN..][..m * TOKEN]);
                 self.position.extend_from_slice(uav_xy);

@@ -11,15 +11,17 @@
 use super::EnvParams;
 use super::config::{AgentConfig, Aggregation, Gnn, Identity, ObservationKind};
 use super::features::{Inputs, SetEncoder, flat_observation, identity_width, write_action_identity_position};
+use super::fleet_profile::FleetProfile;
 use super::geometry::{Geometry, GeometryConfig};
 use super::goal_head::{GoalCache, GoalHead};
+use super::goals::Goals;
 use super::hop_search::HopSearch;
-use super::memory::{remember, uav_memory_len};
+use super::memory::{memories, remember, uav_memory_len};
 use super::sight::Sight;
 use crate::invalid::Invalid;
 use crate::nn::matmul::InitialValue;
 use crate::nn::{
-    Batch, GraphLayer, Gru, HIDDEN, LayerCache, LayerScratch, Linear, Mlp, MlpCache, ParameterLayout, Real, Rows, Weights,
+    Batch, GraphLayer, Gru, HIDDEN, Init, LayerCache, LayerScratch, Linear, Mlp, MlpCache, ParameterLayout, Real, Rows, Weights,
     leaky_relu, leaky_relu_back, relu, relu_back,
 };
 
@@ -34,6 +36,10 @@ pub struct Dims {
     pub env: EnvParams,
 }
 
+/// What is added to the Q-value of the advised heading before training: more than the differences of untrained Q-values, so that an
+/// untrained policy follows the advice nearly always.
+const TRUST: f64 = 2.0;
+
 /// An agent's architecture and the layout of its parameters.
 #[derive(Clone, Debug)]
 pub struct Agent {
@@ -45,6 +51,8 @@ pub struct Agent {
     rnn: Gru,
     body: Body,
     goals: Option<GoalHead>,
+    /// What is added to the Q-value of the advised heading.
+    advice: Option<usize>,
     /// Width of an observation.
     observation_width: usize,
 }
@@ -106,7 +114,8 @@ impl Agent {
         let sets = (config.observation == ObservationKind::Set).then(|| SetEncoder::new(&mut layout, "agent.sets"));
         let observation = if sets.is_some() { SetEncoder::WIDTH } else { 2 * m + 3 * dims.users };
         let position = if config.self_position { 2 } else { 0 };
-        let input = observation + dims.env.actions + identity_width(config.identity, m) + position;
+        let advice = if config.advice.is_none() { 0 } else { dims.env.actions };
+        let input = observation + dims.env.actions + identity_width(config.identity, m) + position + advice;
         let fc = Linear::new(&mut layout, "agent.fc", input, HIDDEN);
         let rnn = Gru::new(&mut layout, "agent.rnn");
         let mean = config.aggregation == Aggregation::Mean;
@@ -124,8 +133,9 @@ impl Agent {
             Body::Graph { w1, w2, layers, head: Mlp::new(&mut layout, "agent.head", 2 * HIDDEN, dims.env.actions) }
         };
         let context = if config.gnn == Gnn::None { HIDDEN } else { 2 * HIDDEN };
-        let goals = (!config.memory.is_none()).then(|| GoalHead::new(&mut layout, "agent.goals", context));
-        Self { config, dims, layout, sets, fc, rnn, body, goals, observation_width: observation }
+        let goals = (!config.memory.is_none()).then(|| GoalHead::new(&mut layout, "agent.goals", context, advice > 0));
+        let advice = (advice > 0).then(|| layout.add("agent.advice", &[1], Init::Constant(TRUST)));
+        Self { config, dims, layout, sets, fc, rnn, body, goals, advice, observation_width: observation }
     }
 
     /// The architecture.
@@ -160,10 +170,22 @@ impl Agent {
         if self.config.memory.is_none() { 0 } else { uavs * uav_memory_len(users) }
     }
 
-    /// Advances what the UAVs of a fleet remember; does nothing without memory. `received` is a buffer.
-    pub fn remember(&self, env: &EnvParams, sight: &Sight<'_>, slot: u64, memory: &mut [f32], received: &mut Vec<f32>) {
-        if let Some(sharing) = self.config.memory.sharing() {
-            remember(sight, env.detection_range, slot, sharing, memory, received);
+    /// Advances what the UAVs of a fleet remember to slot `slot`, and adds their goals, and the advice from it, to `goals`. Does nothing
+    /// without memory. `last` holds the last headings of the UAVs. `received` is a buffer.
+    pub fn remember(
+        &self,
+        slot: (&EnvParams, &Sight<'_>, u64),
+        (last, profile): (&[u8], Option<&FleetProfile>),
+        memory: &mut [f32],
+        received: &mut Vec<f32>,
+        goals: &mut Goals,
+    ) {
+        let Some(sharing) = self.config.memory.sharing() else { return };
+        let (env, sight, step) = slot;
+        remember(sight, env.detection_range, step, sharing, memory, received);
+        goals.push_fleet(slot, memories(memory, sight.users()), (last, profile));
+        if self.advice.is_some() {
+            goals.push_advice(slot, memories(memory, sight.users()), profile);
         }
     }
 
@@ -298,6 +320,11 @@ impl Agent {
                 }
             }
         }
+        if let Some(trust) = self.advice {
+            for (q, &heading) in c.q.as_mut_slice().chunks_exact_mut(self.dims.env.actions).zip(inputs.goals.advice()) {
+                q[usize::from(heading)] += w.params[trust];
+            }
+        }
     }
 
     /// Adds the gradients of all parameters, given those of the Q-values of the last forward pass. Overwrites the cache.
@@ -312,6 +339,11 @@ impl Agent {
         let uavs = inputs.geometry.uav_rows();
         let h = hidden(&c.h, uavs);
         let s = &mut c.scratch;
+        if let Some(trust) = self.advice {
+            for (dq, &heading) in dq.data.chunks(dq.stride).zip(inputs.goals.advice()) {
+                grads[trust] += dq[usize::from(heading)];
+            }
+        }
         s.dh.resize(HIDDEN, uavs);
         match &self.body {
             Body::Plain { head } => {

@@ -5,7 +5,6 @@ use super::config::TOKEN;
 use super::features::{Inputs, NO_ACTION};
 use super::geometry::Geometry;
 use super::goals::Goals;
-use super::memory::memories;
 use crate::nn::{HIDDEN, Weights};
 
 /// The scenes of B fleets in one slot.
@@ -93,8 +92,7 @@ impl BatchedAgent {
                 let len = agent.memory_len(m, n);
                 let (memory, last) = (&mut self.memory[f * len..][..len], &self.last[f * m..][..m]);
                 let sight = self.geometry.last_sight(aoi);
-                agent.remember(env, &sight, self.slot, memory, &mut self.received);
-                self.goals.push_fleet(env, &sight, self.slot, memories(memory, n), (last, None));
+                agent.remember((env, &sight, self.slot), (last, None), memory, &mut self.received, &mut self.goals);
             }
         }
         self.geometry.finish(&config);

@@ -65,6 +65,17 @@ pub enum Memory {
     Shared,
 }
 
+/// What a rule tells a UAV in every slot (docs/model.md, "Advice").
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Advice {
+    /// Nothing, as in the paper.
+    #[default]
+    None,
+    /// The heading that `sweep` would fly from the UAV's memory; with a shared memory, that of `sweep-shared`.
+    Sweep,
+}
+
 /// Width of a `token` identity.
 pub const TOKEN: usize = 4;
 
@@ -91,8 +102,18 @@ pub struct AgentConfig {
     /// What a UAV remembers.
     #[serde(default)]
     pub memory: Memory,
+    /// What a rule advises, from this memory.
+    #[serde(default)]
+    pub advice: Advice,
     /// Whether flat observations have relative positions in units of d, and own positions are scaled to [-1, 1].
     pub normalise: bool,
+}
+
+impl Advice {
+    /// Whether UAVs get no advice.
+    pub fn is_none(self) -> bool {
+        self == Self::None
+    }
 }
 
 impl Memory {

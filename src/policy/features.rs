@@ -14,7 +14,7 @@ pub const NO_ACTION: u8 = u8::MAX;
 pub struct Inputs<'a> {
     /// Detections; the first rows are the UAVs.
     pub geometry: &'a Geometry,
-    /// Goals per UAV row; empty without a memory.
+    /// Goals and advice per UAV row; empty without a memory.
     pub goals: &'a Goals,
     /// Last action per UAV row, [`NO_ACTION`] in slot 0.
     pub last: &'a [u8],
@@ -63,7 +63,8 @@ pub fn flat_state<T: Real>(uav_xy: &[f32], user_xy: &[f32], aoi: &[f32], episode
     }
 }
 
-/// Writes the part of a UAV's input that follows the observation: last action, identity, own position (docs/model.md, "UAV input").
+/// Writes the part of a UAV's input that follows the observation: last action, identity, own position, advice (docs/model.md, "UAV
+/// input").
 pub(super) fn write_action_identity_position<T: Real>(
     config: &AgentConfig,
     actions: usize,
@@ -78,7 +79,8 @@ pub(super) fn write_action_identity_position<T: Real>(
     }
     let (fleet, uav) = inputs.geometry.node_of_row(row);
     let identity = identity_width(config.identity, fleet.uavs);
-    let (own, position) = rest.split_at_mut(identity);
+    let (own, rest) = rest.split_at_mut(identity);
+    let (position, advice) = rest.split_at_mut(if config.self_position { 2 } else { 0 });
     match config.identity {
         Identity::None => {}
         Identity::Onehot => own[uav] = T::ONE,
@@ -95,6 +97,9 @@ pub(super) fn write_action_identity_position<T: Real>(
         let own = &inputs.position[2 * row..][..2];
         let scale = T::from_f64(if config.normalise { 2.0 } else { 1.0 });
         position.iter_mut().zip(own).for_each(|(o, &p)| *o = (T::from_f64(p.into()) - T::from_f64(0.5)) * scale);
+    }
+    if let Some(&heading) = inputs.goals.advice().get(row) {
+        advice[usize::from(heading)] = T::ONE;
     }
 }
 

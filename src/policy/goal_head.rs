@@ -21,6 +21,8 @@ pub(super) struct GoalHead {
     /// Input: features, hidden state, and in a graph network the output of the last layer.
     first: Linear,
     value: Linear,
+    /// Width of the features: [`FEATURES`], and with advice whether the goal lies in the advised direction.
+    features: usize,
     /// Score of a heading without a goal.
     none: usize,
 }
@@ -41,10 +43,12 @@ pub(super) struct GoalCache<T: Real> {
 }
 
 impl GoalHead {
-    /// `context` is the width of the context.
-    pub(super) fn new(layout: &mut ParameterLayout, name: &str, context: usize) -> Self {
+    /// `context` is the width of the context; `advice`: whether UAVs get advice.
+    pub(super) fn new(layout: &mut ParameterLayout, name: &str, context: usize, advice: bool) -> Self {
+        let features = FEATURES + usize::from(advice);
         Self {
-            first: Linear::new(layout, &format!("{name}.0"), FEATURES + context, HIDDEN),
+            features,
+            first: Linear::new(layout, &format!("{name}.0"), features + context, HIDDEN),
             value: Linear::new(layout, &format!("{name}.2"), HIDDEN, 1),
             none: layout.add(format!("{name}.none"), &[1], Init::Constant(0.0)),
         }
@@ -64,15 +68,24 @@ impl GoalHead {
         c: &mut GoalCache<T>,
         q: &mut Batch<T>,
     ) {
-        c.features.resize(FEATURES, goals.len());
-        c.features.as_mut_slice().iter_mut().zip(goals.features()).for_each(|(x, &f)| *x = T::from_f64(f.into()));
+        c.features.resize(self.features, goals.len());
+        for (row, features) in
+            c.features.as_mut_slice().chunks_exact_mut(self.features).zip(goals.features().chunks_exact(FEATURES))
+        {
+            row.iter_mut().zip(features).for_each(|(x, &f)| *x = T::from_f64(f.into()));
+        }
+        for (r, &heading) in goals.advice().iter().enumerate() {
+            for g in goals.of_row(r) {
+                c.features.row_mut(g)[FEATURES] = if goals.headings()[g] == heading { T::ONE } else { T::ZERO };
+            }
+        }
         c.hidden.resize(HIDDEN, goals.len());
         let first = &self.first;
-        first.forward_part(w, (0, FEATURES), c.features.rows(), c.hidden.rows_mut(), InitialValue::Bias(first.bias(w)));
+        first.forward_part(w, (0, self.features), c.features.rows(), c.hidden.rows_mut(), InitialValue::Bias(first.bias(w)));
         c.context.resize(HIDDEN, goals.rows());
         for (part, &rows) in context.iter().enumerate() {
             let initial = if part == 0 { InitialValue::Zero } else { InitialValue::Previous };
-            first.forward_part(w, (FEATURES + part * HIDDEN, HIDDEN), rows, c.context.rows_mut(), initial);
+            first.forward_part(w, (self.features + part * HIDDEN, HIDDEN), rows, c.context.rows_mut(), initial);
         }
         let (actions, none) = (q.width(), w.params[self.none]);
         let (value, bias) = (self.value.weight(w.params), self.value.bias(w)[0]);
@@ -123,7 +136,7 @@ impl GoalHead {
             }
         }
         c.d_hidden.resize(HIDDEN, c.chosen.len());
-        c.chosen_features.resize(FEATURES, c.chosen.len());
+        c.chosen_features.resize(self.features, c.chosen.len());
         let mut d_value = [T::ZERO; HIDDEN];
         let mut d_bias = T::ZERO;
         for (i, &(r, g, d)) in c.chosen.iter().enumerate() {
@@ -140,15 +153,15 @@ impl GoalHead {
         self.value.weight_mut(grads).iter_mut().zip(d_value).for_each(|(g, d)| *g += d);
         self.value.bias_mut(grads)[0] += d_bias;
         self.first.backward_bias(c.d_hidden.rows(), grads);
-        self.first.backward_part((0, FEATURES), c.chosen_features.rows(), c.d_hidden.rows(), grads);
+        self.first.backward_part((0, self.features), c.chosen_features.rows(), c.d_hidden.rows(), grads);
         for (part, &rows) in context.iter().enumerate() {
-            self.first.backward_part((FEATURES + part * HIDDEN, HIDDEN), rows, c.d_context.rows(), grads);
+            self.first.backward_part((self.features + part * HIDDEN, HIDDEN), rows, c.d_context.rows(), grads);
         }
     }
 
     /// Adds the gradient of part `part` of the context to `dx`.
     pub(super) fn backward_context<T: Real>(&self, params: &[T], part: usize, c: &GoalCache<T>, dx: RowsMut<'_, T>) {
-        let columns = (FEATURES + part * HIDDEN, HIDDEN);
+        let columns = (self.features + part * HIDDEN, HIDDEN);
         self.first.backward_input(params, columns, c.d_context.rows(), dx, InitialValue::Previous);
     }
 }

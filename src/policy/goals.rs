@@ -7,6 +7,7 @@ use super::fleet_profile::{FleetProfile, Place};
 use super::flight::{distance, heading_toward, travel_slots};
 use super::memory::{GRID, RememberedUser, UavMemory};
 use super::sight::Sight;
+use super::sweep_plan::sweep_headings;
 use crate::env::Point;
 
 /// Number of features of a goal.
@@ -28,6 +29,8 @@ pub struct Goals {
     headings: Vec<u8>,
     /// (goals, [`FEATURES`]).
     features: Vec<f32>,
+    /// The advised heading of each row; empty without advice.
+    advice: Vec<u8>,
     users: Vec<RememberedUser>,
 }
 
@@ -38,6 +41,7 @@ impl Goals {
         self.offsets.push(0);
         self.headings.clear();
         self.features.clear();
+        self.advice.clear();
     }
 
     /// Number of rows.
@@ -70,13 +74,26 @@ impl Goals {
         &self.features
     }
 
+    /// The advised heading of each row; empty without advice.
+    pub fn advice(&self) -> &[u8] {
+        &self.advice
+    }
+
+    /// Adds the advice of `sweep` to the UAVs of a fleet in slot `slot`.
+    pub(super) fn push_advice<'a>(
+        &mut self,
+        slot: (&EnvParams, &Sight<'_>, u64),
+        memories: impl Iterator<Item = UavMemory<'a>>,
+        profile: Option<&FleetProfile>,
+    ) {
+        sweep_headings(slot, memories, profile, |_, heading| self.advice.push(heading));
+    }
+
     /// Adds one row per UAV of a fleet in slot `slot`. `memories` holds their memories, `last` their last
     /// headings.
-    pub fn push_fleet<'a>(
+    pub(super) fn push_fleet<'a>(
         &mut self,
-        env: &EnvParams,
-        sight: &Sight<'_>,
-        slot: u64,
+        (env, sight, slot): (&EnvParams, &Sight<'_>, u64),
         memories: impl Iterator<Item = UavMemory<'a>>,
         (last, profile): (&[u8], Option<&FleetProfile>),
     ) {

@@ -12,7 +12,7 @@ use super::config::{AgentConfig, Identity, TOKEN};
 use super::features::{Inputs, NO_ACTION};
 use super::geometry::Geometry;
 use super::goals::{self, Goals};
-use super::memory::{self, memories, uav_memory_len};
+use super::memory::{self, uav_memory_len};
 use super::{Carry, EnvParams, FleetStep, Policy, Reach, RequiredInput};
 use crate::invalid::{Invalid, in_range};
 use crate::nn::{HIDDEN, Weights, argmax};
@@ -209,9 +209,9 @@ impl LearnedPolicy {
             if !self.agent.config().memory.is_none() {
                 let sight = fleet.graph.sight().expect("the caller provides what `needs` requires");
                 memory::exclude_outside(&fleet.env, sight.users(), remembered);
-                self.agent.remember(&fleet.env, &sight, fleet.step, remembered, &mut b.received);
+                let slot = (&fleet.env, &sight, fleet.step);
                 let last = &b.last[b.last.len() - sight.uavs()..];
-                b.goals.push_fleet(&fleet.env, &sight, fleet.step, memories(remembered, sight.users()), (last, fleet.profile));
+                self.agent.remember(slot, (last, fleet.profile), remembered, &mut b.received, &mut b.goals);
             }
             if let Some(own) = fleet.graph.uav_positions() {
                 b.position.extend(own.iter().flatten().map(|&x| x as f32));

@@ -18,10 +18,11 @@ pub mod memory;
 pub mod mixer;
 mod neighbor_search;
 mod sight;
+mod sweep_plan;
 
 pub use agent::{Agent, AgentCache, Dims};
 pub use batched_agent::{BatchedAgent, StepInput};
-pub use config::{AgentConfig, Aggregation, Gnn, Identity, Memory, ObservationKind, TOKEN};
+pub use config::{Advice, AgentConfig, Aggregation, Gnn, Identity, Memory, ObservationKind, TOKEN};
 pub use env_params::EnvParams;
 pub use features::{Inputs, NO_ACTION, SetEncoder, flat_observation, flat_state};
 pub use fleet_graph::FleetGraph;

@@ -12,7 +12,7 @@ use crate::env::EnvConfig;
 use crate::invalid::{Invalid, expectation, in_range};
 use crate::policy::baselines;
 use crate::policy::mixer::MixerKind;
-use crate::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, Memory, ObservationKind};
+use crate::policy::{Advice, AgentConfig, Aggregation, Dims, Gnn, Identity, Memory, ObservationKind};
 
 /// The algorithms of the paper, and common baselines.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -74,6 +74,10 @@ pub struct Training {
     /// remember.
     #[serde(default)]
     pub memory: Memory,
+    /// What a rule advises a UAV from its memory: `none`, as in the paper; `sweep`, the heading that `sweep` would fly, with a shared memory
+    /// that of `sweep-shared`.
+    #[serde(default)]
+    pub advice: Advice,
     /// Mixer.
     pub mixer: MixerKind,
     /// Factor of the initial weights of the hypernetworks' last layers.
@@ -186,6 +190,7 @@ impl TrainConfig {
             hops: 1,
             normalise: false,
             memory: Memory::None,
+            advice: Advice::None,
             mixer: MixerKind::Invariant,
             hyper_init: 1.0,
             steps: 2_050_000,
@@ -294,6 +299,7 @@ impl TrainConfig {
             hops: t.hops,
             normalise: t.normalise,
             memory: t.memory,
+            advice: t.advice,
         }
     }
 
@@ -332,6 +338,9 @@ impl TrainConfig {
                 t.hops,
                 "1, because the number of layers of a graph network sets its hops",
             ));
+        }
+        if !t.advice.is_none() && t.memory.is_none() {
+            return Err(Invalid::new("training.advice", "sweep", "none, because the rule needs training.memory"));
         }
         if !t.vary.is_none() {
             self.validate_vary()?;

@@ -2,7 +2,7 @@
 #![allow(dead_code)] // each test binary uses its part
 
 use qedgix::learner::Episodes;
-use qedgix::policy::{AgentConfig, Aggregation, Dims, Gnn, Identity, Memory, ObservationKind, TOKEN};
+use qedgix::policy::{Advice, AgentConfig, Aggregation, Dims, Gnn, Identity, Memory, ObservationKind, TOKEN};
 use qedgix::rng;
 use rand::RngExt;
 
@@ -18,6 +18,7 @@ pub const AGENT: AgentConfig = AgentConfig {
     hops: 1,
     normalise: false,
     memory: Memory::None,
+    advice: Advice::None,
 };
 
 /// Episodes of UAVs that fly at random from the centre. Each episode has its own users.
