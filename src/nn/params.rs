@@ -53,6 +53,14 @@ impl ParameterLayout {
         start
     }
 
+    /// Multiplies the initial values of the parameters whose names begin with `prefix` by `factor`.
+    pub fn scale_init(&mut self, prefix: &str, factor: f64) {
+        for p in self.parameters.iter_mut().filter(|p| p.name.starts_with(prefix)) {
+            let (Init::Constant(x) | Init::Uniform(x) | Init::Normal(x)) = &mut p.init;
+            *x *= factor;
+        }
+    }
+
     /// Length of the flat vector.
     pub fn len(&self) -> usize {
         self.parameters.last().map_or(0, |p| p.range.end)

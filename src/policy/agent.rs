@@ -36,9 +36,10 @@ pub struct Dims {
     pub env: EnvParams,
 }
 
-/// What is added to the Q-value of the advised heading before training: more than the differences of untrained Q-values, so that an
-/// untrained policy follows the advice nearly always.
-const TRUST: f64 = 2.0;
+/// What is added to the Q-value of the advised heading before training, and the factor of the initial weights of the last layers. The
+/// other differences of untrained Q-values are then smaller, so an untrained policy follows the advice.
+const TRUST: f64 = 0.1;
+const QUIET: f64 = 0.02;
 
 /// An agent's architecture and the layout of its parameters.
 #[derive(Clone, Debug)]
@@ -134,7 +135,11 @@ impl Agent {
         };
         let context = if config.gnn == Gnn::None { HIDDEN } else { 2 * HIDDEN };
         let goals = (!config.memory.is_none()).then(|| GoalHead::new(&mut layout, "agent.goals", context, advice > 0));
-        let advice = (advice > 0).then(|| layout.add("agent.advice", &[1], Init::Constant(TRUST)));
+        let advice = (advice > 0).then(|| {
+            let last_layers = ["agent.head.weight", "agent.head.bias", "agent.head.3.", "agent.goals.2."];
+            last_layers.iter().for_each(|name| layout.scale_init(name, QUIET));
+            layout.add("agent.advice", &[1], Init::Constant(TRUST))
+        });
         Self { config, dims, layout, sets, fc, rnn, body, goals, advice, observation_width: observation }
     }
 
