@@ -278,7 +278,7 @@ mod tests {
         let graph = FleetGraph::from_scene(&[[0.1, 0.1]], &vec![[0.9, 0.9]; users], &vec![1.0; users], 0.28);
         let mut goals = Goals::default();
         goals.clear();
-        goals.push_fleet(&env, &graph.sight().unwrap(), 60, memories(&memory, users), (&[0], None));
+        goals.push_fleet((&env, &graph.sight().unwrap(), 60), memories(&memory, users), (&[0], None));
         assert_eq!(goals.len(), MAX_USERS + MAX_BLOCKS);
         let (oldest, user_goals) = (ln1(50.0), goals.features().chunks_exact(FEATURES).take(MAX_USERS));
         assert!(user_goals.into_iter().all(|features| f64::from(features[3]) > oldest), "AoI on arrival");
