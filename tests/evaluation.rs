@@ -1,5 +1,6 @@
 //! Traced evaluations: they agree with plain evaluations, and disturbances have their documented effect only.
 
+use std::process::{Command, Output};
 use std::sync::Mutex;
 
 use qedgix::env::{EnvConfig, EpisodeMetrics, LostUav};
@@ -193,4 +194,60 @@ fn errors_name_the_invalid_field() {
         evaluate_traced(&RecordingPolicy(Mutex::default()), &env, &[1], 1, &Disturbance::default(), 1).unwrap_err().field,
         "traced"
     );
+}
+
+/// Runs the command in `dir`.
+fn command(dir: &tempfile::TempDir, line: &str) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_qedgix")).args(line.split(' ')).current_dir(dir).output().unwrap()
+}
+
+fn document(output: &Output) -> serde_json::Value {
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+#[test]
+fn an_audit_says_what_uavs_need() {
+    let dir = tempfile::tempdir().unwrap();
+    for (policy, passes) in [("qmix", true), ("sweep-shared", true), ("nearest", false), ("tour", false)] {
+        let output = command(&dir, &format!("audit --policy {policy} --episodes 3 --threads 1 --json"));
+        let report = document(&output);
+        assert_eq!((output.status.code(), &report["passed"]), (Some(i32::from(!passes)), &passes.into()), "{policy}");
+        assert_eq!(report["why"].is_string(), !passes);
+        if passes {
+            assert_eq!((&report["needs"]["message_links"], &report["needs"]["message_range"]), (&1.into(), &0.28.into()));
+            assert_eq!(report["trials"][1]["same_bits"], 1.0);
+        }
+    }
+}
+
+#[test]
+fn a_plan_finds_the_smallest_fleet_that_meets_the_target() {
+    let dir = tempfile::tempdir().unwrap();
+    let line = "plan --policy sweep-shared --users 4 --target-p95 25 --episodes 12 --threads 1 --failures --report out --json";
+    let output = command(&dir, line);
+    assert_eq!(output.status.code(), Some(0), "{output:?}");
+    let plan = document(&output);
+    let uavs = plan["uavs"].as_u64().unwrap() as usize;
+    let p95 = |size: usize, end: &str| plan["sizes"][size - 1]["p95_aoi"][end].as_f64().unwrap();
+    assert!(p95(uavs, "mean") <= 25.0 && (1..uavs).all(|size| p95(size, "mean") > 25.0), "{plan}");
+    let [low, high] = [0, 1].map(|end| plan["interval"][end].as_u64().unwrap() as usize);
+    assert!(low <= uavs && uavs <= high && p95(high, "high") <= 25.0);
+    assert_eq!(plan["failures"].as_array().unwrap().len(), 8);
+    for file in ["plan.svg", "failures.svg", "plan.json"] {
+        assert!(std::fs::metadata(dir.path().join("out").join(file)).unwrap().len() > 500, "{file}");
+    }
+    let none = command(&dir, "plan --policy random --target-p95 0.5 --max-uavs 2 --episodes 2 --threads 1 --json");
+    assert_eq!((none.status.code(), &document(&none)["uavs"]), (Some(1), &serde_json::Value::Null));
+}
+
+#[test]
+fn explanations_are_drawn_and_written() {
+    let dir = tempfile::tempdir().unwrap();
+    let output = command(&dir, "evaluate --policy qmix --policy sweep --episodes 2 --threads 1 --explain why");
+    assert_eq!(output.status.code(), Some(0), "{output:?}");
+    let read = |name: &str| std::fs::read_to_string(dir.path().join("why").join(name)).unwrap();
+    assert!(read("explain-1-qmix.svg").contains("for the heading") && !read("explain-2-sweep.svg").contains("for the heading"));
+    let slots: serde_json::Value = serde_json::from_str(&read("explain-1-qmix.json")).unwrap();
+    assert_eq!(slots["slots"].as_array().unwrap().len(), 80);
+    assert!(!slots["slots"][0]["influences"].as_array().unwrap().is_empty());
 }

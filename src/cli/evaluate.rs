@@ -9,7 +9,7 @@ use clap::Args;
 use super::connect::ConnectArgs;
 use super::files::read_if_exists;
 use super::output::{errln, outln};
-use super::{act_client, ports, progress, report, run_args::all_cores, table};
+use super::{act_client, explain, ports, progress, report, run_args::all_cores, table};
 use crate::checkpoint::Checkpoint;
 use crate::env::{EnvConfig, LostUav, UserSlots};
 use crate::invalid::Invalid;
@@ -89,6 +89,10 @@ pub struct EvaluateArgs {
     /// Index of the layout (from 0) whose trajectories the report shows
     #[arg(long, env = "QEDGIX_REPORT_LAYOUT", value_name = "N", default_value_t = 0)]
     report_layout: usize,
+    /// Write into this directory, for each policy with Q-values, what speaks for and against its headings on one layout
+    /// (--report-layout): explain-N-POLICY.svg and .json
+    #[arg(long, env = "QEDGIX_EXPLAIN", value_name = "DIR")]
+    explain: Option<PathBuf>,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -147,6 +151,10 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
         }
     }
     bar.finish_and_clear();
+    if let Some(directory) = &args.explain {
+        explain::write(directory, &args.policy, &env, seeds[args.report_layout])
+            .with_context(|| format!("writing explanations to {}", directory.display()))?;
+    }
 
     let comparison = Comparison { layouts: list, episodes: seeds.len(), env, disturbance, policies: evaluations };
     if let Some(directory) = &args.report {
@@ -191,6 +199,10 @@ fn check(args: &EvaluateArgs) -> anyhow::Result<(LayoutList, Vec<u64>, EnvConfig
         "--report-layout: got {}, expected a number from 0 to {}",
         args.report_layout,
         seeds.len() - 1
+    );
+    ensure!(
+        args.explain.is_none() || (args.server.is_none() && !list.mixed),
+        "--explain works for files, bundled policies and baselines, on lists that are not mixed; leave out --server"
     );
     let local_only = args.report.is_some() || args.disturbance() != Disturbance::default();
     ensure!(

@@ -9,12 +9,14 @@ mod connect;
 mod demo;
 mod evaluate;
 mod experiment;
+mod explain;
 mod files;
 mod in_process_server;
 mod jobs;
 mod keys;
 mod manual;
 mod output;
+mod plan;
 mod policies;
 mod ports;
 mod progress;
@@ -62,6 +64,8 @@ enum Command {
     Evaluate(evaluate::EvaluateArgs),
     /// Check whether UAVs can decide alone by a policy, and what they need for it
     Audit(audit::AuditArgs),
+    /// Find the number of UAVs that a policy needs for so many users
+    Plan(plan::PlanArgs),
     /// List, upload, export, load and unload policies of a server, and move aliases
     Policies(policies::PoliciesArgs),
     /// Show or change a running server: its CPU budget
@@ -103,6 +107,7 @@ pub fn run() -> ExitCode {
         Command::Jobs(args) => block_on(jobs::run(args)),
         Command::Evaluate(args) => block_on(evaluate::run(args)),
         Command::Audit(args) => block_on(audit::run(args)),
+        Command::Plan(args) => block_on(plan::run(args)),
         Command::Policies(args) => block_on(policies::run(args)),
         Command::Server(args) => block_on(server::run(args)),
         Command::Experiment(args) => block_on(experiment::run(args)),

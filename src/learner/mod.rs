@@ -5,6 +5,7 @@ mod disturbance;
 mod episodes;
 mod evaluation;
 mod event;
+mod explained;
 mod layouts;
 pub mod loss;
 mod memory;
@@ -28,7 +29,8 @@ pub use loss::LossMetrics;
 pub use memory::MemoryEstimate;
 pub use rollout::Rollout;
 pub use snapshot::SnapshotError;
-pub use summary::{Difference, Interval, Summary, difference, summarize};
+pub use explained::{ExplainedSlot, explained_flight};
+pub use summary::{Difference, Interval, Summary, difference, interval, summarize};
 pub use trainer::Trainer;
 pub use update::{Learner, LearnerState};
 

@@ -54,7 +54,7 @@ pub struct Difference {
 /// [`Invalid`] if there are no episodes.
 pub fn summarize(episodes: &[EpisodeMetrics]) -> Result<Summary, Invalid> {
     let aoi: Vec<f64> = episodes.iter().map(|e| e.mean_aoi).collect();
-    Ok(Summary { episodes: episodes.len(), mean_aoi: bootstrap(&aoi)?, mean: EpisodeMetrics::mean(episodes) })
+    Ok(Summary { episodes: episodes.len(), mean_aoi: interval(&aoi)?, mean: EpisodeMetrics::mean(episodes) })
 }
 
 /// The paired difference of two policies evaluated on the same layouts, in the same order.
@@ -71,11 +71,14 @@ pub fn difference(first: &[EpisodeMetrics], second: &[EpisodeMetrics]) -> Result
     }
     let aoi: Vec<f64> = first.iter().zip(second).map(|(a, b)| a.mean_aoi - b.mean_aoi).collect();
     let wins = aoi.iter().filter(|&&d| d < 0.0).count() as f64 / aoi.len().max(1) as f64;
-    Ok(Difference { mean_aoi: bootstrap(&aoi)?, wins })
+    Ok(Difference { mean_aoi: interval(&aoi)?, wins })
 }
 
-/// Percentile bootstrap of the mean.
-fn bootstrap(values: &[f64]) -> Result<Interval, Invalid> {
+/// The mean of `values` with the interval of the percentile bootstrap.
+///
+/// # Errors
+/// [`Invalid`] if there are no values.
+pub fn interval(values: &[f64]) -> Result<Interval, Invalid> {
     if values.is_empty() {
         return Err(Invalid::new("episodes", 0, "at least 1"));
     }

@@ -45,6 +45,17 @@ pub struct Bar {
     pub high: f64,
 }
 
+/// What speaks for or against the heading of a UAV, drawn from the UAV to it.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Pull {
+    /// Position of the UAV.
+    pub from: Point,
+    /// Position of the node.
+    pub to: Point,
+    /// From -1, against the heading, to 1, for it.
+    pub strength: f64,
+}
+
 /// The paths of a fleet in one episode. Lengths are in units of the square's side.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Trajectories {

@@ -13,9 +13,9 @@ mod scale;
 mod trajectories;
 
 pub use bars::bars;
-pub use data::{Bar, Chart, Series, Trajectories};
+pub use data::{Bar, Chart, Pull, Series, Trajectories};
 pub use lines::{distribution, lines};
-pub use trajectories::trajectories;
+pub use trajectories::{explained, trajectories};
 
 #[cfg(test)]
 mod tests;

@@ -4,7 +4,7 @@ use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, VPos};
 
 use super::canvas::{self, Axes, BOTTOM, Drawn, INK, Key, Legend, Plot, QUIET, TEXT, WIDTH, Words, text};
-use super::data::Trajectories;
+use super::data::{Pull, Trajectories};
 use super::palette::Look;
 use super::scale::{drawable, extent};
 use crate::env::Point;
@@ -21,9 +21,16 @@ const ARROW_INTERVAL: usize = 4;
 const MAX_NUMBERED: usize = 60;
 const USER: RGBColor = QUIET;
 const START: RGBColor = INK;
+const FOR: RGBColor = RGBColor(0x1b, 0x7f, 0x5c);
+const AGAINST: RGBColor = RGBColor(0xb2, 0x3a, 0x48);
 
 /// Users, circles and paths as SVG, over the unit square and the area around it that UAVs reached.
 pub fn trajectories(title: &str, shown: &Trajectories) -> String {
+    explained(title, shown, &[])
+}
+
+/// As [`trajectories`], with what speaks for and against the headings: the stronger, the wider the line.
+pub fn explained(title: &str, shown: &Trajectories, pulls: &[Pull]) -> String {
     let users: Vec<(usize, Point)> = shown.users.iter().copied().enumerate().filter(|(_, p)| visible(p)).collect();
     let paths: Vec<Vec<Point>> = shown.uavs.iter().map(|path| path.iter().copied().filter(visible).collect()).collect();
     if users.is_empty() && paths.iter().all(Vec::is_empty) {
@@ -36,7 +43,7 @@ pub fn trajectories(title: &str, shown: &Trajectories) -> String {
     let range = range.start - margin..range.end + margin;
     let scale = f64::from(PLOT) / (range.end - range.start);
     let circle = if shown.transmission_range > 0.0 { (shown.transmission_range * scale).min(4e3) as i32 } else { 0 };
-    let legend = Legend::new(entries(paths.len()));
+    let legend = Legend::new(entries(paths.len(), !pulls.is_empty()));
     let words =
         Words { title, description: format!("The paths of {} UAVs over {} users, from above.", paths.len(), users.len()) };
     canvas::draw((SIZE.0, SIZE.1 + legend.height()), &words, |sheet| {
@@ -49,6 +56,12 @@ pub fn trajectories(title: &str, shown: &Trajectories) -> String {
         for (_, [x, y]) in &users {
             plot.plotting_area().draw(&Circle::new((*x, *y), circle, USER.mix(0.07).filled()))?;
             plot.plotting_area().draw(&Circle::new((*x, *y), circle, USER.mix(0.45)))?;
+        }
+        for Pull { from, to, strength } in pulls.iter().filter(|pull| visible(&pull.from) && visible(&pull.to)) {
+            let style = if *strength < 0.0 { AGAINST } else { FOR };
+            let width = (strength.abs() * 6.0).clamp(1.0, 6.0) as u32;
+            let line = PathElement::new([(from[0], from[1]), (to[0], to[1])], style.mix(0.45).stroke_width(width));
+            plot.plotting_area().draw(&line)?;
         }
         for (i, path) in paths.iter().enumerate() {
             let line = colour(i).mix(0.75).stroke_width(2);
@@ -91,12 +104,15 @@ fn arrows(plot: &mut Plot, i: usize, path: &[Point], size: f64) -> Drawn {
     Ok(())
 }
 
-fn entries(uavs: usize) -> Vec<(Key, String)> {
+fn entries(uavs: usize, explained: bool) -> Vec<(Key, String)> {
     let mut entries = vec![
         (Key::Ring(START, 7), "start".to_owned()),
         (Key::Dot(USER, 5), "user".to_owned()),
         (Key::Ring(USER, 9), "collected within".to_owned()),
     ];
+    if explained {
+        entries.extend([(Key::Dot(FOR, 5), "for the heading".to_owned()), (Key::Dot(AGAINST, 5), "against it".to_owned())]);
+    }
     entries.extend((0..uavs).map(|i| (Key::Line(Look::of_index(i), true), format!("UAV {i}"))));
     entries.push((Key::Note, "Arrows point along the flight, every fourth slot; a path ends at its dot.".to_owned()));
     entries

@@ -143,6 +143,23 @@ impl FleetGraph {
         complete
     }
 
+    /// The same graph with those detections for which `keep(node, target)` is true.
+    pub fn filtered(&self, keep: impl Fn(usize, usize) -> bool) -> Self {
+        let mut filtered = Self { offsets: vec![0], detections: Vec::with_capacity(self.detections.len()), ..self.clone() };
+        for node in 0..self.offsets.len() - 1 {
+            filtered.detections.extend(self.detections(node).iter().filter(|d| keep(node, d.target as usize)));
+            filtered.offsets.push(filtered.detections.len() as u32);
+        }
+        filtered
+    }
+
+    /// Moves UAV `uav` to where UAV `to` is, if their positions are known. The detections remain.
+    pub fn place_uav(&mut self, uav: usize, to: usize) {
+        if let Some(positions) = &mut self.uav_positions {
+            positions[uav] = positions[to];
+        }
+    }
+
     /// Adds users that no node detects, until there are `users`.
     pub fn add_undetected_users(&mut self, users: usize) {
         if users > self.users {

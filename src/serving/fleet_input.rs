@@ -346,7 +346,7 @@ impl ReportedGraph {
     }
 
     /// Rejects detections far beyond the range: the caller uses other units, or a sensor that the policy was not trained with.
-    fn check_ranges(&self, ranges: Ranges) -> Result<(), Invalid> {
+    pub(super) fn check_ranges(&self, ranges: Ranges) -> Result<(), Invalid> {
         let uavs = self.positions.len();
         for (node, list) in self.detections.iter().enumerate() {
             for detection in list.iter().filter(|d| !d.mirrored) {

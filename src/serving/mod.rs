@@ -23,7 +23,7 @@ mod roster;
 mod sessions;
 mod table;
 
-pub use engine::{Decision, Engine, EngineConfig, OutputBuffers, Task, TaskOutput, Timings};
+pub use engine::{Decision, Engine, EngineConfig, NamedInfluence, OutputBuffers, Task, TaskOutput, Timings};
 pub use environments::{
     CopyObservation, CopyState, Environment, EnvironmentInfo, EnvironmentReset, EnvironmentSpec, EnvironmentState,
     EnvironmentStep, Environments, EpisodeCursor, FinishedEpisode,

@@ -178,7 +178,7 @@ impl Model {
 fn request(policy: Option<&str>, scene: v1::Scene, memory: act::MemoryLocation, step: Option<u64>) -> act::Request {
     let input = FleetInput::try_from(scene).unwrap();
     let policy = policy.map(|policy| policy.parse().unwrap());
-    act::Request { policy, input, memory, step, run_id: None, seed: None, flight: None, return_motion: false }
+    act::Request { policy, input, memory, step, run_id: None, seed: None, flight: None, return_motion: false, explain: false }
 }
 
 /// Calls `act`; panics if it has to wait.

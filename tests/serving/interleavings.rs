@@ -235,6 +235,7 @@ impl Model {
             seed: None,
             flight: None,
             return_motion: false,
+            explain: false,
         };
         let app = self.app.clone();
         let answer = async move {

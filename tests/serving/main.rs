@@ -9,6 +9,7 @@ mod certificates;
 mod conversion;
 mod decentral;
 mod environments;
+mod explain;
 mod fleets;
 mod guard;
 mod harness;

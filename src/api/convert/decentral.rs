@@ -77,6 +77,7 @@ pub fn action(decided: &Decided, wanted: Wanted) -> Action {
         velocity: wanted.velocity.then(|| flight.velocity(heading, *speed)),
         waypoint: position.filter(|_| wanted.waypoint).map(|at| flight.waypoint(at, heading, *speed)),
         overruled: None,
+        influences: Vec::new(),
     }
 }
 

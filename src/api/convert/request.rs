@@ -27,6 +27,8 @@ pub struct ActFields {
     pub flight: FlightFields,
     /// Whether velocities or waypoints are requested.
     pub return_motion: bool,
+    /// Whether the response says why.
+    pub explain: bool,
 }
 
 impl ActFields {
@@ -35,13 +37,13 @@ impl ActFields {
     /// # Errors
     /// [`Invalid`] for an invalid name, an area without size, or if there is neither a scene nor a graph.
     pub fn request(self, input: Option<FleetInput>) -> Result<act::Request, Invalid> {
-        let Self { policy, session_id, recurrent_state, step, run_id, seed, flight, return_motion } = self;
+        let Self { policy, session_id, recurrent_state, step, run_id, seed, flight, return_motion, explain } = self;
         let flight = flight.options()?;
         let policy = if policy.is_empty() { None } else { Some(policy.parse()?) };
         check_ids(session_id.as_deref(), run_id.as_deref())?;
         let memory = session_id.map_or(act::MemoryLocation::RecurrentState(recurrent_state), act::MemoryLocation::Session);
         let input = input.ok_or_else(|| Invalid::missing("observation", "a graph or a scene"))?;
-        Ok(act::Request { policy, input, memory, step, run_id, seed, flight, return_motion })
+        Ok(act::Request { policy, input, memory, step, run_id, seed, flight, return_motion, explain })
     }
 }
 
@@ -56,8 +58,9 @@ impl TryFrom<v1::ActRequest> for act::Request {
     fn try_from(request: v1::ActRequest) -> Result<Self, Invalid> {
         use v1::act_request::{Memory, Observation as Sent};
         let return_motion = request.return_velocity || request.return_waypoint;
-        let v1::ActRequest { policy, observation, memory, step, run_id, seed, symmetric, frame, world, constraints, .. } =
-            request;
+        let v1::ActRequest {
+            policy, observation, memory, step, run_id, seed, symmetric, frame, world, constraints, explain, ..
+        } = request;
         let flight = flight::fields(frame, world, symmetric, constraints)?;
         let (session_id, recurrent_state) = match memory {
             Some(Memory::SessionId(id)) => (Some(id), Bytes::new()),
@@ -69,7 +72,7 @@ impl TryFrom<v1::ActRequest> for act::Request {
             Some(Sent::Scene(scene)) => Some(scene.try_into()?),
             None => None,
         };
-        ActFields { policy, session_id, recurrent_state, step, run_id, seed, flight, return_motion }.request(input)
+        ActFields { policy, session_id, recurrent_state, step, run_id, seed, flight, return_motion, explain }.request(input)
     }
 }
 

@@ -11,7 +11,7 @@ use crate::policy::RequiredInput;
 use crate::service::act;
 use crate::service::policies::{PolicyDetails, VersionSummary};
 use crate::serving::flight::degrees;
-use crate::serving::{Constraint, Decision, Overruled, PolicyInfo, PolicyKind, PolicyRef, SessionInfo, Warning};
+use crate::serving::{Constraint, Decision, NamedInfluence, Overruled, PolicyInfo, PolicyKind, PolicyRef, SessionInfo, Warning};
 use crate::wire::v1;
 
 /// The action of one UAV.
@@ -31,6 +31,8 @@ pub struct Action {
     pub waypoint: Option<Point>,
     /// What constraints did to the heading, if anything.
     pub overruled: Option<Overruled>,
+    /// Why, if that was asked for.
+    pub influences: Vec<NamedInfluence>,
 }
 
 /// What a request wants of each UAV besides its heading.
@@ -50,7 +52,7 @@ pub fn actions(response: &mut act::Response, wanted: Wanted) -> impl Iterator<It
     let act::Response {
         canonical_of_request,
         uavs,
-        decision: Decision { headings, q_values: values, overruled, .. },
+        decision: Decision { headings, q_values: values, overruled, influences, .. },
         flight,
         motion,
         ..
@@ -68,6 +70,7 @@ pub fn actions(response: &mut act::Response, wanted: Wanted) -> impl Iterator<It
             q_values: if wanted.q_values && q.iter().all(|q| q.is_finite()) { q.to_vec() } else { Vec::new() },
             velocity: flight.as_ref().filter(|_| wanted.velocity).map(|flight| flight.velocity(heading, speed)),
             overruled: overruled.iter().find(|overruled| overruled.uav as usize == uav).cloned(),
+            influences: influences.iter().filter(|of| of.uav as usize == uav).cloned().collect(),
             waypoint: flight.as_ref().zip(at).map(|(flight, at)| flight.waypoint(at, heading, speed)),
         }
     })
@@ -100,6 +103,7 @@ impl From<Action> for v1::Action {
             velocity: action.velocity.map(|[x, y]| v1::Velocity { x, y }),
             waypoint: action.waypoint.map(|[x, y]| v1::Position { x, y, z: None }),
             overruled: action.overruled.map(Into::into),
+            influences: action.influences.into_iter().map(Into::into).collect(),
         }
     }
 }
@@ -121,6 +125,12 @@ impl From<SessionInfo> for v1::Session {
             owner: session.owner.id().unwrap_or_default().to_owned(),
             warnings: session.warnings.into_iter().map(Into::into).collect(),
         }
+    }
+}
+
+impl From<NamedInfluence> for v1::Influence {
+    fn from(of: NamedInfluence) -> Self {
+        Self { node_id: of.node, message: of.message, change: of.change }
     }
 }
 

@@ -73,6 +73,9 @@ struct ActRequest {
     /// Whether to return where each UAV should be after the slot. UAVs without a position in the request get none.
     #[serde(default)]
     return_waypoint: bool,
+    /// Whether to return what speaks for and against each heading. Takes a run of the policy per detection of a UAV.
+    #[serde(default)]
+    explain: bool,
 }
 
 fn example() -> serde_json::Value {
@@ -115,6 +118,7 @@ impl TryFrom<ActRequest> for act::Request {
             frame,
             world,
             constraints,
+            explain,
             ..
         } = request;
         let flight = flight::fields(frame, world, symmetric, constraints)?;
@@ -128,7 +132,7 @@ impl TryFrom<ActRequest> for act::Request {
             return Err(Invalid::schema("session_id", "session_id and recurrent_state", "one of them"));
         }
         let recurrent_state = recurrent_state.map(|state| state.0).unwrap_or_default();
-        ActFields { policy, session_id, recurrent_state, step, run_id, seed, flight, return_motion }.request(observation)
+        ActFields { policy, session_id, recurrent_state, step, run_id, seed, flight, return_motion, explain }.request(observation)
     }
 }
 
@@ -171,6 +175,20 @@ pub(super) struct Action {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
     overruled: Option<Overruled>,
+    /// What speaks for and against the heading, the strongest first, if `explain` was set and if the policy has Q-values.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    influences: Vec<Influence>,
+}
+
+/// What one detection, or one message of another UAV, means for the heading that the policy prefers.
+#[derive(Debug, Serialize, ToSchema)]
+struct Influence {
+    /// The node that the UAV detects, or the UAV that sends the message.
+    node_id: String,
+    /// Whether it is the message of the node: what it detects and remembers. Otherwise it is its detection.
+    message: bool,
+    /// The Q-value of the heading minus that without the detection or message. Positive: it speaks for the heading.
+    change: f32,
 }
 
 impl From<response::Action> for Action {
@@ -183,6 +201,11 @@ impl From<response::Action> for Action {
             velocity: action.velocity.map(Into::into),
             waypoint: action.waypoint.map(Into::into),
             overruled: action.overruled.map(Into::into),
+            influences: action
+                .influences
+                .into_iter()
+                .map(|of| Influence { node_id: of.node, message: of.message, change: of.change })
+                .collect(),
         }
     }
 }

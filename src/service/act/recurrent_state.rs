@@ -52,6 +52,7 @@ pub(super) async fn act(
     };
     let task = Task::new(policy.clone(), input, step, memory, OutputBuffers::default()).with_change(Some(Box::new(change)));
     let task = Placed::in_world(task, flight.as_ref(), speeds, endurance);
+    let task = if request.explain { task.explained(fleet.clone()) } else { task };
     let output = compute::run(app, owner, task, deadline).await?;
     let memory = output.memory.into_packed(implementation, roster.size());
     let (digest, step, members) = (policy.reference.digest, step.saturating_add(1), Members::Roster(roster));

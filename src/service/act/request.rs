@@ -30,6 +30,8 @@ pub struct Request {
     pub flight: Option<Box<FlightOptions>>,
     /// Whether the response has what velocities and waypoints follow from.
     pub return_motion: bool,
+    /// Whether the response says why.
+    pub explain: bool,
 }
 
 /// Where the memory of a fleet is kept between slots.

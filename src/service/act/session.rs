@@ -23,7 +23,8 @@ pub(super) async fn act(app: &App, session: &Session, request: Request, deadline
         return Err(Invalid::new("frame", "frame, world, symmetric or constraints", expected).into());
     }
     let placed = Placed::new(request.input, session.policy(), session.flight(), request.return_motion)?;
-    advance(app, session, SessionStep::new(placed, session.policy(), request.step, request.run_id)?, deadline).await
+    let step = SessionStep::new(placed, session.policy(), request.step, request.run_id)?;
+    advance(app, session, SessionStep { explain: request.explain, ..step }, deadline).await
 }
 
 /// A step with the input of the session's policy.
@@ -39,6 +40,7 @@ pub(super) struct SessionStep {
     motion: Option<Motion>,
     step: Option<u64>,
     run_id: Option<String>,
+    explain: bool,
 }
 
 impl SessionStep {
@@ -47,7 +49,8 @@ impl SessionStep {
         let Placed { fleet, canonical_of_request, content, speeds, endurance, flight, motion } = placed;
         let only_detected = policy.implementation.remembers_users() && content.lists_only_detected();
         let input = content.into_task_input(fleet.size(), &*policy.implementation, sensing)?;
-        Ok(Self { fleet, canonical_of_request, only_detected, input, speeds, endurance, flight, motion, step, run_id })
+        let explain = false;
+        Ok(Self { fleet, canonical_of_request, only_detected, input, speeds, endurance, flight, motion, step, run_id, explain })
     }
 }
 
@@ -59,7 +62,19 @@ pub(super) async fn advance(
     deadline: Option<Instant>,
 ) -> Result<Response, Error> {
     let policy = session.policy().clone();
-    let SessionStep { fleet, canonical_of_request, only_detected, input, speeds, endurance, flight, motion, step, run_id } = step;
+    let SessionStep {
+        fleet,
+        canonical_of_request,
+        only_detected,
+        input,
+        speeds,
+        endurance,
+        flight,
+        motion,
+        step,
+        run_id,
+        explain,
+    } = step;
     let listed = Listed { fleet: &fleet, only_detected };
     let decision = match session.begin_step(listed, step, run_id.as_deref(), app.absent_after).await? {
         StepStart::Repeated(decision) => decision,
@@ -67,6 +82,7 @@ pub(super) async fn advance(
             let (memory, buffers) = (std::mem::take(&mut pending.memory), std::mem::take(&mut pending.buffers));
             let task = Task::new(policy.clone(), input, pending.step, memory, buffers).with_change(pending.change.take());
             let task = Placed::in_world(task, flight.as_ref(), speeds, endurance);
+            let task = if explain { task.explained(fleet.clone()) } else { task };
             pending.commit(compute::run(app, session.owner(), task, deadline).await?)?
         }
     };

@@ -20,7 +20,7 @@ mod metrics;
 mod queue;
 mod task;
 
-pub use task::{Decision, OutputBuffers, Task, TaskOutput, Timings};
+pub use task::{Decision, NamedInfluence, OutputBuffers, Task, TaskOutput, Timings};
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicU32, Ordering};

@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::invalid::Invalid;
-use crate::policy::{EnvParams, FleetGraph, FleetProfile, FleetStep};
-use crate::serving::{FleetChange, FleetMemory, Guard, LoadedPolicy, Overruled, SceneOrGraph, Sensing, Situation, TaskInput};
+use crate::policy::{DecidedSlot, EnvParams, FleetGraph, FleetProfile, FleetStep};
+use crate::serving::{FleetChange, FleetIds, FleetMemory, Guard, LoadedPolicy, Overruled, SceneOrGraph, Sensing, Situation, TaskInput};
 
 /// One fleet in one slot, with buffers for the output.
 #[derive(Debug)]
@@ -24,6 +24,8 @@ pub struct Task {
     env: EnvParams,
     /// Constraints, and the slots that each UAV can still fly.
     guard: Option<(Arc<Guard>, Vec<f64>)>,
+    /// The ids of the fleet if the decision is to be explained, and the memory before the slot.
+    explain: Option<Box<(FleetIds, Vec<f32>)>>,
     /// The memory of a fleet of which some UAVs are missing.
     all: Option<Vec<f32>>,
     /// The memory before the slot, until [`Task::prepare`] moves it to `numbers`.
@@ -56,7 +58,25 @@ pub struct Decision {
     pub timings: Timings,
     /// What constraints changed.
     pub overruled: Vec<Overruled>,
+    /// Why, if that was asked for.
+    pub influences: Vec<NamedInfluence>,
 }
+
+/// What a detection or a message means for the heading of a UAV, see [`Influence`](crate::policy::Influence).
+#[derive(Clone, Debug, PartialEq)]
+pub struct NamedInfluence {
+    /// Canonical index of the UAV.
+    pub uav: u32,
+    /// Id of the node.
+    pub node: String,
+    /// Whether it is the message of the node.
+    pub message: bool,
+    /// Change of the Q-value of the policy's heading.
+    pub change: f32,
+}
+
+/// Limit of an explanation: runs of the policy, times numbers of its memory and detections. About 0.1 s.
+const MAX_EXPLAINED: usize = 1 << 24;
 
 /// Duration of a task.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -88,7 +108,7 @@ impl Task {
         headings.resize(uavs, 0);
         q_values.clear();
         q_values.resize(uavs * policy.implementation.actions(), f32::NAN);
-        let decision = Decision { step, headings, q_values, timings: Timings::default(), overruled: Vec::new() };
+        let decision = Decision { step, headings, q_values, timings: Timings::default(), overruled: Vec::new(), influences: Vec::new() };
         let work = policy.implementation.work(uavs, users, input.detection_count());
         let (graph, unconverted) = match input {
             TaskInput::Graph(graph) => (graph, None),
@@ -104,6 +124,7 @@ impl Task {
             profile: None,
             env,
             guard: None,
+            explain: None,
             all: None,
             memory,
             numbers: Vec::new(),
@@ -137,6 +158,13 @@ impl Task {
         self
     }
 
+    /// The same task, whose decision is explained. `ids`: those of the input.
+    #[must_use]
+    pub fn explained(mut self, ids: FleetIds) -> Self {
+        self.explain = Some(Box::new((ids, Vec::new())));
+        self
+    }
+
     /// The policy version to run.
     pub fn policy(&self) -> &Arc<LoadedPolicy> {
         &self.policy
@@ -161,7 +189,32 @@ impl Task {
                 }
             }
         }
+        if let Some(explain) = &mut self.explain {
+            let (runs, numbers) = (DecidedSlot::runs(&self.graph), self.numbers.len());
+            if runs * (numbers + self.graph.detection_count() + 1024) > MAX_EXPLAINED {
+                let expected = "a smaller fleet: to explain a slot, the policy is run once per detection of a UAV";
+                return Err(Invalid::new("explain", format!("{runs} runs of the policy"), expected));
+            }
+            explain.1 = self.numbers.clone();
+        }
         Ok(())
+    }
+
+    /// What speaks for and against the headings of the policy.
+    fn influences(&self) -> Vec<NamedInfluence> {
+        let Some((ids, memory)) = self.explain.as_deref() else { return Vec::new() };
+        let decided = DecidedSlot {
+            env: self.env,
+            graph: &self.graph,
+            step: self.decision.step,
+            profile: self.profile.as_deref(),
+            memory,
+            headings: &self.decision.headings,
+            q_values: &self.decision.q_values,
+        };
+        let id = |node: u32| ids.uavs.iter().chain(&ids.users).nth(node as usize).cloned().unwrap_or_default();
+        let influences = decided.explain(&*self.policy.implementation).into_iter();
+        influences.map(|of| NamedInfluence { uav: of.uav, node: id(of.node), message: of.message, change: of.change }).collect()
     }
 
     /// The arguments of the policy for this task. [`Task::prepare`] has succeeded.
@@ -173,6 +226,7 @@ impl Task {
     }
 
     pub(super) fn finish(mut self, timings: Timings) -> TaskOutput {
+        self.decision.influences = self.influences();
         let policy = &*self.policy.implementation;
         if let (Some((guard, endurance)), Some(positions)) = (&self.guard, self.graph.uav_positions()) {
             let Decision { headings, q_values, overruled, .. } = &mut self.decision;

@@ -95,6 +95,17 @@ class Overruled(NamedTuple):
         return Overruled(overruled.preferred_heading_index, names(overruled.because), names(overruled.violates))
 
 
+class Influence(NamedTuple):
+    """What one detection, or one message of another UAV, means for a heading."""
+
+    node_id: str
+    """The node that the UAV detects, or the UAV that sends the message."""
+    message: bool
+    """Whether it is the message of the node: what it detects and remembers."""
+    change: float
+    """The Q-value of the heading minus that without the detection or message. Positive: it speaks for the heading."""
+
+
 class Decision:
     """The headings of one fleet for one slot, in the order of the UAVs in the observation."""
 
@@ -163,6 +174,15 @@ class Decision:
         """What constraints did, by id of the UAV; UAVs whose heading is that of the policy and breaks nothing are not in it."""
         return {
             action.uav_id: Overruled.of(action.overruled) for action in self.message.actions if action.HasField("overruled")
+        }
+
+    @property
+    def influences(self) -> dict[str, list[Influence]]:
+        """What speaks for and against the heading of each UAV, by id, the strongest first; empty without `explain`, and for
+        policies without Q-values."""
+        return {
+            action.uav_id: [Influence(of.node_id, of.message, of.change) for of in action.influences]
+            for action in self.message.actions
         }
 
     @property

@@ -240,6 +240,7 @@ class AsyncClient:
         symmetric: bool = True,
         q_values: bool = False,
         motion: bool = False,
+        explain: bool = False,
         timeout: float | None = None,
     ) -> Decision:
         """The headings for one observation of a fleet without a past. For more than one slot use a session.
@@ -250,7 +251,7 @@ class AsyncClient:
             QedgixError: as `act` of a session.
         """
         fleet = self.local_session(policy, seed=seed, frame=frame, world=world, constraints=constraints, symmetric=symmetric)
-        return await fleet.act(observation, q_values=q_values, motion=motion, timeout=timeout)
+        return await fleet.act(observation, q_values=q_values, motion=motion, explain=explain, timeout=timeout)
 
     async def act_batch(
         self,

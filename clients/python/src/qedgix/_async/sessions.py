@@ -55,6 +55,7 @@ class AsyncFleet:
         *,
         q_values: bool = False,
         motion: bool = False,
+        explain: bool = False,
         timeout: float | None = None,
     ) -> Decision:
         """Returns the headings for what the fleet observes in this slot, and goes on to the next slot.
@@ -66,6 +67,7 @@ class AsyncFleet:
             observation: a `Scene`, a `Graph`, their message or a dict.
             q_values: whether to return Q-values.
             motion: whether to return velocities and waypoints.
+            explain: whether to return what speaks for and against each heading; takes longer.
             timeout: seconds for all attempts. Default: that of the client.
 
         Raises:
@@ -75,6 +77,7 @@ class AsyncFleet:
             Unavailable, ResourceExhausted, DeadlineExceeded: no answer within the deadline.
         """
         request = self.request(observation, q_values=q_values, motion=motion)
+        request.explain = explain
         response = await self._transport.call(ACT, request, timeout)
         return self.accept(response)
 

@@ -241,6 +241,7 @@ class Client:
         symmetric: bool = True,
         q_values: bool = False,
         motion: bool = False,
+        explain: bool = False,
         timeout: float | None = None,
     ) -> Decision:
         """The headings for one observation of a fleet without a past. For more than one slot use a session.
@@ -251,7 +252,7 @@ class Client:
             QedgixError: as `act` of a session.
         """
         fleet = self.local_session(policy, seed=seed, frame=frame, world=world, constraints=constraints, symmetric=symmetric)
-        return fleet.act(observation, q_values=q_values, motion=motion, timeout=timeout)
+        return fleet.act(observation, q_values=q_values, motion=motion, explain=explain, timeout=timeout)
 
     def act_batch(
         self,

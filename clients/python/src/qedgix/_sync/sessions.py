@@ -56,6 +56,7 @@ class Fleet:
         *,
         q_values: bool = False,
         motion: bool = False,
+        explain: bool = False,
         timeout: float | None = None,
     ) -> Decision:
         """Returns the headings for what the fleet observes in this slot, and goes on to the next slot.
@@ -67,6 +68,7 @@ class Fleet:
             observation: a `Scene`, a `Graph`, their message or a dict.
             q_values: whether to return Q-values.
             motion: whether to return velocities and waypoints.
+            explain: whether to return what speaks for and against each heading; takes longer.
             timeout: seconds for all attempts. Default: that of the client.
 
         Raises:
@@ -76,6 +78,7 @@ class Fleet:
             Unavailable, ResourceExhausted, DeadlineExceeded: no answer within the deadline.
         """
         request = self.request(observation, q_values=q_values, motion=motion)
+        request.explain = explain
         response = self._transport.call(ACT, request, timeout)
         return self.accept(response)
 

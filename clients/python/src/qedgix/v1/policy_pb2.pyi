@@ -64,7 +64,7 @@ NEEDS_OWN_POSITIONS: Needs
 NEEDS_FULL_SCENE: Needs
 
 class ActRequest(_message.Message):
-    __slots__ = ("policy", "graph", "scene", "session_id", "recurrent_state", "step", "run_id", "return_q_values", "seed", "symmetric", "frame", "world", "return_velocity", "return_waypoint", "constraints")
+    __slots__ = ("policy", "graph", "scene", "session_id", "recurrent_state", "step", "run_id", "return_q_values", "seed", "symmetric", "frame", "world", "return_velocity", "return_waypoint", "constraints", "explain")
     POLICY_FIELD_NUMBER: _ClassVar[int]
     GRAPH_FIELD_NUMBER: _ClassVar[int]
     SCENE_FIELD_NUMBER: _ClassVar[int]
@@ -80,6 +80,7 @@ class ActRequest(_message.Message):
     RETURN_VELOCITY_FIELD_NUMBER: _ClassVar[int]
     RETURN_WAYPOINT_FIELD_NUMBER: _ClassVar[int]
     CONSTRAINTS_FIELD_NUMBER: _ClassVar[int]
+    EXPLAIN_FIELD_NUMBER: _ClassVar[int]
     policy: str
     graph: Graph
     scene: Scene
@@ -95,7 +96,8 @@ class ActRequest(_message.Message):
     return_velocity: bool
     return_waypoint: bool
     constraints: Constraints
-    def __init__(self, policy: _Optional[str] = ..., graph: _Optional[_Union[Graph, _Mapping]] = ..., scene: _Optional[_Union[Scene, _Mapping]] = ..., session_id: _Optional[str] = ..., recurrent_state: _Optional[bytes] = ..., step: _Optional[int] = ..., run_id: _Optional[str] = ..., return_q_values: bool = ..., seed: _Optional[int] = ..., symmetric: bool = ..., frame: _Optional[_Union[Frame, _Mapping]] = ..., world: _Optional[_Union[World, _Mapping]] = ..., return_velocity: bool = ..., return_waypoint: bool = ..., constraints: _Optional[_Union[Constraints, _Mapping]] = ...) -> None: ...
+    explain: bool
+    def __init__(self, policy: _Optional[str] = ..., graph: _Optional[_Union[Graph, _Mapping]] = ..., scene: _Optional[_Union[Scene, _Mapping]] = ..., session_id: _Optional[str] = ..., recurrent_state: _Optional[bytes] = ..., step: _Optional[int] = ..., run_id: _Optional[str] = ..., return_q_values: bool = ..., seed: _Optional[int] = ..., symmetric: bool = ..., frame: _Optional[_Union[Frame, _Mapping]] = ..., world: _Optional[_Union[World, _Mapping]] = ..., return_velocity: bool = ..., return_waypoint: bool = ..., constraints: _Optional[_Union[Constraints, _Mapping]] = ..., explain: bool = ...) -> None: ...
 
 class EncodeRequest(_message.Message):
     __slots__ = ("policy", "uav_ids", "user_ids", "observation", "state", "seed", "step", "frame", "world")
@@ -336,7 +338,7 @@ class ActResponse(_message.Message):
     def __init__(self, actions: _Optional[_Iterable[_Union[Action, _Mapping]]] = ..., policy: _Optional[_Union[PolicyRef, _Mapping]] = ..., step: _Optional[int] = ..., recurrent_state: _Optional[bytes] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ...) -> None: ...
 
 class Action(_message.Message):
-    __slots__ = ("uav_id", "heading_index", "heading_deg", "q_values", "velocity", "waypoint", "overruled")
+    __slots__ = ("uav_id", "heading_index", "heading_deg", "q_values", "velocity", "waypoint", "overruled", "influences")
     UAV_ID_FIELD_NUMBER: _ClassVar[int]
     HEADING_INDEX_FIELD_NUMBER: _ClassVar[int]
     HEADING_DEG_FIELD_NUMBER: _ClassVar[int]
@@ -344,6 +346,7 @@ class Action(_message.Message):
     VELOCITY_FIELD_NUMBER: _ClassVar[int]
     WAYPOINT_FIELD_NUMBER: _ClassVar[int]
     OVERRULED_FIELD_NUMBER: _ClassVar[int]
+    INFLUENCES_FIELD_NUMBER: _ClassVar[int]
     uav_id: str
     heading_index: int
     heading_deg: float
@@ -351,7 +354,18 @@ class Action(_message.Message):
     velocity: Velocity
     waypoint: Position
     overruled: Overruled
-    def __init__(self, uav_id: _Optional[str] = ..., heading_index: _Optional[int] = ..., heading_deg: _Optional[float] = ..., q_values: _Optional[_Iterable[float]] = ..., velocity: _Optional[_Union[Velocity, _Mapping]] = ..., waypoint: _Optional[_Union[Position, _Mapping]] = ..., overruled: _Optional[_Union[Overruled, _Mapping]] = ...) -> None: ...
+    influences: _containers.RepeatedCompositeFieldContainer[Influence]
+    def __init__(self, uav_id: _Optional[str] = ..., heading_index: _Optional[int] = ..., heading_deg: _Optional[float] = ..., q_values: _Optional[_Iterable[float]] = ..., velocity: _Optional[_Union[Velocity, _Mapping]] = ..., waypoint: _Optional[_Union[Position, _Mapping]] = ..., overruled: _Optional[_Union[Overruled, _Mapping]] = ..., influences: _Optional[_Iterable[_Union[Influence, _Mapping]]] = ...) -> None: ...
+
+class Influence(_message.Message):
+    __slots__ = ("node_id", "message", "change")
+    NODE_ID_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_FIELD_NUMBER: _ClassVar[int]
+    CHANGE_FIELD_NUMBER: _ClassVar[int]
+    node_id: str
+    message: bool
+    change: float
+    def __init__(self, node_id: _Optional[str] = ..., message: bool = ..., change: _Optional[float] = ...) -> None: ...
 
 class Velocity(_message.Message):
     __slots__ = ("x", "y")

@@ -1,0 +1,260 @@
+//! `qedgix plan`: how many UAVs a policy needs to keep the data of so many users fresh, also if one UAV is lost.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, ensure};
+use clap::Args;
+use serde_json::{Value, json};
+
+use super::output::{Exit, outln};
+use super::run_args::all_cores;
+use super::table::text_table;
+use super::{evaluate, progress};
+use crate::env::{EnvConfig, LostUav};
+use crate::files;
+use crate::learner::{Disturbance, Interval, evaluate_traced, interval, layout_list};
+use crate::plot::{self, Chart, Series};
+
+/// Flags of `plan`.
+#[derive(Args, Debug)]
+#[command(after_help = "Evaluates fleets of 1, 2, 3, ... UAVs on the same layouts until one surely meets the target. Exit status 1: none of up to
+--max-uavs UAVs does.
+
+Examples:
+  qedgix plan --policy qedgix --users 12 --target-p95 10
+  qedgix plan --policy sweep-shared --users 12 --target-p95 20 --failures --report plan   # plan/plan.svg, failures.svg, plan.json")]
+pub struct PlanArgs {
+    /// A checkpoint file, a bundled policy or a baseline, for any number of UAVs
+    #[arg(long, env = "QEDGIX_POLICY")]
+    policy: String,
+    /// Number of users
+    #[arg(long, env = "QEDGIX_USERS", default_value_t = 5)]
+    users: usize,
+    /// 95th percentile of AoI over users and slots that the fleet must keep, in slots
+    #[arg(long, env = "QEDGIX_TARGET_P95", value_name = "SLOTS")]
+    target_p95: f64,
+    /// Largest fleet to try
+    #[arg(long, env = "QEDGIX_MAX_UAVS", default_value_t = 12)]
+    max_uavs: usize,
+    /// Also loses a UAV at each of several times, of the fleet that meets the target and of the next larger one
+    #[arg(long, env = "QEDGIX_FAILURES")]
+    failures: bool,
+    /// Frozen list of layouts, not a mixed one
+    #[arg(long, env = "QEDGIX_LAYOUTS", default_value = "eval-v1")]
+    layouts: String,
+    /// Number of layouts, from the first of the list; all if the list has fewer
+    #[arg(long, env = "QEDGIX_EPISODES", default_value_t = 128)]
+    episodes: usize,
+    /// Slots per episode
+    #[arg(long, env = "QEDGIX_SLOTS", default_value_t = 80)]
+    slots: usize,
+    /// Detection range, in units of the square's side
+    #[arg(long, env = "QEDGIX_DETECTION_RANGE", default_value_t = 0.28)]
+    detection_range: f64,
+    /// Range within which UAVs exchange messages, in units of the square's side [default: the detection range]
+    #[arg(long, env = "QEDGIX_COMMUNICATION_RANGE")]
+    communication_range: Option<f64>,
+    /// Transmission range, in units of the square's side
+    #[arg(long, env = "QEDGIX_TRANSMISSION_RANGE", default_value_t = 0.12)]
+    transmission_range: f64,
+    /// Threads [default: all cores]
+    #[arg(long, env = "QEDGIX_THREADS")]
+    threads: Option<usize>,
+    /// Write plan.svg, plan.json and, with --failures, failures.svg into this directory
+    #[arg(long, env = "QEDGIX_REPORT", value_name = "DIR")]
+    report: Option<PathBuf>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// A fleet of some size on the layouts. Intervals are over layouts.
+#[derive(Clone, Copy, Debug)]
+struct Size {
+    uavs: usize,
+    p95: Interval,
+    mean_aoi: Interval,
+}
+
+/// A UAV lost at `slot`, in fleets of two sizes.
+#[derive(Clone, Copy, Debug)]
+struct Failure {
+    slot: usize,
+    sizes: [Size; 2],
+}
+
+/// The plan.
+#[derive(Debug)]
+struct Plan {
+    sizes: Vec<Size>,
+    /// The smallest fleet whose p95 meets the target, and those by the ends of its interval; `None`: not tried large enough.
+    uavs: Option<usize>,
+    interval: [Option<usize>; 2],
+    failures: Vec<Failure>,
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// A policy that does not fit, flags out of range, files that cannot be written; exit status 1 if no fleet meets the target.
+pub async fn run(args: PlanArgs) -> anyhow::Result<()> {
+    ensure!(args.target_p95 > 0.0, "--target-p95: got {}, expected a number above 0", args.target_p95);
+    ensure!((1..=256).contains(&args.max_uavs), "--max-uavs: got {}, expected a number from 1 to 256", args.max_uavs);
+    ensure!(args.episodes > 0, "--episodes: got 0, expected at least 1");
+    let list = layout_list(&args.layouts)?;
+    ensure!(!list.mixed, "--layouts {}: it draws the environments itself; choose a list that is not mixed", list.name);
+    let plan = args.plan(&list.seeds(args.episodes))?;
+    let document = args.document(&plan);
+    if let Some(directory) = &args.report {
+        let write = |name: &str, text: &str| files::write_atomic(&directory.join(name), text.as_bytes());
+        std::fs::create_dir_all(directory)
+            .and_then(|()| write("plan.svg", &args.figure(&plan)))
+            .and_then(|()| write("plan.json", &format!("{document:#}\n")))
+            .and_then(|()| if args.failures { write("failures.svg", &args.failure_figure(&plan)) } else { Ok(()) })
+            .with_context(|| format!("writing to {}", directory.display()))?;
+    }
+    if args.json {
+        outln!("{document:#}")?;
+    } else {
+        args.print(&plan)?;
+    }
+    match plan.uavs {
+        Some(_) => Ok(()),
+        None => Err(Exit::new(1, format!("no fleet of up to {} UAVs keeps p95 AoI at {}", args.max_uavs, args.target_p95)).into()),
+    }
+}
+
+impl PlanArgs {
+    fn plan(&self, seeds: &[u64]) -> anyhow::Result<Plan> {
+        let bar = progress::bar(self.max_uavs as u64, "fleets");
+        let mut sizes = Vec::new();
+        for uavs in 1..=self.max_uavs {
+            let size = self.evaluate(uavs, None, seeds)?;
+            sizes.push(size);
+            bar.inc(1);
+            if size.p95.high <= self.target_p95 {
+                break;
+            }
+        }
+        let first = |p95: fn(&Interval) -> f64| sizes.iter().find(|size| p95(&size.p95) <= self.target_p95).map(|size| size.uavs);
+        let (uavs, interval) = (first(|p95| p95.mean), [first(|p95| p95.low), first(|p95| p95.high)]);
+        let mut failures = Vec::new();
+        // A fleet of one that loses it does nothing.
+        if let Some(uavs) = uavs.filter(|_| self.failures) {
+            const TIMES: usize = 8;
+            for k in 0..TIMES.min(self.slots) {
+                let slot = k * self.slots / TIMES.min(self.slots);
+                let lost = |uavs| self.evaluate(uavs, Some(LostUav { uav: 0, slot }), seeds);
+                failures.push(Failure { slot, sizes: [lost(uavs)?, lost(uavs + 1)?] });
+            }
+        }
+        bar.finish_and_clear();
+        Ok(Plan { sizes, uavs, interval, failures })
+    }
+
+    fn evaluate(&self, uavs: usize, lose: Option<LostUav>, seeds: &[u64]) -> anyhow::Result<Size> {
+        let env = EnvConfig {
+            uavs,
+            users: self.users,
+            slots: self.slots,
+            detection_range: self.detection_range,
+            communication_range: self.communication_range,
+            transmission_range: self.transmission_range,
+            ..EnvConfig::default()
+        };
+        env.validate()?;
+        let policy = evaluate::open(&self.policy, &env)?;
+        let env = EnvConfig { hover: policy.actions() > EnvConfig::COMPASS, ..env };
+        let disturbance = Disturbance { lose, ..Disturbance::default() };
+        let threads = self.threads.unwrap_or_else(all_cores);
+        let traced = evaluate_traced(&*policy, &env, seeds, 0, &disturbance, threads)
+            .with_context(|| format!("policy {} with {uavs} UAVs", self.policy))?;
+        let of = |metric: fn(&crate::env::EpisodeMetrics) -> f64| interval(&traced.episodes.iter().map(metric).collect::<Vec<_>>());
+        Ok(Size { uavs, p95: of(|episode| episode.p95_aoi)?, mean_aoi: of(|episode| episode.mean_aoi)? })
+    }
+
+    fn print(&self, plan: &Plan) -> anyhow::Result<()> {
+        let mut before = None;
+        let rows = plan.sizes.iter().map(|size| {
+            let gain = before.replace(size.p95.mean).map_or_else(String::new, |before: f64| format!("{:.2}", before - size.p95.mean));
+            [size.uavs.to_string(), cell(&size.p95), gain, cell(&size.mean_aoi)]
+        });
+        outln!("{} users, {}, AoI in slots, mean and 95 % interval over layouts", self.users, self.policy)?;
+        outln!("{}", text_table(["UAVs", "p95 AoI", "gain by the last UAV", "mean AoI"], rows))?;
+        if let Some(uavs) = plan.uavs {
+            let [low, high] = plan.interval.map(|end| end.map_or_else(|| format!("more than {}", self.max_uavs), |end| end.to_string()));
+            outln!("{uavs} UAVs keep p95 AoI at {} or less (95 % interval: {low} to {high} UAVs)", self.target_p95)?;
+            if !plan.failures.is_empty() {
+                let rows = plan.failures.iter().map(|failure| {
+                    let [smaller, larger] = failure.sizes.map(|size| cell(&size.p95));
+                    [failure.slot.to_string(), smaller, larger]
+                });
+                let header = ["a UAV lost at slot".to_owned(), format!("p95 AoI, {uavs} UAVs"), format!("{} UAVs", uavs + 1)];
+                outln!("{}", text_table(header, rows))?;
+            }
+        }
+        Ok(())
+    }
+
+    fn figure(&self, plan: &Plan) -> String {
+        let points = |of: fn(&Size) -> Interval| -> (Vec<[f64; 2]>, Option<Vec<[f64; 2]>>) {
+            let ends = |size: &Size| [of(size).low, of(size).high];
+            let points = plan.sizes.iter().map(|size| [size.uavs as f64, of(size).mean]).collect();
+            (points, Some(plan.sizes.iter().map(ends).collect()))
+        };
+        let (p95, mean) = (points(|size| size.p95), points(|size| size.mean_aoi));
+        plot::lines(&Chart {
+            title: format!("{}: fleets for {} users", self.policy, self.users),
+            x: "UAVs".into(),
+            y: "AoI (slots)".into(),
+            series: vec![
+                Series { name: "p95 AoI".into(), points: p95.0, band: p95.1 },
+                Series { name: "mean AoI".into(), points: mean.0, band: mean.1 },
+            ],
+            levels: vec![("target of p95".into(), self.target_p95)],
+            note: "Bars are 95 % intervals over layouts.".into(),
+            markers: true,
+        })
+    }
+
+    fn failure_figure(&self, plan: &Plan) -> String {
+        let series = |which: usize| {
+            let of = |failure: &Failure| failure.sizes[which];
+            Series {
+                name: format!("{} UAVs", plan.failures.first().map_or(0, |failure| of(failure).uavs)),
+                points: plan.failures.iter().map(|failure| [failure.slot as f64, of(failure).p95.mean]).collect(),
+                band: Some(plan.failures.iter().map(|failure| [of(failure).p95.low, of(failure).p95.high]).collect()),
+            }
+        };
+        plot::lines(&Chart {
+            title: format!("{}: a UAV is lost", self.policy),
+            x: "slot of the loss".into(),
+            y: "p95 AoI (slots)".into(),
+            series: vec![series(0), series(1)],
+            levels: vec![("target".into(), self.target_p95)],
+            note: "Bars are 95 % intervals over layouts.".into(),
+            markers: true,
+        })
+    }
+
+    fn document(&self, plan: &Plan) -> Value {
+        let size = |size: &Size| json!({"uavs": size.uavs, "p95_aoi": size.p95, "mean_aoi": size.mean_aoi});
+        json!({
+            "policy": self.policy,
+            "users": self.users,
+            "target_p95": self.target_p95,
+            "layouts": self.layouts,
+            "episodes": self.episodes,
+            "uavs": plan.uavs,
+            "interval": plan.interval,
+            "sizes": plan.sizes.iter().map(size).collect::<Vec<_>>(),
+            "failures": plan.failures.iter().map(|failure| {
+                json!({"slot": failure.slot, "sizes": failure.sizes.iter().map(size).collect::<Vec<_>>()})
+            }).collect::<Vec<_>>(),
+        })
+    }
+}
+
+fn cell(interval: &Interval) -> String {
+    format!("{:.2} ({:.2} to {:.2})", interval.mean, interval.low, interval.high)
+}
