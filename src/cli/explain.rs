@@ -67,9 +67,7 @@ fn document(name: &str, seed: u64, slots: &[ExplainedSlot]) -> Value {
         node.checked_sub(slot.uavs.len()).map_or_else(|| format!("uav-{node}"), |user| format!("user-{user}"))
     };
     let slot = |(step, slot): (usize, &ExplainedSlot)| {
-        let influence = |of: &crate::policy::Influence| {
-            json!({"uav_id": id(slot, of.uav), "node_id": id(slot, of.node), "message": of.message, "change": of.change})
-        };
+        let influence = |of: &crate::policy::Influence| json!({"uav_id": id(slot, of.uav), "node_id": id(slot, of.node), "message": of.message, "change": of.change});
         json!({
             "step": step,
             "headings": slot.headings,

@@ -17,12 +17,14 @@ use crate::plot::{self, Chart, Series};
 
 /// Flags of `plan`.
 #[derive(Args, Debug)]
-#[command(after_help = "Evaluates fleets of 1, 2, 3, ... UAVs on the same layouts until one surely meets the target. Exit status 1: none of up to
+#[command(
+    after_help = "Evaluates fleets of 1, 2, 3, ... UAVs on the same layouts until one surely meets the target. Exit status 1: none of up to
 --max-uavs UAVs does.
 
 Examples:
   qedgix plan --policy qedgix --users 12 --target-p95 10
-  qedgix plan --policy sweep-shared --users 12 --target-p95 20 --failures --report plan   # plan/plan.svg, failures.svg, plan.json")]
+  qedgix plan --policy sweep-shared --users 12 --target-p95 20 --failures --report plan   # plan/plan.svg, failures.svg, plan.json"
+)]
 pub struct PlanArgs {
     /// A checkpoint file, a bundled policy or a baseline, for any number of UAVs
     #[arg(long, env = "QEDGIX_POLICY")]
@@ -120,7 +122,9 @@ pub async fn run(args: PlanArgs) -> anyhow::Result<()> {
     }
     match plan.uavs {
         Some(_) => Ok(()),
-        None => Err(Exit::new(1, format!("no fleet of up to {} UAVs keeps p95 AoI at {}", args.max_uavs, args.target_p95)).into()),
+        None => {
+            Err(Exit::new(1, format!("no fleet of up to {} UAVs keeps p95 AoI at {}", args.max_uavs, args.target_p95)).into())
+        }
     }
 }
 
@@ -169,20 +173,23 @@ impl PlanArgs {
         let threads = self.threads.unwrap_or_else(all_cores);
         let traced = evaluate_traced(&*policy, &env, seeds, 0, &disturbance, threads)
             .with_context(|| format!("policy {} with {uavs} UAVs", self.policy))?;
-        let of = |metric: fn(&crate::env::EpisodeMetrics) -> f64| interval(&traced.episodes.iter().map(metric).collect::<Vec<_>>());
+        let of =
+            |metric: fn(&crate::env::EpisodeMetrics) -> f64| interval(&traced.episodes.iter().map(metric).collect::<Vec<_>>());
         Ok(Size { uavs, p95: of(|episode| episode.p95_aoi)?, mean_aoi: of(|episode| episode.mean_aoi)? })
     }
 
     fn print(&self, plan: &Plan) -> anyhow::Result<()> {
         let mut before = None;
         let rows = plan.sizes.iter().map(|size| {
-            let gain = before.replace(size.p95.mean).map_or_else(String::new, |before: f64| format!("{:.2}", before - size.p95.mean));
+            let gain =
+                before.replace(size.p95.mean).map_or_else(String::new, |before: f64| format!("{:.2}", before - size.p95.mean));
             [size.uavs.to_string(), cell(&size.p95), gain, cell(&size.mean_aoi)]
         });
         outln!("{} users, {}, AoI in slots, mean and 95 % interval over layouts", self.users, self.policy)?;
         outln!("{}", text_table(["UAVs", "p95 AoI", "gain by the last UAV", "mean AoI"], rows))?;
         if let Some(uavs) = plan.uavs {
-            let [low, high] = plan.interval.map(|end| end.map_or_else(|| format!("more than {}", self.max_uavs), |end| end.to_string()));
+            let [low, high] =
+                plan.interval.map(|end| end.map_or_else(|| format!("more than {}", self.max_uavs), |end| end.to_string()));
             outln!("{uavs} UAVs keep p95 AoI at {} or less (95 % interval: {low} to {high} UAVs)", self.target_p95)?;
             if !plan.failures.is_empty() {
                 let rows = plan.failures.iter().map(|failure| {

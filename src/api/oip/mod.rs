@@ -90,8 +90,17 @@ pub async fn infer(app: &App, caller: &Caller, request: InferRequest, deadline: 
             return Err(Invalid::new(STATE, "a tensor", expected).into());
         }
     };
-    let request =
-        act::Request { policy: Some(spec.clone()), input, memory, step, run_id: None, seed, flight, return_motion: false, explain: false };
+    let request = act::Request {
+        policy: Some(spec.clone()),
+        input,
+        memory,
+        step,
+        run_id: None,
+        seed,
+        flight,
+        return_motion: false,
+        explain: false,
+    };
     let response = act::act(app, caller, request, deadline).await.map_err(model_error)?;
     let reference = &response.policy.reference;
     let (version, digest, step) = (reference.version, reference.digest_hex(), response.decision.step);

@@ -5,7 +5,9 @@ use std::time::Duration;
 
 use crate::invalid::Invalid;
 use crate::policy::{DecidedSlot, EnvParams, FleetGraph, FleetProfile, FleetStep};
-use crate::serving::{FleetChange, FleetIds, FleetMemory, Guard, LoadedPolicy, Overruled, SceneOrGraph, Sensing, Situation, TaskInput};
+use crate::serving::{
+    FleetChange, FleetIds, FleetMemory, Guard, LoadedPolicy, Overruled, SceneOrGraph, Sensing, Situation, TaskInput,
+};
 
 /// One fleet in one slot, with buffers for the output.
 #[derive(Debug)]
@@ -108,7 +110,8 @@ impl Task {
         headings.resize(uavs, 0);
         q_values.clear();
         q_values.resize(uavs * policy.implementation.actions(), f32::NAN);
-        let decision = Decision { step, headings, q_values, timings: Timings::default(), overruled: Vec::new(), influences: Vec::new() };
+        let decision =
+            Decision { step, headings, q_values, timings: Timings::default(), overruled: Vec::new(), influences: Vec::new() };
         let work = policy.implementation.work(uavs, users, input.detection_count());
         let (graph, unconverted) = match input {
             TaskInput::Graph(graph) => (graph, None),
