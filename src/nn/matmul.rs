@@ -317,7 +317,7 @@ impl<T: Real> Strided<'_, T> {
         let pairs = (depth - 1) / 2;
         let b = self.data.chunks_exact(2 * stride);
         // Both sets of sums, a row of B and a number of A.
-        if 2 * R * V + V + 1 <= S::REGISTER_COUNT {
+        if 2 * R * V + V < S::REGISTER_COUNT {
             for (a_pair, b) in a.pairs(pairs).zip(b) {
                 accumulate(
                     simd,

@@ -109,7 +109,7 @@ pub(super) fn looks<'a>(names: impl IntoIterator<Item = &'a str>) -> Vec<Look> {
 fn algorithm(name: &str) -> Option<usize> {
     let name = name.to_lowercase();
     let alone = |from: usize, to: usize| {
-        let letter = |c: Option<char>| c.is_some_and(|c| c.is_alphanumeric());
+        let letter = |c: Option<char>| c.is_some_and(char::is_alphanumeric);
         !letter(name[..from].chars().next_back()) && !letter(name[to..].chars().next())
     };
     PLACES.iter().position(|(known, _)| name.match_indices(known).any(|(at, found)| alone(at, at + found.len())))

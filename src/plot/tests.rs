@@ -137,7 +137,7 @@ fn ticks_are_at_whole_uavs() {
 #[test]
 fn ticks_are_round_and_few() {
     assert_eq!(super::scale::ticks(&(0.0..80.0), 6), [0.0, 20.0, 40.0, 60.0, 80.0]);
-    for range in [0.0..1e-300, -1e12..1e12, 3.0..3.000001, 0.0..1.02] {
+    for range in [0.0..1e-300, -1e12..1e12, 3.0..3.000_001, 0.0..1.02] {
         let ticks = super::scale::ticks(&range, 7);
         assert!(ticks.len() <= 8 && !ticks.is_empty() && ticks.iter().all(|tick| tick.is_finite()), "{range:?}: {ticks:?}");
     }

@@ -112,26 +112,23 @@ fn encode_with(policy: Arc<LoadedPolicy>, state: Option<UavState>, request: Enco
     let implementation = &*policy.implementation;
     let EncodeRequest { uav_ids, user_ids, observation, seed, step, flight, .. } = request;
     let flight = flight_of(flight, &policy)?;
-    let mut state = match state {
-        Some(state) => {
-            let given = [("uav_ids", !uav_ids.is_empty()), ("user_ids", !user_ids.is_empty()), ("seed", seed.is_some())];
-            if let Some((field, _)) = given.into_iter().find(|(_, given)| *given) {
-                return Err(Invalid::new(field, "a value", "no value, because the state has it").into());
-            }
-            if state.observation.is_some() {
-                return Err(Invalid::new("state", "a state after Encode", "the state after Decide, or none").into());
-            }
-            check_step(step, &state)?;
-            decentral::check(implementation, state.ids.size())?;
-            state
+    let mut state = if let Some(state) = state {
+        let given = [("uav_ids", !uav_ids.is_empty()), ("user_ids", !user_ids.is_empty()), ("seed", seed.is_some())];
+        if let Some((field, _)) = given.into_iter().find(|(_, given)| *given) {
+            return Err(Invalid::new(field, "a value", "no value, because the state has it").into());
         }
-        None => {
-            let ids = FleetIds::new(uav_ids, user_ids)?;
-            decentral::check(implementation, ids.size())?;
-            let (digest, seed) = (policy.reference.digest, seed.unwrap_or(0));
-            let memory = FleetMemory::default();
-            UavState { digest, seed, step: step.unwrap_or(0), uav: u32::MAX, ids, observation: None, memory }
+        if state.observation.is_some() {
+            return Err(Invalid::new("state", "a state after Encode", "the state after Decide, or none").into());
         }
+        check_step(step, &state)?;
+        decentral::check(implementation, state.ids.size())?;
+        state
+    } else {
+        let ids = FleetIds::new(uav_ids, user_ids)?;
+        decentral::check(implementation, ids.size())?;
+        let (digest, seed) = (policy.reference.digest, seed.unwrap_or(0));
+        let memory = FleetMemory::default();
+        UavState { digest, seed, step: step.unwrap_or(0), uav: u32::MAX, ids, observation: None, memory }
     };
     let (uav, observed) = Observation::new(observation, &state.ids, &flight)?;
     let size = state.ids.size();
@@ -155,7 +152,7 @@ fn encode_with(policy: Arc<LoadedPolicy>, state: Option<UavState>, request: Enco
     let reach = implementation.reach();
     let message_links = if let Reach::Links(links) = reach { Some(links as u32) } else { None };
     let message_range = reach.range(&flight.env).map(|range| flight.length(range));
-    Ok(Encoded { step, state, message, message_links, message_range, policy })
+    Ok(Encoded { policy, step, state, message, message_links, message_range })
 }
 
 /// Takes the messages of other UAVs, and returns the heading.

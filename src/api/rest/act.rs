@@ -35,6 +35,7 @@ pub(super) fn router() -> OpenApiRouter<Arc<App>> {
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 #[schema(example = example)]
+#[allow(clippy::struct_excessive_bools, reason = "independent switches of a request")]
 struct ActRequest {
     /// NAME (its newest version), NAME@ALIAS or NAME:VERSION. Optional with a session; if set, it must name the policy of the
     /// session.

@@ -105,7 +105,7 @@ impl UavState {
     /// Names `state` if the bytes are not the unchanged result of [`UavState::encode`].
     pub fn decode(bytes: &Bytes) -> Result<Self, Invalid> {
         let wrong = |value: String| Invalid::new("state", value, "the unchanged state of the UAV's previous response, or none");
-        let mut rest = opened(bytes, STATE).map_err(wrong)?;
+        let mut rest = opened(bytes, *STATE).map_err(wrong)?;
         let mut read = || {
             let mut digest = [0; 32];
             rest.try_copy_to_slice(&mut digest).ok()?;
@@ -145,7 +145,7 @@ impl Message {
     pub fn decode(index: usize, bytes: &Bytes, state: &UavState, mission: &Mission) -> Result<Self, Invalid> {
         let field = || format!("messages[{index}]");
         let wrong = |value: String| Invalid::new(field(), value, "the unchanged message of another UAV");
-        let mut rest = opened(bytes, MESSAGE).map_err(wrong)?;
+        let mut rest = opened(bytes, *MESSAGE).map_err(wrong)?;
         let mut theirs = [0; 16];
         let mut head = || {
             rest.try_copy_to_slice(&mut theirs).ok()?;
@@ -226,9 +226,9 @@ fn sealed(mut bytes: BytesMut, memory: &Bytes) -> Bytes {
 ///
 /// # Errors
 /// What `bytes` are instead.
-fn opened(bytes: &Bytes, magic: &[u8; 4]) -> Result<Bytes, String> {
+fn opened(bytes: &Bytes, magic: [u8; 4]) -> Result<Bytes, String> {
     let head = magic.len() + 1;
-    if bytes.len() < head + CHECKSUM || !bytes.starts_with(magic) {
+    if bytes.len() < head + CHECKSUM || !bytes.starts_with(&magic) {
         return Err(format!("{} bytes of another format", bytes.len()));
     }
     let (body, sum) = bytes.split_at(bytes.len() - CHECKSUM);

@@ -198,7 +198,7 @@ impl Task {
                 let expected = "a smaller fleet: to explain a slot, the policy is run once per detection of a UAV";
                 return Err(Invalid::new("explain", format!("{runs} runs of the policy"), expected));
             }
-            explain.1 = self.numbers.clone();
+            explain.1.clone_from(&self.numbers);
         }
         Ok(())
     }
