@@ -123,7 +123,8 @@ fn main() {
     let row = |name: &str, size: &str, rates: &[f64]| {
         println!("{name:<26}{size:<18}{}", (0..widths.len()).map(|w| cell(rates[w], w)).collect::<String>());
     };
-    println!("{:<44}{}", "GFLOP/s", widths.iter().map(|width| format!("{:>9}        ", width.name())).collect::<String>());
+    let names: Vec<String> = widths.iter().map(|width| format!("{:>9}        ", width.name())).collect();
+    println!("{:<44}{}", "GFLOP/s", names.concat());
     row("peak", "", &peaks);
     for ((shape, _), rates) in shapes.iter().zip(&rates) {
         let (m, k, n) = shape.size;

@@ -60,7 +60,7 @@ pub struct AuditArgs {
 ///
 /// # Errors
 /// An unknown policy or list, a policy that does not fit the environment; exit status 1 if the policy does not pass.
-pub fn run(args: AuditArgs) -> anyhow::Result<()> {
+pub fn run(args: &AuditArgs) -> anyhow::Result<()> {
     let env = EnvConfig {
         uavs: args.uavs,
         users: args.users,

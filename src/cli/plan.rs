@@ -99,7 +99,7 @@ struct Plan {
 ///
 /// # Errors
 /// A policy that does not fit, flags out of range, files that cannot be written; exit status 1 if no fleet meets the target.
-pub fn run(args: PlanArgs) -> anyhow::Result<()> {
+pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     ensure!(args.target_p95 > 0.0, "--target-p95: got {}, expected a number above 0", args.target_p95);
     ensure!((1..=256).contains(&args.max_uavs), "--max-uavs: got {}, expected a number from 1 to 256", args.max_uavs);
     ensure!(args.episodes > 0, "--episodes: got 0, expected at least 1");

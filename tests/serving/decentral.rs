@@ -294,7 +294,7 @@ async fn metres_go_in_and_out() {
     let mut client = fleet.client.clone();
     let frame = v1::Frame { side: Some(1000.0), ..Default::default() };
     let plain = fleet.encode(0);
-    let mut metres = v1::EncodeRequest { frame: Some(frame.clone()), ..plain.clone() };
+    let mut metres = v1::EncodeRequest { frame: Some(frame), ..plain.clone() };
     let node = metres.observation.as_mut().unwrap();
     let position = node.position.as_mut().unwrap();
     (position.x, position.y) = (1000.0 * position.x, 1000.0 * position.y);

@@ -30,7 +30,7 @@ async fn an_influence_is_the_change_without_the_detection_or_message() {
     let graph = graph(&scene(4, 12, 3), 0.45, false);
     let explained = v1::ActRequest { explain: true, ..request("qmix", graph.clone()) };
     let world = Some(v1::World { detection_range: Some(0.45), ..Default::default() });
-    let explained = v1::ActRequest { world: world.clone(), ..explained };
+    let explained = v1::ActRequest { world, ..explained };
     let actions = client.act(explained.clone()).await.unwrap().into_inner().actions;
     let plain = v1::ActRequest { explain: false, ..explained };
     let same = client.act(plain.clone()).await.unwrap().into_inner().actions;
@@ -62,7 +62,7 @@ async fn an_influence_is_the_change_without_the_detection_or_message() {
             uav_ids: ids(v1::NodeKind::Uav),
             user_ids: ids(v1::NodeKind::User),
             observation: Some(node.clone()),
-            world: world.clone(),
+            world,
             ..Default::default()
         };
         encoded.push(client.encode(request).await.unwrap().into_inner());
@@ -76,7 +76,7 @@ async fn an_influence_is_the_change_without_the_detection_or_message() {
                 state: encoded[i].state.clone(),
                 messages: (0..4).filter(heard).map(|k| encoded[k].message.clone()).collect(),
                 return_q_values: true,
-                world: world.clone(),
+                world,
                 ..Default::default()
             };
             let alone = client.decide(request).await.unwrap().into_inner().action.unwrap();
