@@ -152,7 +152,7 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
     }
     bar.finish_and_clear();
     if let Some(directory) = &args.explain {
-        explain::write(directory, &args.policy, &env, seeds[args.report_layout])
+        explain::write(directory, (&args.policy, &|name| open(name, &env)), &env, seeds[args.report_layout])
             .with_context(|| format!("writing explanations to {}", directory.display()))?;
     }
 

@@ -1,28 +1,34 @@
 //! `qedgix evaluate --explain`: what speaks for and against each heading of an episode, as a figure and as JSON.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use serde_json::{Value, json};
 
-use super::evaluate;
 use crate::env::{EnvConfig, Point};
 use crate::files;
 use crate::learner::{ExplainedSlot, explained_flight};
 use crate::plot::{self, Pull, Trajectories};
+use crate::policy::Policy;
 
 /// Slots between two that the figure explains.
 const INTERVAL: usize = 4;
 /// Influences of a UAV that the figure shows in a slot.
 const STRONGEST: usize = 2;
 
-/// Writes the figure and the numbers of each policy into `directory`.
+/// Writes the figure and the numbers of each policy, which `open` opens, into `directory`.
 ///
 /// # Errors
 /// A policy that does not fit the environment, files that cannot be written.
-pub fn write(directory: &Path, policies: &[String], env: &EnvConfig, seed: u64) -> anyhow::Result<()> {
+pub fn write(
+    directory: &Path,
+    (policies, open): (&[String], &dyn Fn(&str) -> anyhow::Result<Arc<dyn Policy>>),
+    env: &EnvConfig,
+    seed: u64,
+) -> anyhow::Result<()> {
     std::fs::create_dir_all(directory)?;
     for (i, name) in policies.iter().enumerate() {
-        let policy = evaluate::open(name, env)?;
+        let policy = open(name)?;
         let env = EnvConfig { hover: policy.actions() > EnvConfig::COMPASS, ..env.clone() };
         let slots = explained_flight(&*policy, &env, seed)?;
         let last = name.rsplit(['/', '\\']).next().unwrap_or(name);

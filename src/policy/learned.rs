@@ -113,7 +113,8 @@ impl Policy for LearnedPolicy {
         }
         // Each UAV looks at every user and scores its goals; then it may receive as many memories as it detects UAVs.
         let goals = goals::MAX_USERS.min(users) + goals::MAX_BLOCKS;
-        let received = detections * uavs / (uavs + users);
+        // As many of all detections as are among UAVs when nodes of both kinds are spread alike.
+        let received = (detections as f64 * (uavs as f64 / (uavs + users) as f64).powi(2)) as usize;
         alone + uavs * (goals + users / 4) + received * (users / 8 + goals / 32)
     }
 

@@ -13,8 +13,8 @@ pub const MAX_NODES: usize = 20_000;
 /// Maximum number of detections of one input, including mirrored and derived ones.
 pub const MAX_DETECTIONS: usize = 1 << 22;
 
-/// Maximum work of one input (see [`Policy::work`]).
-const MAX_WORK: usize = 1 << 26;
+/// Maximum number of memories that the UAVs of one input receive, times the number of users that each may hold.
+const MAX_RECEIVED: usize = 1 << 31;
 
 /// Reported distances may exceed the detection range by this factor, because sensors are not exact. Beyond, the caller uses other units or
 /// another sensor than the policy was trained with.
@@ -170,13 +170,27 @@ impl SceneOrGraph {
             // Users detect each other about as often as UAVs detect users.
             Self::Graph(graph) => 2 * graph.detections.iter().map(Vec::len).sum::<usize>(),
         };
-        let work = policy.work(uavs, users, detections);
-        if work > MAX_WORK {
-            let value = format!("{uavs} UAVs and {users} users with about {detections} detections");
-            let expected = "fewer UAVs or users, or shorter ranges: the slot would take several seconds";
+        if policy.remembers_users() && self.links(uavs, sensing).saturating_mul(users) > MAX_RECEIVED {
+            let value = format!("{uavs} UAVs in communication range of many others, and {users} users");
+            let expected =
+                "fewer UAVs or users, or a shorter communication range: the UAVs exchange what they remember of each user";
             return Err(Invalid::new(self.field(), value, expected));
         }
         Ok(TaskInput::Large { content: Box::new(self), size, sensing, detections })
+    }
+
+    /// Number of UAVs that other UAVs receive messages from, about.
+    fn links(&self, count: usize, sensing: Sensing) -> usize {
+        match self {
+            Self::Scene(Scene { uavs, .. }) => {
+                let ranges = Ranges { detection: sensing.ranges.communication, ..sensing.ranges };
+                estimate_detections(uavs, &[], uavs.len(), ranges).about
+            }
+            Self::Graph(graph) => {
+                let of_uavs = graph.detections.iter().take(count).flatten();
+                2 * of_uavs.filter(|detection| (detection.target as usize) < count).count()
+            }
+        }
     }
 
     /// The field of the request.

@@ -2,7 +2,6 @@
 //! crash neither loses nor duplicates a row.
 
 use jiff::Timestamp;
-use sqlx::{QueryBuilder, Sqlite};
 
 use super::attempts::is_active;
 use super::metric_summaries::summarize;
@@ -93,23 +92,27 @@ impl Store {
         after: Option<&MetricCursor>,
         limit: u32,
     ) -> Result<Vec<MetricRow>> {
-        // Only the conditions that there are, so that each page begins where the last one ended.
-        let mut sql = QueryBuilder::<Sqlite>::new(
-            "SELECT name, step, value, at FROM metrics WHERE job = (SELECT number FROM jobs WHERE id = ",
-        );
-        sql.push_bind(id.to_string()).push(")");
-        if let Some(name) = name {
-            sql.push(" AND name = ").push_bind(name);
-        }
-        match after {
-            Some(after) if name == Some(&after.name) => drop(sql.push(" AND step > ").push_bind(after.step as i64)),
-            Some(after) => {
-                sql.push(" AND (name, step) > (").push_bind(&after.name).push(", ").push_bind(after.step as i64).push(")");
-            }
-            None => {}
-        }
-        sql.push(" ORDER BY name, step LIMIT ").push_bind(limit);
-        let rows: Vec<(String, i64, Option<f64>, i64)> = sql.build_query_as().fetch_all(&self.read).await?;
+        // Two statements, so that each page begins where the last one ended. Names are not empty, steps not negative.
+        let (after_name, after_step) = after.map_or(("", -1), |after| (after.name.as_str(), after.step as i64));
+        let rows = sqlx::query_as::<_, (String, i64, Option<f64>, i64)>;
+        let rows = match name {
+            None => rows(
+                "SELECT name, step, value, at FROM metrics WHERE job = (SELECT number FROM jobs WHERE id = ?1)
+                 AND (name, step) > (?2, ?3) ORDER BY name, step LIMIT ?4",
+            )
+            .bind(id.to_string())
+            .bind(after_name)
+            .bind(after_step),
+            Some(name) if name < after_name => return Ok(Vec::new()),
+            Some(name) => rows(
+                "SELECT name, step, value, at FROM metrics WHERE job = (SELECT number FROM jobs WHERE id = ?1)
+                 AND name = ?2 AND step > ?3 ORDER BY name, step LIMIT ?4",
+            )
+            .bind(id.to_string())
+            .bind(name)
+            .bind(if name == after_name { after_step } else { -1 }),
+        };
+        let rows = rows.bind(limit).fetch_all(&self.read).await?;
         rows.into_iter()
             .map(|(name, step, value, at)| Ok(MetricRow { name, step: step as u64, value, at: timestamp(at)? }))
             .collect()

@@ -276,7 +276,7 @@ async fn observations_are_checked() {
     ] {
         assert_invalid(client.encode(request).await, field, value);
     }
-    let many = v1::EncodeRequest { user_ids: (0..19_000).map(|j| format!("u{j}")).collect(), ..first.clone() };
+    let many = v1::EncodeRequest { user_ids: (0..18_000).map(|j| format!("u{j}")).collect(), ..first.clone() };
     let many = v1::EncodeRequest {
         uav_ids: (0..900).map(|i| format!("uav-{i}")).collect(),
         observation: Some(v1::Node { detections: vec![], ..first.observation.clone().unwrap() }),

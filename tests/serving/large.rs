@@ -136,6 +136,8 @@ async fn dense_scene_is_refused_only_by_policies_that_need_its_detections() {
     for policy in ["random", "nearest"] {
         client.act(held(policy, Bytes::new(), dense.clone())).await.unwrap();
     }
-    // Each UAV would receive what hundreds of others know of thousands of users.
-    assert_invalid(client.act(held("qedgix", Bytes::new(), scene(1000, 3000, 0))).await, "scene", "1000 UAVs and 3000 users");
+    // Each UAV would receive what all others know of ten thousand users.
+    let mut close = wide_scene(1000, 10_000, 0.28);
+    close.uavs.iter_mut().for_each(|uav| (uav.x, uav.y) = (0.5, 0.5));
+    assert_invalid(client.act(held("qedgix", Bytes::new(), close)).await, "scene", "1000 UAVs in communication range");
 }

@@ -83,7 +83,7 @@ async fn what_cannot_be_published_is_refused_and_leaves_nothing() {
         ("sweep", Some(BYTES), good.clone(), 400, "invalid_argument", "name"),
         ("mine:1", Some(BYTES), good.clone(), 400, "invalid_argument", "name"),
         ("mine?alias=a:b", Some(BYTES), good.clone(), 400, "invalid_argument", "alias"),
-        ("mine?allias=live", Some(BYTES), good.clone(), 400, "invalid_argument", "query"),
+        ("mine?allias=live", Some(BYTES), good.clone(), 400, "invalid_argument", "allias"),
         ("mine", json, nowhere.into(), 404, "not_found", ""),
         ("mine", json, br#"{"checkpoint_id": "../../x"}"#.to_vec(), 404, "not_found", ""),
         ("mine", json, br#"{"checkpoint": 3}"#.to_vec(), 422, "invalid_schema", "checkpoint"),

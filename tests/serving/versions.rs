@@ -238,7 +238,7 @@ async fn ten_thousand_versions_are_listed_in_pages_and_none_is_read_at_the_start
     let all = rest.get("/v1/policies").await.1;
     let names: Vec<&Value> = all["policies"].as_array().unwrap().iter().map(|policy| &policy["ref"]["name"]).collect();
     assert!(names.contains(&&json!("qedgix")) && !names.contains(&&json!("mine")), "{names:?}");
-    for (query, field) in [("page_size=1001", "page_size"), ("page_token=x", "page_token"), ("pagesize=3", "query")] {
+    for (query, field) in [("page_size=1001", "page_size"), ("page_token=x", "page_token"), ("pagesize=3", "pagesize")] {
         let (status, problem) = rest.get(&format!("/v1/policies/mine/versions?{query}")).await;
         assert_eq!((status.as_u16(), &problem["field"]), (400, &json!(field)), "{problem}");
     }
