@@ -251,5 +251,5 @@ def test_commands_within_text(page):
             command.append(words.pop(0))
         assert command or words[0] == "COMMAND" or words[0].startswith("--"), f"{page}: {line}: no such command"
         known = usage(*command)
-        for flag in re.findall(r"(?<!\S)--[a-z][a-z-]*", " ".join(words)):
+        for flag in re.findall(r"(?<!\S)--[a-z][a-z0-9-]*", " ".join(words)):
             assert re.search(rf"{flag}\b(?!-)", known), f"{page}: {line}: no flag {flag}"
