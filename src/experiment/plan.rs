@@ -116,11 +116,11 @@ impl Experiment {
             points.push(NamedSettings { name: String::new(), x: Some(0.0), settings: RunSettings::default() });
         }
         let x = top.optional("x")?.unwrap_or_default();
-        let command_line = RunSettings::overrides(overrides);
+        let overriding = RunSettings::overrides(overrides);
         for (i, point) in points.iter().enumerate() {
-            if let Some((field, value)) = point.settings.field_in_common(&command_line) {
+            if let Some((field, value)) = point.settings.field_in_common(&overriding) {
                 let expected = format!("a field that no point sets; points[{i}] sets it, so all points would be the same");
-                return Err(Invalid::new(format!("on the command line, {field}"), value, expected));
+                return Err(Invalid::new(format!("{}{field}", overrides.origin), value, expected));
             }
         }
 
@@ -132,14 +132,14 @@ impl Experiment {
                 }
                 (x, _) => x.unwrap_or(i as f64),
             };
-            let shared = RunSettings::resolve(&[&run, &point.settings, &command_line], 1)?;
+            let shared = RunSettings::resolve(&[&run, &point.settings, &overriding], 1)?;
             experiment_points.push(ExperimentPoint { name: point.name.clone(), x, environment: shared.environment });
         }
         let mut runs = Vec::new();
         for &seed in &seeds {
             for (p, point) in points.iter().enumerate() {
                 for (s, series) in series.iter().enumerate() {
-                    let config = RunSettings::resolve(&[&run, &series.settings, &point.settings, &command_line], seed)?;
+                    let config = RunSettings::resolve(&[&run, &series.settings, &point.settings, &overriding], seed)?;
                     let folder = folder(&series.name, &point.name, &config);
                     runs.push(Run { series: s, point: p, folder, config });
                 }

@@ -6,7 +6,7 @@ use serde_json::{Map, Value};
 use crate::invalid::{Invalid, expectation};
 use crate::train_config::{Algorithm, Preset, TrainConfig, field_name};
 
-/// Settings of the command line, which override the document.
+/// Settings that override the document.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Overrides {
     /// Seeds that replace those of the document.
@@ -21,6 +21,8 @@ pub struct Overrides {
     pub environment: Map<String, Value>,
     /// Fields of `training`.
     pub training: Map<String, Value>,
+    /// Prefix of these fields in errors.
+    pub origin: String,
 }
 
 /// A table of the document; fields are removed as they are read.
@@ -93,10 +95,10 @@ impl RunSettings {
         })
     }
 
-    /// The settings of the command line.
+    /// The settings that override the document.
     pub fn overrides(overrides: &Overrides) -> Self {
-        let Overrides { environment, training, .. } = overrides.clone();
-        Self { prefix: "on the command line, ".into(), environment, training, ..Self::default() }
+        let Overrides { environment, training, origin: prefix, .. } = overrides.clone();
+        Self { prefix, environment, training, ..Self::default() }
     }
 
     /// The first field that `other` sets, too, with the value of `other`: `training.gamma`.

@@ -6,6 +6,7 @@
 mod backfill;
 pub mod evaluation;
 mod executor;
+pub mod experiment_jobs;
 mod local;
 pub mod memory;
 mod scheduler;

@@ -74,6 +74,9 @@ pub struct JobRequest {
     /// What a job of the kind `sweep` varies.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sweep: Option<SweepRequest>,
+    /// What a job of the kind `experiment` compares: the document of `qedgix experiment`, and `overrides`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub experiment: Option<Map<String, Value>>,
     /// Seed of every random stream; default: 1.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub seed: Option<u64>,
@@ -185,6 +188,8 @@ impl JobRequest {
             config: None,
             evaluation: None,
             sweep: None,
+            experiment: None,
+            report: None,
             point: None,
             work: 0,
         };
@@ -211,13 +216,17 @@ impl JobRequest {
             ("publish", self.publish.is_some()),
         ];
         let unwanted: &[(&str, bool)] = match kind {
-            JobKind::Train => &[("evaluation", self.evaluation.is_some()), ("sweep", self.sweep.is_some())],
+            JobKind::Train => &[
+                ("evaluation", self.evaluation.is_some()),
+                ("sweep", self.sweep.is_some()),
+                ("experiment", self.experiment.is_some()),
+            ],
             JobKind::Evaluate if self.evaluation.is_none() => {
                 return Err(Invalid::missing("evaluation", "what a job of the kind evaluate does"));
             }
             JobKind::Evaluate => &training,
             // Its jobs are checked one by one.
-            JobKind::Sweep => &[],
+            JobKind::Sweep | JobKind::Experiment => &[],
         };
         match unwanted.iter().find(|(_, given)| *given) {
             Some((field, _)) => Err(Invalid::new(*field, "a value", format!("no value in a job of the kind {kind}"))),

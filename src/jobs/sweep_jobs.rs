@@ -8,14 +8,14 @@ use crate::invalid::{Invalid, in_range};
 use crate::store::{JobKind, JobSpec};
 
 /// Longest name of a sweep: the names of its jobs have a number at the end.
-const MAX_NAME: usize = 58;
+pub(super) const MAX_NAME: usize = 58;
 
-/// A sweep with its jobs.
+/// A sweep or an experiment with its jobs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sweep {
-    /// The job of the sweep itself.
+    /// The job itself.
     pub spec: JobSpec,
-    /// Its jobs: all seeds of the first combination, then of the next.
+    /// Its jobs; of a sweep all seeds of the first combination, then of the next.
     pub jobs: Vec<JobSpec>,
 }
 

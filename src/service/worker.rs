@@ -26,7 +26,7 @@ const MAX_CHECKPOINT: u64 = 256 << 20;
 /// Maximum number of metrics in one report.
 const MAX_METRICS: usize = 10_000;
 /// Maximum size of the result of a job, in bytes.
-const MAX_RESULT: usize = 1 << 20;
+const MAX_RESULT: usize = 3 << 20;
 /// Most values that an early stop looks back to. Workers report fewer.
 const MAX_OBSERVED: u32 = 50_000;
 
@@ -56,6 +56,8 @@ pub struct AttemptTask {
     pub snapshot_every: std::time::Duration,
     /// Whether training begins with weights of a checkpoint, unless there is a snapshot.
     pub initial_weights: bool,
+    /// What is evaluated after training.
+    pub report: Option<Value>,
     /// Whether the best checkpoint is compared with a policy, see [`rival`].
     pub rival: bool,
     /// When training ends before all steps are done.
@@ -110,6 +112,7 @@ pub async fn fetch(app: &App, lease: Lease) -> Result<AttemptTask, Error> {
         snapshot,
         snapshot_every: app.scheduler.config().snapshot_every,
         initial_weights: spec.init.is_some_and(|init| init.from == InitKind::Weights),
+        report: spec.report,
         rival: spec.publish.is_some_and(|rule| rule.better_than.is_some()),
         stop: spec.stop,
         observed,
@@ -228,7 +231,7 @@ pub async fn finish(app: &App, lease: Lease, result: WorkerResult, document: Opt
         WorkerResult::Succeeded => match new_version(app, lease).await {
             Ok(Some((version, promotion))) => {
                 let promotion = promotion.map(|rule| promotion_of(rule, document)).transpose()?;
-                policies::publish_and_end(app, version, promotion, lease).await?
+                policies::publish_and_end(app, version, policies::JobResult { promotion, document }, lease).await?
             }
             Ok(None) => end(app, lease, &WorkerResult::Succeeded, document).await?,
             // Another attempt would fail with the same checkpoint.

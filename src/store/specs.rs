@@ -20,6 +20,8 @@ named_enum! {
         Evaluate = "evaluate",
         /// Trains many policies.
         Sweep = "sweep",
+        /// Trains and evaluates the policies of an experiment.
+        Experiment = "experiment",
     }
 }
 
@@ -100,7 +102,13 @@ pub struct JobSpec {
     /// What a sweep varies, as a document that the store does not read.
     #[serde(default)]
     pub sweep: Option<Value>,
-    /// Number of the combination of its sweep that the job has, from 0.
+    /// What an experiment compares, as a document that the store does not read.
+    #[serde(default)]
+    pub experiment: Option<Value>,
+    /// What a job of an experiment reports when it has trained, as a document that the store does not read.
+    #[serde(default)]
+    pub report: Option<Value>,
+    /// Number of the combination of its sweep, or of the run of its experiment, that the job has, from 0.
     #[serde(default)]
     pub point: Option<u64>,
     /// The amount of work of a job that does not train, in steps of its progress.
@@ -125,6 +133,8 @@ impl JobSpec {
             config: Some(config),
             evaluation: None,
             sweep: None,
+            experiment: None,
+            report: None,
             point: None,
             work: 0,
         }

@@ -1,4 +1,4 @@
-//! Sweeps: jobs that only have other jobs. Their state follows from the states of these.
+//! Sweeps and experiments: jobs that only have other jobs. Their state follows from the states of these.
 
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
@@ -6,9 +6,29 @@ use sqlx::SqliteConnection;
 use super::jobs::get_existing;
 use super::submission::{find_submitted, insert};
 use super::transitions::{Transition, transition};
-use super::{Job, JobAction, JobKind, JobState, NewJob, PendingAction, Result, Store, SubmitResult};
+use super::{Job, JobAction, JobId, JobKind, JobState, NewJob, PendingAction, Result, Store, SubmitResult};
 
 impl Store {
+    /// The results of the jobs that the job `parent` has made, as JSON, in the order of submission.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn results_of_jobs(&self, parent: JobId) -> Result<Vec<Option<String>>> {
+        let query = sqlx::query_scalar("SELECT result FROM jobs WHERE parent = ? ORDER BY number").bind(parent.to_string());
+        Ok(query.fetch_all(&self.read).await?)
+    }
+
+    /// Keeps the result of a job that has succeeded, as JSON.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn keep_result(&self, job: JobId, result: &str) -> Result<()> {
+        let mut tx = self.begin().await?;
+        let sql = "UPDATE jobs SET result = ? WHERE id = ? AND state = 'succeeded'";
+        sqlx::query(sql).bind(result).bind(job.to_string()).execute(&mut *tx).await?;
+        tx.commit().await
+    }
+
     /// Submits a sweep together with its jobs, which are queued.
     ///
     /// # Errors
@@ -33,9 +53,10 @@ impl Store {
     }
 }
 
-/// Whether a job is a sweep.
+/// Whether a job only has other jobs: a sweep or an experiment.
 pub(super) fn is_sweep(job: &Job) -> bool {
-    job.spec.kind.as_deref() == Some(JobKind::Sweep.as_str())
+    let kind = job.spec.kind.as_deref();
+    [JobKind::Sweep, JobKind::Experiment].iter().any(|makes_jobs| kind == Some(makes_jobs.as_str()))
 }
 
 /// Applies `action` to the jobs of a sweep that it concerns. Returns whether there were any.

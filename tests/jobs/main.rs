@@ -2,6 +2,7 @@
 
 mod command_line;
 mod events;
+mod experiments;
 mod finding;
 mod harness;
 mod killed_sweep;

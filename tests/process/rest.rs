@@ -31,6 +31,11 @@ impl Rest {
         Self { http, client: reqwest::Client::builder().connect_timeout(Duration::from_secs(5)).build().unwrap() }
     }
 
+    /// The address, as `http://127.0.0.1:8080`.
+    pub fn address(&self) -> &str {
+        &self.http
+    }
+
     pub fn request(&self, method: Method, path: &str) -> reqwest::RequestBuilder {
         self.client.request(method, format!("{}{path}", self.http))
     }

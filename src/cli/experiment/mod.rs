@@ -109,6 +109,7 @@ fn read(args: &ExperimentArgs) -> anyhow::Result<Experiment> {
         num_seeds: args.num_seeds.map(usize::from),
         series: args.series.clone(),
         points: args.point.clone(),
+        origin: "on the command line, ".into(),
         ..Overrides::default()
     };
     run_args::set(&args.set, &mut overrides.environment, &mut overrides.training)?;

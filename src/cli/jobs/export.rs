@@ -83,6 +83,7 @@ fn config(job: &Value) -> Value {
         "training",
         "evaluation",
         "sweep",
+        "experiment",
         "seed",
     ];
     let given = fields.iter().filter(|field| !job[**field].is_null());

@@ -25,6 +25,10 @@ pub struct SubmitArgs {
     /// JSON from standard input
     #[arg(long, value_name = "FILE")]
     file: Option<PathBuf>,
+    /// Submits the experiment of this TOML file, as `qedgix experiment` runs it; --steps, --uavs and --set override the fields of all
+    /// runs
+    #[arg(long, value_name = "FILE", conflicts_with = "file")]
+    experiment: Option<PathBuf>,
     #[command(flatten)]
     job: JobArgs,
     /// Follow the job until its end; the exit status is then that of `jobs watch`
@@ -118,8 +122,27 @@ async fn add(client: &Client, path: &str, body: &Value) -> Result<Value, ClientE
 /// Runs the command.
 pub(super) async fn run(client: &Client, args: SubmitArgs, json: bool) -> anyhow::Result<()> {
     let document = args.file.as_deref().map(read).transpose()?.unwrap_or_default();
-    let job = submit(client, &body(document, &args.run, &args.job)?).await?;
+    let mut body = body(document, &args.run, &args.job)?;
+    if let Some(path) = &args.experiment {
+        body = experiment(read(path)?, body);
+    }
+    let job = submit(client, &body).await?;
     print_and_watch(client, &job, json, args.watch).await
+}
+
+/// A job of the kind `experiment`, with the fields of `body` for all runs.
+fn experiment(mut document: Map<String, Value>, mut body: Value) -> Value {
+    let mut overrides = Map::new();
+    if let Value::Object(body) = &mut body {
+        for section in ["environment", "training"] {
+            overrides.extend(body.remove_entry(section));
+        }
+    }
+    if !overrides.is_empty() {
+        document.insert("overrides".into(), overrides.into());
+    }
+    (body["kind"], body["experiment"]) = ("experiment".into(), document.into());
+    body
 }
 
 /// Flags of `jobs continue`.

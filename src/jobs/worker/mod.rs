@@ -9,6 +9,7 @@ mod early_stop;
 mod evaluation;
 mod report;
 mod rival;
+mod run_report;
 mod training;
 
 use std::any::Any;
@@ -219,8 +220,12 @@ impl Work {
         };
         let observed: Vec<_> = task.observed.iter().map(|metric| (metric.step, metric.value)).collect();
         let stop_rule = stop_rule.map(|rule| StopRule::new(rule, &observed));
+        let report = match task.report.as_str() {
+            "" => None,
+            report => Some(serde_json::from_str(report).map_err(Error::Configuration)?),
+        };
         let rival = task.rival;
-        Ok(Self::Train(TrainingTask { config, threads, snapshot, initial_weights, snapshot_every, stop_rule, rival }))
+        Ok(Self::Train(TrainingTask { config, threads, snapshot, initial_weights, snapshot_every, stop_rule, rival, report }))
     }
 
     /// Does the work. Returns how it ended, and the result as JSON if it has one.

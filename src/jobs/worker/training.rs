@@ -7,10 +7,12 @@ use std::time::{Duration, Instant};
 use tokio::sync::mpsc::Sender;
 
 use super::early_stop::StopRule;
+use super::run_report::{self, TrainedRun};
 use super::{ServerHandle, StopSignal, rival};
-use crate::checkpoint::Checkpoint;
+use crate::checkpoint::{self, Checkpoint};
 use crate::invalid::Invalid;
 use crate::jobs::Directive;
+use crate::jobs::experiment_jobs::RunReport;
 use crate::learner::{Evaluation, Event, TrainConfig, Trainer};
 use crate::store::WorkerResult;
 use crate::wire::v1::CheckpointKind;
@@ -46,6 +48,8 @@ pub(super) struct TrainingTask {
     pub stop_rule: Option<StopRule>,
     /// Whether the best checkpoint is compared with a policy of the server.
     pub rival: bool,
+    /// What is evaluated after training.
+    pub report: Option<RunReport>,
 }
 
 /// The queue of reports. Adding a report waits while the queue is full.
@@ -90,9 +94,15 @@ pub(super) fn train(
     stop: &StopSignal,
     server: &ServerHandle,
 ) -> (WorkerResult, Option<String>) {
-    let (rival, threads) = (task.rival, task.threads);
-    let trained = try_train(task, reports, stop).and_then(|(end, best)| match best.filter(|_| rival) {
-        Some(best) if end == WorkerResult::Succeeded => {
+    let (rival, threads, report) = (task.rival, task.threads, task.report.clone());
+    let trained = try_train(task, reports, stop).and_then(|(end, run)| match (run, report) {
+        (Some(run), Some(report)) => {
+            tracing::info!("training is done; evaluating");
+            let reported = run_report::evaluate(&run, &report, threads, &stop.flag())?;
+            let reported = reported.map(|reported| serde_json::to_string(&reported)).transpose()?;
+            Ok((if reported.is_some() { end } else { WorkerResult::Stopped }, reported))
+        }
+        (Some(TrainedRun { best, .. }), None) if rival => {
             let Some(rival) = server.rival()? else { return Ok((end, None)) };
             tracing::info!(rival = rival.0, "training is done; comparing the best checkpoint");
             let compared = rival::compare(&best, &rival, threads, &stop.flag());
@@ -111,13 +121,14 @@ pub(super) fn train(
     }
 }
 
-/// Trains. Returns how it ended, and the best checkpoint of a run that is done.
+/// Trains. Returns how it ended, and the run if it has trained.
 fn try_train(
     mut task: TrainingTask,
     reports: &ReportQueue,
     stop: &StopSignal,
-) -> Result<(WorkerResult, Option<Checkpoint>), Box<dyn std::error::Error>> {
-    let snapshot_every = task.snapshot_every;
+) -> Result<(WorkerResult, Option<TrainedRun>), Box<dyn std::error::Error>> {
+    let begun = Instant::now();
+    let (snapshot_every, task_report) = (task.snapshot_every, task.report.is_some());
     let mut stop_rule = task.stop_rule.take();
     let mut trainer = begin(task)?;
     trainer.add_reports();
@@ -139,6 +150,8 @@ fn try_train(
                     reports.checkpoint(CheckpointKind::Best, &best);
                 }
             }
+            // The best weights of a run that diverged are a result of an experiment, too.
+            Event::Diverged { .. } if task_report => return Ok((WorkerResult::Succeeded, trained(&trainer, None, begun)?)),
             Event::Diverged { env_steps } => {
                 let reason = format!("training diverged at step {env_steps}: a parameter is not finite or too large");
                 return Ok((WorkerResult::Failed { reason, permanent: true }, None));
@@ -147,8 +160,9 @@ fn try_train(
         }
         if ends {
             tracing::info!(step = trainer.env_steps(), "training ends early");
-            reports.checkpoint(CheckpointKind::Last, &trainer.checkpoint()?);
-            return Ok((WorkerResult::Succeeded, trainer.best()?));
+            let last = trainer.checkpoint()?;
+            reports.checkpoint(CheckpointKind::Last, &last);
+            return Ok((WorkerResult::Succeeded, trained(&trainer, Some(last), begun)?));
         }
         if last_snapshot.elapsed() >= snapshot_every && !reports.snapshot_pending.load(Ordering::Acquire) {
             reports.snapshot(&trainer);
@@ -162,10 +176,17 @@ fn try_train(
             Ok((WorkerResult::Stopped, None))
         }
         Directive::Pause | Directive::Continue => {
-            reports.checkpoint(CheckpointKind::Last, &trainer.checkpoint()?);
-            Ok((WorkerResult::Succeeded, trainer.best()?))
+            let last = trainer.checkpoint()?;
+            reports.checkpoint(CheckpointKind::Last, &last);
+            Ok((WorkerResult::Succeeded, trained(&trainer, Some(last), begun)?))
         }
     }
+}
+
+/// A run that has trained; `None` without an evaluation.
+fn trained(trainer: &Trainer, last: Option<Checkpoint>, begun: Instant) -> Result<Option<TrainedRun>, checkpoint::Error> {
+    let (steps, seconds) = (trainer.env_steps(), begun.elapsed().as_secs_f64());
+    Ok(trainer.best()?.map(|best| TrainedRun { best, last, steps, seconds }))
 }
 
 /// The run of a task: from its snapshot, from its initial weights, or anew.

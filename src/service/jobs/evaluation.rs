@@ -35,7 +35,8 @@ pub(super) fn pin_versions(app: &App, evaluation: Value) -> Result<Value, Error>
 }
 
 /// The result of the job `id`: of an evaluation, the report of `qedgix evaluate --json`; of a sweep, at any time, the states of its
-/// jobs and means over seeds.
+/// jobs and means over seeds; of an experiment, the states of its jobs and, when all have succeeded, the report; of a training job with
+/// `publish`, what became of it.
 ///
 /// # Errors
 /// [`Error::NotFound`], or [`Error::Precondition`] while the job has none.
@@ -43,6 +44,9 @@ pub async fn result(app: &App, caller: &Caller, id: &str) -> Result<Value, Error
     let job = get(app, caller, id).await?;
     if job.spec.kind.as_deref() == Some(JobKind::Sweep.as_str()) {
         return super::sweep::result(app, &job).await;
+    }
+    if job.spec.kind.as_deref() == Some(JobKind::Experiment.as_str()) {
+        return super::experiment::result(app, &job).await;
     }
     if let Some(result) = app.store.job_result(job.id).await? {
         serde_json::from_str(&result).map_err(Error::internal)

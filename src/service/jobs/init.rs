@@ -99,7 +99,7 @@ pub(super) async fn continued(
     let most = TrainConfig::MAX_STEPS;
     in_range("steps", request.steps, 1..=most)?;
     let labels = spec.labels.clone();
-    let spec = JobSpec { name: job.spec.name.clone(), labels, after: Vec::new(), point: None, ..spec };
+    let spec = JobSpec { name: job.spec.name.clone(), labels, after: Vec::new(), report: None, point: None, ..spec };
     if let Some(snapshot) = app.store.snapshot(job.id).await? {
         let init = JobInit {
             from: InitKind::Snapshot,

@@ -1,6 +1,7 @@
 //! The use cases of jobs: submit, get, list, edit, cancel, pause, resume, retry, delete, and read metrics, checkpoints and logs.
 
 mod evaluation;
+mod experiment;
 mod init;
 mod listing;
 mod logs;
@@ -56,7 +57,7 @@ async fn submit_job(
         Ok(idempotency) => idempotency,
         Err(result) => return submitted(app, result),
     };
-    if request.kind == Some(JobKind::Sweep) {
+    if matches!(request.kind, Some(JobKind::Sweep | JobKind::Experiment)) {
         return submitted(app, sweep::submit(app, caller, request, idempotency).await?);
     }
     let (notes, init) = (request.notes.clone().unwrap_or_default(), request.init.clone());

@@ -10,19 +10,19 @@ use super::init::InitialWeights;
 use super::{check_dependency, publication};
 use crate::jobs::memory::check as check_memory;
 use crate::jobs::spec::JobRequest;
-use crate::jobs::{sweep, sweep_jobs};
+use crate::jobs::{experiment_jobs, sweep, sweep_jobs};
 use crate::learner::Interval;
 use crate::rng;
 use crate::service::keys::Caller;
 use crate::service::policies::Publisher;
 use crate::service::{App, Error};
-use crate::store::{Job, JobFilter, JobId, JobList, JobOrder, JobSort, JobState, ListedJob, MetricSummary, NewJob, SubmitResult};
+use crate::store::{Job, JobFilter, JobId, JobKind, JobList, JobOrder, JobSort, JobState, ListedJob, MetricSummary, NewJob, SubmitResult};
 
 /// The metrics of the result of a sweep.
 const METRICS: [&str; 6] =
     ["eval/mean_aoi", "eval/p95_aoi", "eval/peak_aoi", "eval/coverage", "eval/fairness", "eval-v1/mean_aoi"];
 
-/// Submits a sweep with its jobs.
+/// Submits a sweep or an experiment with its jobs.
 pub(super) async fn submit(
     app: &App,
     caller: &Caller,
@@ -34,7 +34,8 @@ pub(super) async fn submit(
         Some(init) => Some(InitialWeights::find(app, caller, init).await?),
         None => None,
     };
-    let mut sweep = sweep_jobs::resolve(request, app.scheduler.cpu_budget())?;
+    let resolve = if request.kind == Some(JobKind::Experiment) { experiment_jobs::resolve } else { sweep_jobs::resolve };
+    let mut sweep = resolve(request, app.scheduler.cpu_budget())?;
     let memory = app.scheduler.config().memory;
     let mut beginning = None;
     for (i, job) in sweep.jobs.iter_mut().enumerate() {

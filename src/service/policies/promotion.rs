@@ -18,6 +18,14 @@ pub(in crate::service) struct Promotion {
     pub comparison: Option<RivalComparison>,
 }
 
+/// What a job that succeeds leaves besides its policy.
+pub(in crate::service) struct JobResult<'a> {
+    /// The move of an alias, which is then its result.
+    pub promotion: Option<Promotion>,
+    /// The result as JSON.
+    pub document: Option<&'a str>,
+}
+
 /// Whether the alias moves, and why it does not.
 pub(super) type Decision = Result<(), String>;
 

@@ -5,7 +5,7 @@ use jiff::Timestamp;
 use super::aliases::{check_alias, unloaded};
 use super::deletion::retain_after_publishing;
 use super::info::{self, PolicyDetails, complete};
-use super::promotion::Promotion;
+use super::promotion::JobResult;
 use super::stored::{CheckpointBytes, ParsedCheckpoint};
 use super::upload_limit::UploadPermit;
 use super::{PolicyStores, one_at_a_time};
@@ -133,16 +133,17 @@ pub async fn publish(app: &App, caller: &Caller, request: PublishRequest) -> Res
 pub(in crate::service) async fn publish_and_end(
     app: &App,
     version: NewVersion,
-    promotion: Option<Promotion>,
+    result: JobResult<'_>,
     lease: Lease,
 ) -> Result<Option<Job>, Error> {
     let (max_attempts, now) = (app.scheduler.config().max_attempts, app.clock.now());
     let name = version.name.clone();
+    let (promotion, document) = (result.promotion, result.document.map(str::to_owned));
     let job = one_at_a_time(app, async move |PolicyStores { store, registry }| {
         // Policies do not change between the decision and the transaction.
         let decision = promotion.as_ref().map(|p| (p, p.decide(&registry, &version.name, &version.parsed.digest)));
         let alias = decision.as_ref().filter(|(_, decision)| decision.is_ok()).map(|(promotion, _)| promotion.alias.as_str());
-        let document = decision.as_ref().map(|(promotion, decision)| promotion.document(decision).to_string());
+        let document = decision.as_ref().map(|(promotion, decision)| promotion.document(decision).to_string()).or(document);
         let (new, document) = (version.row(now, alias), document.as_deref());
         let ended = EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: Some(new), document, max_attempts, now };
         let Some((job, published)) = store.end_attempt(ended).await? else { return Ok(None) };

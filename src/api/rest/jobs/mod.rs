@@ -430,7 +430,9 @@ async fn logs(State(app): AppState, caller: Caller, Path(JobPath { id }): Path<J
 
 /// Get the result of a job: of an evaluation that has succeeded, the report of `qedgix evaluate --json`
 ///
-/// Of a sweep, at any time: the states of its jobs, and the means of metrics over the seeds of each combination.
+/// Of a sweep, at any time: the states of its jobs, and the means of metrics over the seeds of each combination. Of an experiment, at
+/// any time: the states of its jobs, and `report`, which is null until all have succeeded. Of a training job with `publish.alias`:
+/// whether the alias moved.
 #[utoipa::path(
     get, path = "/v1/jobs/{id}/result", operation_id = "getJobResult", tag = "jobs", params(JobPath),
     responses((status = 200, description = "The result.", body = Object), BadRequest, NotFound, Conflict)

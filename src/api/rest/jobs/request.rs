@@ -81,6 +81,11 @@ pub(super) struct JobRequest {
     evaluation: Option<Evaluation>,
     /// What a job of the kind `sweep` varies. The other fields are those of its jobs.
     sweep: Option<Sweep>,
+    /// What a job of the kind `experiment` compares: a file of `qedgix experiment` as JSON, and `overrides` with fields of `environment`
+    /// and `training` that override those of all runs.
+    #[serde(default, deserialize_with = "json::optional_object")]
+    #[schema(value_type = Option<Object>)]
+    experiment: Option<Map<String, Value>>,
     /// Seed of the training. Configuration and seed determine every metric and weight. Default: 1.
     #[serde(default, deserialize_with = "json::optional_integer")]
     seed: Option<u64>,
@@ -90,7 +95,8 @@ impl From<JobRequest> for spec::JobRequest {
     fn from(request: JobRequest) -> Self {
         let JobRequest { kind, name, labels, notes, threads, priority, algorithm, preset, environment, training, seed, .. } =
             request;
-        let JobRequest { max_attempts, timeout, backoff, after, stop, init, publish, evaluation, sweep, .. } = request;
+        let JobRequest { max_attempts, timeout, backoff, after, stop, init, publish, evaluation, sweep, experiment, .. } =
+            request;
         let (init, publish) = (init.map(Into::into), publish.map(Into::into));
         let sweep = sweep.map(Into::into);
         let evaluation = evaluation.map(Into::into);
@@ -115,6 +121,7 @@ impl From<JobRequest> for spec::JobRequest {
             training,
             evaluation,
             sweep,
+            experiment,
             seed,
         }
     }
@@ -358,12 +365,13 @@ fn label_changes() -> RefOr<Schema> {
 
 /// A kind of jobs that this version runs.
 pub(super) fn kind() -> RefOr<Schema> {
-    schema(json!({"type": "string", "enum": [JobKind::Train, JobKind::Evaluate, JobKind::Sweep]}))
+    schema(json!({"type": "string", "enum": JobKind::NAMES}))
 }
 
 /// A kind of jobs that this version runs.
 pub(super) fn optional_kind() -> RefOr<Schema> {
-    schema(json!({"type": ["string", "null"], "enum": [JobKind::Train, JobKind::Evaluate, JobKind::Sweep, null]}))
+    let kinds = JobKind::NAMES.iter().map(|name| json!(name)).chain([Value::Null]);
+    schema(json!({"type": ["string", "null"], "enum": kinds.collect::<Vec<_>>()}))
 }
 
 fn labels() -> RefOr<Schema> {

@@ -182,7 +182,10 @@ pub(super) struct Job {
     /// The combinations and the number of seeds of a sweep; null for other kinds.
     #[schema(value_type = Option<Object>, required = true)]
     sweep: Option<Value>,
-    /// Number of the combination of its sweep that the job has, from 0; null without a sweep.
+    /// What an experiment compares; null for other kinds.
+    #[schema(value_type = Option<Object>, required = true)]
+    experiment: Option<Value>,
+    /// Number of the combination of its sweep, or of the run of its experiment, that the job has, from 0; null without one.
     #[schema(required = true)]
     point: Option<u64>,
 }
@@ -255,6 +258,7 @@ impl From<JobView> for Job {
         };
         let limits = spec.as_ref().map(|spec| spec.limits).unwrap_or_default();
         let point = spec.as_ref().and_then(|spec| spec.point);
+        let experiment = spec.as_ref().and_then(|spec| spec.experiment.clone());
         let (init, publish) = spec.as_ref().map(|spec| (spec.init.clone(), spec.publish.clone())).unwrap_or_default();
         let (after, stop, config, evaluation, sweep) =
             spec.map_or_else(Default::default, |spec| (spec.after, spec.stop, spec.config, spec.evaluation, spec.sweep));
@@ -300,6 +304,7 @@ impl From<JobView> for Job {
             training,
             evaluation,
             sweep,
+            experiment,
             point,
         }
     }
