@@ -60,6 +60,8 @@ pub struct Config {
     pub drain_timeout: Duration,
     /// Allow non-loopback addresses although no API key exists.
     pub insecure: bool,
+    /// Hosts that webhooks may be sent to besides those with public addresses: names or addresses, as in their URLs.
+    pub webhook_allow: Vec<String>,
     /// Names of hosts that requests may name while there is no API key, besides those of loopback and the address of REST.
     pub allow_hosts: Vec<String>,
     /// TLS certificates of both addresses; `None`: no TLS.
@@ -128,6 +130,7 @@ impl Config {
             engine: EngineConfig { threads: cores.min(4), queue: 4096, max_batch: 64, max_batch_delay: Duration::ZERO },
             drain_timeout: Duration::from_secs(20),
             insecure: false,
+            webhook_allow: Vec::new(),
             allow_hosts: Vec::new(),
             tls: None,
             max_connections: 10_000,
@@ -164,6 +167,8 @@ impl Config {
         in_range("--policy-memory", self.policy_memory, 1 << 20..=1 << 40)?;
         in_range("--keep-checkpoints", self.retention.checkpoints, 0..=1_000_000)?;
         in_range("--keep-versions", self.retention.versions, 0..=1_000_000)?;
+        in_range("--keep-jobs", self.retention.jobs, 0..=100_000_000)?;
+        in_seconds("--keep-jobs-for", self.retention.jobs_for, 0.0..=1e9)?;
         in_range("--max-message-size", self.max_message_size, 1024..=1 << 30)?;
         in_range("--max-watchers", self.max_watchers, 1..=100_000)?;
         in_seconds("--event-heartbeat", self.event_heartbeat, 0.001..=3600.0)?;
@@ -181,10 +186,11 @@ impl Config {
         in_seconds("--connection-idle", self.connection_idle, 0.001..=1e9)?;
         in_seconds("--connection-age", self.connection_age, 0.001..=1e9)?;
         in_seconds("--connection-grace", self.connection_grace, 0.001..=1e9)?;
-        for host in &self.allow_hosts {
+        for (flag, hosts) in [("--allow-host", &self.allow_hosts), ("--webhook-allow", &self.webhook_allow)] {
             let name = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
-            if host.is_empty() || !(host.chars().all(name) || host.parse::<IpAddr>().is_ok()) {
-                return Err(Invalid::new("--allow-host", format!("{host:?}"), "the name of a host, without scheme and port"));
+            let is_host = |host: &String| !host.is_empty() && (host.chars().all(name) || host.parse::<IpAddr>().is_ok());
+            if let Some(host) = hosts.iter().find(|host| !is_host(host)) {
+                return Err(Invalid::new(flag, format!("{host:?}"), "the name of a host, without scheme and port"));
             }
         }
         if let Some(rate) = self.key_rate {

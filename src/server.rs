@@ -42,6 +42,7 @@ use crate::invalid::Invalid;
 use crate::jobs::{LocalProcess, Scheduler, SchedulerConfig};
 use crate::service::keys::{Keyring, Rate};
 use crate::service::policies::{Loads, UploadLimit};
+use crate::service::webhooks::Webhooks;
 use crate::service::{App, WatchLimit, operations, policies};
 use crate::serving::{Engine, Environments, Limits, Registry, Sessions};
 use crate::store::{self, Store};
@@ -221,7 +222,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
     let store = Store::open(&data.path).await?;
     housekeeping::prepare_file(&store, &data.path).await?;
     let executor = match &config.worker {
-        Some(program) => LocalProcess { program: program.clone() },
+        Some(program) => LocalProcess::new(program),
         None => LocalProcess::same_program().map_err(Error::Worker)?,
     };
     let scheduler = SchedulerConfig {
@@ -251,6 +252,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         environments: Environments::new(environments, clock.clone()),
         engine: Engine::start(config.engine).map_err(Error::Engine)?,
         watchers: WatchLimit::new(config.max_watchers, config.event_heartbeat),
+        webhooks: Webhooks::new(&config.webhook_allow),
         clock,
         max_message_size: config.max_message_size,
         draining,

@@ -9,13 +9,14 @@ import { go, link, setOptions } from './route.js';
 import { Action, Bar, Card, copy, Empty, ErrorBox, Field, Loaded, Loading, run, State, Tabs, Title, useLoad } from './ui.js';
 import { Evaluation, SweepJobs } from './report.js';
 import { Edit } from './edit.js';
-import { command, commands, useTimeLeft, why } from './jobs.js';
+import { command, commands, makesJobs, useTimeLeft, why } from './jobs.js';
 
 /** The views of a job of each kind; the first one is shown if the address names none. */
 const VIEWS = {
   train: [['curves', 'Curves'], ['configuration', 'Configuration'], ['events', 'Events'], ['logs', 'Logs'], ['checkpoints', 'Checkpoints']],
   evaluate: [['report', 'Report'], ['configuration', 'Configuration'], ['events', 'Events'], ['logs', 'Logs']],
   sweep: [['jobs', 'Jobs'], ['configuration', 'Configuration'], ['events', 'Events']],
+  experiment: [['jobs', 'Jobs'], ['configuration', 'Configuration'], ['events', 'Events']],
 };
 
 /** Milliseconds between two drawings of a stream of events. */
@@ -83,7 +84,7 @@ export function JobPage({ id, options }) {
     if (verb === 'delete') go('#/jobs');
     else job.reload();
   };
-  const actions = html`${commands(now).map(([verb, label]) => html`<${Action} command=${() => act(verb)}>${label}<//>`)}<button type="button" onClick=${() => setEditing(true)}>Edit</button>${now.kind !== 'sweep' && html`<a class="button" href=${link(['submit'], { from: id })}>Clone</a>`}`;
+  const actions = html`${commands(now).map(([verb, label]) => html`<${Action} command=${() => act(verb)}>${label}<//>`)}<button type="button" onClick=${() => setEditing(true)}>Edit</button>${!makesJobs(now) && html`<a class="button" href=${link(['submit'], { from: id })}>Clone</a>`}`;
   return html`
     <p class="crumbs"><a href="#/jobs">Jobs</a></p>
     <${Title} text=${name} actions=${actions}>${name} <${State} state=${now.state} wanted=${now.wanted} /><//>
@@ -114,7 +115,7 @@ function Summary({ job, left }) {
       <div><dt>Threads</dt><dd>${job.threads}${job.priority ? `, priority ${job.priority}` : ''}</dd></div>
       ${job.policy && html`<div><dt>Policy</dt><dd><a href=${link(['policies', job.policy.split(':')[0]])}>${job.policy}</a> · <a href=${link(['player'], { policy: job.policy })}>fly it</a></dd></div>`}
       ${job.metrics?.['eval/mean_aoi']?.best != null && html`<div><dt>Best mean AoI</dt><dd><strong>${number(job.metrics['eval/mean_aoi'].best)}</strong> at ${short(job.metrics['eval/mean_aoi'].best_step)} steps</dd></div>`}
-      ${job.parent && html`<div><dt>Made by</dt><dd><a href=${link(['jobs', job.parent])}>a sweep</a></dd></div>`}
+      ${job.parent && html`<div><dt>Made by</dt><dd><a href=${link(['jobs', job.parent])}>another job</a></dd></div>`}
       ${Object.keys(job.labels ?? {}).length > 0 && html`<div><dt>Labels</dt><dd>${Object.entries(job.labels).map(([k, v]) => html`<span class="label">${k}=${v}</span>`)}</dd></div>`}
     </dl>
     ${job.notes && html`<p class="notes">${job.notes}</p>`}
@@ -146,7 +147,7 @@ function AllCurves({ job, events, options }) {
 }
 
 function Configuration({ job }) {
-  const parts = [['Environment', job.environment], ['Training', job.training], ['Evaluation', job.evaluation], ['Sweep', job.sweep]].filter(([, values]) => values);
+  const parts = [['Environment', job.environment], ['Training', job.training], ['Evaluation', job.evaluation], ['Sweep', job.sweep], ['Experiment', job.experiment]].filter(([, values]) => values);
   const request = { name: job.name, algorithm: job.algorithm, preset: job.preset, seed: job.seed, threads: job.threads, environment: job.environment, training: job.training };
   if (job.unreadable) return html`<${Card} title="Unreadable specification"><p>${job.unreadable.reason}</p><pre tabindex="0">${job.unreadable.document}</pre><//>`;
   return html`<p class="right"><button type="button" onClick=${() => copy(JSON.stringify(request, null, 2))}>Copy as JSON</button></p>

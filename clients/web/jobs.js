@@ -8,7 +8,10 @@ import { link, go, setOptions } from './route.js';
 import { Action, ask, Bar, Card, Choice, Empty, ErrorBox, Field, Loading, run, State, Title, useLoad } from './ui.js';
 
 const STATES = ['queued', 'running', 'paused', 'succeeded', 'failed', 'cancelled'];
-const KINDS = ['train', 'evaluate', 'sweep'];
+const KINDS = ['train', 'evaluate', 'sweep', 'experiment'];
+
+/** Whether a job only has other jobs. */
+export const makesJobs = (job) => job.kind === 'sweep' || job.kind === 'experiment';
 const PAGE = 100;
 /** Jobs that are selected when the reader has selected none. */
 const FIRST = 6;
@@ -148,6 +151,6 @@ function Row({ job, left, selected, select, reload }) {
     <td class="number" data-name="Best mean AoI">${number(job.metrics['eval/mean_aoi']?.best)}</td>
     <td data-name="Submitted" title=${clock(job.created_at)} class="nowrap">${ago(job.created_at)}</td>
     <td class="row-actions">${commands(job).map(([verb, label]) => html`<${Action} class="small" command=${() => command(job, verb).then(reload)} aria-label=${`${label} ${name}`}>${label}<//>`)}
-      ${job.kind !== 'sweep' && html`<button type="button" class="small" onClick=${() => go(link(['submit'], { from: job.id }))} aria-label=${`Clone ${name}`}>Clone</button>`}</td>
+      ${!makesJobs(job) && html`<button type="button" class="small" onClick=${() => go(link(['submit'], { from: job.id }))} aria-label=${`Clone ${name}`}>Clone</button>`}</td>
   </tr>`;
 }

@@ -36,12 +36,12 @@ function IntervalBar({ of, end, colour }) {
     <rect x="0" y="1" width=${at(of.mean)} height="8" fill=${colour} opacity="0.75" /><line x1=${at(of.low)} x2=${at(of.high)} y1="5" y2="5" class="whisker" /></svg>`;
 }
 
-/** The jobs of a sweep: compared, and as a list. */
+/** The jobs of a sweep or an experiment: compared, and as a list. */
 export function SweepJobs({ id, options, ended }) {
   const list = useLoad((signal) => all(`/v1/jobs?parent=${id}&page_size=500`, 'jobs', 500, signal), [id, ended], ended ? 0 : 3);
-  return html`<${Loaded} of=${list} what="the jobs of the sweep">${(jobs) => (jobs.length ? html`<${Curves} jobs=${jobs.filter((job) => job.progress.step > 0)} options=${options} first="parallel" />
+  return html`<${Loaded} of=${list} what="the jobs of this job">${(jobs) => (jobs.length ? html`<${Curves} jobs=${jobs.filter((job) => job.progress.step > 0)} options=${options} first="parallel" />
       <${Card} title=${`${jobs.length} jobs`}><div class="scroll"><table class="stack"><thead><tr><th scope="col">Job</th><th scope="col">State</th><th scope="col">Progress</th></tr></thead>
         <tbody>${jobs.map((job) => html`<tr key=${job.id}><td><a href=${link(['jobs', job.id])}>${job.name ?? job.id.slice(-6)}</a> <span class="faint small">seed ${job.seed}</span></td><td><${State} state=${job.state} wanted=${job.wanted} /></td>
           <td class="progress"><${Bar} value=${job.progress.steps ? job.progress.step / job.progress.steps : 0} label="Progress" /><span class="faint small">${short(job.progress.step)} of ${short(job.progress.steps)} steps</span></td></tr>`)}</tbody></table></div><//>`
-    : html`<${Card}><${Empty} title="The sweep has made no job yet." /><//>`)}<//>`;
+    : html`<${Card}><${Empty} title="It has made no job yet." /><//>`)}<//>`;
 }

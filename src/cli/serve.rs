@@ -83,6 +83,13 @@ pub struct ServeArgs {
     /// Newest versions to keep of each policy, besides those with an alias; older ones are deleted; 0: all
     #[arg(long, env = "QEDGIX_KEEP_VERSIONS", default_value_t = 0, value_name = "VERSIONS")]
     keep_versions: usize,
+    /// Newest jobs to keep of those that have ended; older ones are deleted with their metrics, logs and checkpoints, but not the
+    /// versions that they published; 0: all
+    #[arg(long, env = "QEDGIX_KEEP_JOBS", default_value_t = 0, value_name = "JOBS")]
+    keep_jobs: usize,
+    /// Time after its end for which a job is kept, as 30m or 720h; 0: forever
+    #[arg(long, env = "QEDGIX_KEEP_JOBS_FOR", default_value = "0s", value_parser = duration, value_name = "TIME")]
+    keep_jobs_for: Duration,
     /// Maximum size of a gRPC message or HTTP body, in bytes
     #[arg(long, env = "QEDGIX_MAX_MESSAGE_SIZE", default_value_t = 16 << 20, value_name = "BYTES")]
     max_message_size: usize,
@@ -113,6 +120,10 @@ pub struct ServeArgs {
     /// Host name by which callers reach this server, besides loopback names and its address, such as that of a proxy; repeatable. Needed only without API keys, when requests that name another host are refused [default: none]
     #[arg(long = "allow-host", help_heading = SECURITY, env = "QEDGIX_ALLOW_HOST", value_delimiter = ',', value_name = "HOST")]
     allow_hosts: Vec<String>,
+    /// Host that webhooks of jobs may be sent to although its address is not public, as in their URLs: hooks.lan, 127.0.0.1; repeatable
+    /// [default: none]
+    #[arg(long = "webhook-allow", help_heading = SECURITY, env = "QEDGIX_WEBHOOK_ALLOW", value_delimiter = ',', value_name = "HOST")]
+    webhook_allow: Vec<String>,
     #[command(flatten)]
     security: SecurityArgs,
     /// Format of the logs on standard error
@@ -278,7 +289,12 @@ impl ServeArgs {
             max_environments: self.max_environments,
             environment_memory: self.environment_memory,
             policy_memory: self.policy_memory,
-            retention: Retention { checkpoints: self.keep_checkpoints, versions: self.keep_versions },
+            retention: Retention {
+                checkpoints: self.keep_checkpoints,
+                versions: self.keep_versions,
+                jobs: self.keep_jobs,
+                jobs_for: self.keep_jobs_for,
+            },
             max_message_size: self.max_message_size,
             max_watchers: self.max_watchers,
             event_heartbeat: self.event_heartbeat,
@@ -290,6 +306,7 @@ impl ServeArgs {
             },
             drain_timeout: self.drain_timeout,
             insecure: self.insecure,
+            webhook_allow: self.webhook_allow.clone(),
             allow_hosts: self.allow_hosts.clone(),
             tls: self.security.tls_files(),
             max_connections: self.security.max_connections,

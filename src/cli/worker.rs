@@ -21,8 +21,9 @@ pub struct WorkerArgs {
 /// # Errors
 /// A variable is missing, or the server refuses the attempt.
 pub fn run(args: &WorkerArgs) -> anyhow::Result<()> {
-    // Before the process has threads, because threads inherit the priority.
+    // Before the process has threads, because threads inherit both.
     worker::lower_priority();
+    worker::confine_to_cores();
     if args.tethered {
         worker::exit_with_stdin()?;
     }

@@ -143,12 +143,16 @@ mod tests {
                 }
                 for job in begun {
                     started[job] = Some(now);
-                    // Nobody of a higher priority, or earlier with the same, waits while it would have fitted.
-                    let overtaken = model.queue.iter().filter(|&&i| (-jobs[i].priority, i) < (-jobs[job].priority, job));
-                    backfilled += overtaken.count();
+                    for &waits in model.queue.iter().filter(|&&i| before_head(&i, job)) {
+                        // Who comes first is overtaken only by jobs that need less.
+                        assert!(jobs[waits].threads > jobs[job].threads, "schedule {schedule} at {now}: {job} overtakes {waits}");
+                        backfilled += 1;
+                    }
                 }
                 let used: usize = model.running.iter().map(|(i, _)| jobs[*i].threads).sum();
                 assert!(used <= budget, "schedule {schedule} at {now}: {used} threads of {budget}");
+                let head_fits = model.queue.first().is_some_and(|&head| used + jobs[head].threads <= budget);
+                assert!(!head_fits, "schedule {schedule} at {now}: the head waits although it fits");
                 if let Some((job, latest)) = promise {
                     match started[job] {
                         Some(at) => assert!(at <= latest, "schedule {schedule}: the head was delayed from {latest} to {at}"),

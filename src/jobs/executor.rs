@@ -14,6 +14,8 @@ use crate::store::Lease;
 pub struct Launch {
     /// The attempt.
     pub lease: Lease,
+    /// Threads that the worker may use.
+    pub threads: usize,
     /// Secret that the worker presents to the server.
     pub token: String,
     /// Address of the server's `WorkerService`, as `http://127.0.0.1:50051`.

@@ -3,13 +3,14 @@
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
+use super::memory::default_limit;
 use super::spec::JobRequest;
 use super::sweep::MAX_JOBS;
 use super::sweep_jobs::{MAX_NAME, Sweep};
 use crate::env::{EnvConfig, EpisodeMetrics};
 use crate::experiment::{Experiment, Overrides, RunResult};
 use crate::invalid::{Invalid, in_range};
-use crate::store::{JobKind, JobSpec};
+use crate::store::{JobKind, JobLimits, JobSpec};
 
 /// Most evaluations of a job: layouts of the best weights, the last ones, and each baseline.
 const MAX_EVALUATIONS: usize = 8192;
@@ -38,10 +39,14 @@ pub struct ReportedRun {
     pub baselines: Vec<Vec<EpisodeMetrics>>,
 }
 
-/// Fields of the document that override those of all runs.
+/// What overrides the document, as the flags of `qedgix experiment` do.
 #[derive(Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct OverriddenFields {
+    seeds: Option<Vec<u64>>,
+    num_seeds: Option<u16>,
+    series: Vec<String>,
+    points: Vec<String>,
     environment: Map<String, Value>,
     training: Map<String, Value>,
 }
@@ -52,10 +57,17 @@ struct OverriddenFields {
 /// The first field that is not accepted, with the prefix `experiment`.
 pub fn experiment(mut document: Map<String, Value>) -> Result<Experiment, Invalid> {
     let overrides = document.remove("overrides").unwrap_or_else(|| Map::new().into());
-    let expected = "an object with environment and training";
-    let OverriddenFields { environment, training } = OverriddenFields::deserialize(&overrides)
-        .map_err(|_| Invalid::schema("experiment.overrides", &overrides, expected))?;
-    let overrides = Overrides { environment, training, origin: "overrides.".into(), ..Overrides::default() };
+    let read = serde_path_to_error::deserialize(&overrides).map_err(|e| {
+        let field = format!("experiment.overrides.{}", e.path());
+        Invalid::from_parser(field.trim_end_matches('.'), e.inner())
+    });
+    let OverriddenFields { seeds, num_seeds, series, points, environment, training } = read?;
+    if let (Some(number), Some(_)) = (num_seeds, &seeds) {
+        return Err(Invalid::new("experiment.overrides.num_seeds", number, "no value beside seeds"));
+    }
+    in_range("experiment.overrides.num_seeds", num_seeds.unwrap_or(1), 1..=1000)?;
+    let num_seeds = num_seeds.map(usize::from);
+    let overrides = Overrides { seeds, num_seeds, series, points, environment, training, origin: "overrides.".into() };
     Experiment::resolve(Value::Object(document), &overrides).map_err(|e| e.with_prefix("experiment"))
 }
 
@@ -90,7 +102,7 @@ pub fn resolve(mut request: JobRequest, cpu_budget: usize) -> Result<Sweep, Inva
     let episodes = experiment.layout_seeds.len();
     in_range("experiment.episodes", episodes * (2 + experiment.baselines.len()), 1..=MAX_EVALUATIONS)?;
     request.kind = None;
-    let name = request.name.take();
+    let (name, memory) = (request.name.take(), request.memory);
     let template = request.resolve(cpu_budget)?;
     let mut work = 0_u64;
     let first_of_point = |i: usize| experiment.runs[..i].iter().all(|run| run.point != experiment.runs[i].point);
@@ -101,9 +113,15 @@ pub fn resolve(mut request: JobRequest, cpu_budget: usize) -> Result<Sweep, Inva
         let report = RunReport { layouts: experiment.layouts.clone(), episodes, baselines, environment };
         JobSpec {
             name: name.as_ref().map(|name| format!("{name}-{i:03}")),
+            limits: JobLimits {
+                memory: memory.or_else(|| Some(default_limit(&run.config, template.threads))),
+                ..template.limits
+            },
             config: Some(run.config.clone()),
             report: Some(serde_json::to_value(report).expect("a report is plain data")),
             point: Some(i as u64),
+            // They are told of the experiment.
+            webhooks: Vec::new(),
             ..template.clone()
         }
     });

@@ -9,8 +9,9 @@ use futures::future::BoxFuture;
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::process::{Child, Command};
 
+use super::cores::{Cores, TakenCores};
 use super::executor::{Executor, Launch, LogTail, WorkerExit};
-use super::worker::{ENV_ATTEMPT, ENV_JOB, ENV_SERVER, ENV_TOKEN};
+use super::worker::{ENV_ATTEMPT, ENV_CORES, ENV_JOB, ENV_SERVER, ENV_TOKEN};
 
 /// Starts `PROGRAM worker` for each attempt.
 ///
@@ -19,23 +20,30 @@ use super::worker::{ENV_ATTEMPT, ENV_JOB, ENV_SERVER, ENV_TOKEN};
 #[derive(Clone, Debug)]
 pub struct LocalProcess {
     /// The `qedgix` binary.
-    pub program: PathBuf,
+    program: PathBuf,
+    cores: Cores,
 }
 
 impl LocalProcess {
+    /// Starts workers from the binary `program`.
+    pub fn new(program: impl Into<PathBuf>) -> Self {
+        Self { program: program.into(), cores: Cores::of_this_process() }
+    }
+
     /// Starts workers from the binary of this process, even if an upgrade has replaced its file.
     ///
     /// # Errors
     /// [`std::io::Error`] when the system does not report the path of the binary.
     pub fn same_program() -> std::io::Result<Self> {
         let linux = PathBuf::from("/proc/self/exe");
-        Ok(Self { program: if linux.exists() { linux } else { std::env::current_exe()? } })
+        Ok(Self::new(if linux.exists() { linux } else { std::env::current_exe()? }))
     }
 }
 
 impl Executor for LocalProcess {
     fn start(&self, launch: Launch) -> BoxFuture<'_, std::io::Result<BoxFuture<'static, WorkerExit>>> {
         async move {
+            let cores = self.cores.take(launch.threads);
             let mut command = Command::new(&self.program);
             command
                 .args(["worker", "--tethered"])
@@ -43,6 +51,7 @@ impl Executor for LocalProcess {
                 .env(ENV_JOB, launch.lease.job_id.to_string())
                 .env(ENV_ATTEMPT, launch.lease.attempt.to_string())
                 .env(ENV_TOKEN, &launch.token)
+                .env(ENV_CORES, cores.list())
                 .stdin(Stdio::piped())
                 .stdout(Stdio::piped())
                 .stderr(Stdio::piped())
@@ -51,7 +60,7 @@ impl Executor for LocalProcess {
             #[cfg(unix)]
             command.process_group(0).arg0("qedgix");
             let child = command.spawn()?;
-            Ok(supervise(child, launch).boxed())
+            Ok(supervise(child, launch, cores).boxed())
         }
         .boxed()
     }
@@ -60,7 +69,8 @@ impl Executor for LocalProcess {
 /// Time to read the remaining output after the process has ended. A child of the worker may hold the pipes open.
 const OUTPUT_TIMEOUT: Duration = Duration::from_secs(1);
 
-async fn supervise(mut child: Child, launch: Launch) -> WorkerExit {
+/// Waits for the end of a worker, whose cores are free then.
+async fn supervise(mut child: Child, launch: Launch, _cores: TakenCores) -> WorkerExit {
     // Held until the process has ended: the worker ends when it is closed.
     let stdin = child.stdin.take();
     let output = (child.stdout.take(), child.stderr.take());

@@ -1,6 +1,7 @@
 //! The memory of this machine, and whether a training run can fit into it.
 
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use crate::invalid::Invalid;
 use crate::learner::{MemoryEstimate, TrainConfig};
@@ -9,16 +10,15 @@ use crate::learner::{MemoryEstimate, TrainConfig};
 /// system does not say.
 pub fn available() -> u64 {
     let read = |path: &Path| std::fs::read_to_string(path).ok();
-    let machine = read(Path::new("/proc/meminfo")).and_then(|text| machine_memory(&text));
+    let machine = read(Path::new("/proc/meminfo")).and_then(|text| size(&text, "MemTotal:"));
     let groups = read(Path::new("/proc/self/cgroup")).unwrap_or_default();
     let limits = limit_files(&groups).into_iter().filter_map(|path| read(&path)?.trim().parse().ok());
     limits.chain(machine).min().unwrap_or(u64::MAX)
 }
 
-/// `MemTotal` of `/proc/meminfo`, in bytes.
-fn machine_memory(text: &str) -> Option<u64> {
-    let kib: u64 =
-        text.lines().find_map(|line| line.strip_prefix("MemTotal:"))?.trim().strip_suffix("kB")?.trim().parse().ok()?;
+/// A size of `/proc/meminfo` or `/proc/self/status`, in bytes.
+fn size(text: &str, field: &str) -> Option<u64> {
+    let kib: u64 = text.lines().find_map(|line| line.strip_prefix(field))?.trim().strip_suffix("kB")?.trim().parse().ok()?;
     Some(kib << 10)
 }
 
@@ -37,6 +37,29 @@ fn limit_files(groups: &str) -> Vec<PathBuf> {
         files.extend(group.ancestors().map(|group| Path::new(root).join(group).join(file)));
     }
     files
+}
+
+/// Memory in bytes that a worker may use unless its job says otherwise: several times the estimate, because a snapshot copies the
+/// replay, and allocators keep what they may need again.
+pub fn default_limit(config: &TrainConfig, threads: usize) -> u64 {
+    /// What a worker needs besides its estimate.
+    const BASE: u64 = 512 << 20;
+    MemoryEstimate::of(config, threads).total().saturating_mul(3).saturating_add(BASE)
+}
+
+/// Returns when this process uses more than `limit` bytes, with what it uses. Never where the system does not say.
+///
+/// The address space says nothing: allocators reserve much more than they use.
+pub(super) async fn exceeds(limit: u64) -> u64 {
+    /// Time between two looks.
+    const INTERVAL: Duration = Duration::from_millis(200);
+    loop {
+        let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+        if let Some(used) = size(&status, "VmRSS:").filter(|used| *used > limit) {
+            return used;
+        }
+        tokio::time::sleep(INTERVAL).await;
+    }
 }
 
 /// Checks that a run of `config` can fit into `available` bytes.
@@ -68,8 +91,8 @@ mod tests {
 
     #[test]
     fn limits_of_control_groups_are_found() {
-        assert_eq!(machine_memory("MemFree: 1 kB\nMemTotal:       16 kB\n"), Some(16 << 10));
-        assert_eq!(machine_memory("nonsense"), None);
+        assert_eq!(size("MemFree: 1 kB\nMemTotal:       16 kB\n", "MemTotal:"), Some(16 << 10));
+        assert_eq!(size("nonsense", "MemTotal:"), None);
         let files = limit_files("12:cpu,memory:/a\n3:pids:/b\n0::/user/run\nnonsense\n");
         let files: Vec<_> = files.iter().map(|path| path.to_str().unwrap()).collect();
         let expected = [
@@ -81,6 +104,12 @@ mod tests {
         ];
         assert_eq!(files, expected);
         assert!(available() > 1 << 20);
+    }
+
+    #[tokio::test]
+    async fn a_process_knows_what_it_uses() {
+        let used = exceeds(0).await;
+        assert!((1 << 20..1 << 40).contains(&used), "{used}");
     }
 
     #[test]

@@ -4,6 +4,7 @@
 //! `WorkerService` protocol, so it can run on any machine.
 
 mod backfill;
+mod cores;
 pub mod evaluation;
 mod executor;
 pub mod experiment_jobs;
@@ -13,6 +14,7 @@ mod scheduler;
 pub mod spec;
 pub mod sweep;
 pub mod sweep_jobs;
+pub mod webhooks;
 pub mod worker;
 
 use std::collections::HashMap;

@@ -116,7 +116,8 @@ impl Scheduler {
             let server = server.to_owned();
             let attempt = async move {
                 let (log, kill) = (running.log.clone(), CancellationToken::new());
-                scheduler.supervise(Launch { lease, token, server, log, kill }, &running).await;
+                let launch = Launch { lease, threads: running.threads, token, server, log, kill };
+                scheduler.supervise(launch, &running).await;
                 scheduler.release(lease.job_row);
             };
             tokio::spawn(attempt.instrument(span));

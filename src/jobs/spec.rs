@@ -8,7 +8,9 @@ use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 
 use super::evaluation::EvaluationRequest;
+use super::memory;
 use super::sweep::SweepRequest;
+use super::webhooks::{self, WebhookRequest};
 use crate::invalid::{Invalid, in_range};
 use crate::store::{EarlyStop, Job, JobEdit, JobId, JobKind, JobLimits, JobSpec, PublishRule, is_metric_name};
 use crate::train_config::{Algorithm, Preset, TrainConfig, floats_to_integers};
@@ -44,6 +46,12 @@ pub struct JobRequest {
     /// Seconds between a failed attempt and the next one; default: 0.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub backoff: Option<u64>,
+    /// Most memory of the worker in bytes; default: several times the estimate of a training run.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub memory: Option<u64>,
+    /// Addresses that are told when the job ends; default: none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub webhooks: Option<Vec<WebhookRequest>>,
     /// Ids of the jobs that must succeed before this one starts.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub after: Option<Vec<String>>,
@@ -164,7 +172,8 @@ impl JobRequest {
         let labels = self.labels.unwrap_or_default();
         check_labels(&labels)?;
         check_notes(&self.notes.unwrap_or_default())?;
-        let limits = resolve_limits(self.max_attempts, self.timeout, self.backoff)?;
+        let limits = JobLimits { memory: self.memory, ..resolve_limits(self.max_attempts, self.timeout, self.backoff)? };
+        in_range("memory", self.memory.unwrap_or(MIN_MEMORY), MIN_MEMORY..=MAX_MEMORY)?;
         let after = resolve_dependencies(self.after.unwrap_or_default())?;
         if let Some(stop) = &self.stop {
             check_stop(stop)?;
@@ -182,6 +191,7 @@ impl JobRequest {
             priority,
             limits,
             after,
+            webhooks: webhooks::resolve(self.webhooks.unwrap_or_default())?,
             stop: self.stop,
             init: None,
             publish: self.publish.map(PublishRequest::resolve).transpose()?,
@@ -201,7 +211,8 @@ impl JobRequest {
         }
         let (algorithm, preset) = (self.algorithm.unwrap_or_default(), self.preset.unwrap_or_default());
         let config = TrainConfig::resolve(algorithm, preset, &environment, &training, self.seed.unwrap_or(1))?;
-        Ok(JobSpec { config: Some(config), ..base })
+        let memory = Some(limits.memory.unwrap_or_else(|| memory::default_limit(&config, threads)));
+        Ok(JobSpec { config: Some(config), limits: JobLimits { memory, ..limits }, ..base })
     }
 
     /// Checks that the request has what its kind needs, and nothing that belongs to another kind.
@@ -321,6 +332,9 @@ pub fn digest(request: &impl Serialize) -> [u8; 32] {
     Sha256::digest(document.to_string()).into()
 }
 
+/// Least and most memory of a job that can be asked for, in bytes: 1 MiB and 1 PiB.
+const MIN_MEMORY: u64 = 1 << 20;
+const MAX_MEMORY: u64 = 1 << 50;
 /// Most jobs that a job comes after.
 const MAX_AFTER: usize = 100;
 /// Most seconds of a timeout or a back-off: a year.
@@ -331,7 +345,7 @@ fn resolve_limits(max_attempts: Option<u32>, timeout: Option<u64>, backoff: Opti
     in_range("max_attempts", max_attempts.unwrap_or(1), 1..=1000)?;
     in_range("timeout", timeout.unwrap_or(1), 1..=MAX_SECONDS)?;
     in_range("backoff", backoff, 0..=MAX_SECONDS)?;
-    Ok(JobLimits { max_attempts, timeout, backoff })
+    Ok(JobLimits { max_attempts, timeout, backoff, memory: None })
 }
 
 fn resolve_dependencies(ids: Vec<String>) -> Result<Vec<JobId>, Invalid> {
@@ -422,6 +436,10 @@ mod tests {
         assert_eq!((spec.kind, spec.threads, spec.priority), (JobKind::Train, 1, 0));
         let config = spec.config.unwrap();
         assert_eq!((config.seed, config.environment.uavs), (1, 3));
+        let memory = |document| resolve(document).unwrap().limits.memory;
+        assert!(memory(json!({})) < memory(json!({"training": {"buffer": 50_000}})));
+        assert_eq!(memory(json!({"memory": 1 << 30})), Some(1 << 30));
+        assert_eq!(memory(json!({"kind": "evaluate", "evaluation": {"policies": ["sweep"]}})), None);
     }
 
     #[test]
@@ -469,6 +487,8 @@ mod tests {
             (json!({"timeout": 0}), "timeout", false),
             (json!({"timeout": -1}), "timeout", true),
             (json!({"backoff": u64::MAX}), "backoff", false),
+            (json!({"memory": 1000}), "memory", false),
+            (json!({"memory": "2G"}), "memory", true),
             (json!({"after": ["me"]}), "after[0]", false),
             (json!({"after": [null]}), "after[0]", true),
             (json!({"stop": {"metric": "loss"}}), "stop.at_most", false),

@@ -4,6 +4,7 @@ use serde_json::{Value, json};
 
 use super::spec::JobRequest;
 use super::sweep::{MAX_JOBS, MAX_SEEDS, request_at};
+use super::webhooks;
 use crate::invalid::{Invalid, in_range};
 use crate::store::{JobKind, JobSpec};
 
@@ -35,6 +36,7 @@ pub fn resolve(mut request: JobRequest, cpu_budget: usize) -> Result<Sweep, Inva
         return Err(Invalid::new("name", name, format!("at most {MAX_NAME} characters in a sweep")));
     }
     request.kind = None;
+    let webhooks = webhooks::resolve(request.webhooks.take().unwrap_or_default())?;
     let first_seed = request.seed.unwrap_or(1);
     let name = request.name.take();
     let Value::Object(base) = serde_json::to_value(&request).expect("a request is plain data") else {
@@ -56,7 +58,8 @@ pub fn resolve(mut request: JobRequest, cpu_budget: usize) -> Result<Sweep, Inva
     let first = jobs.first().expect("there is at least one combination and one seed");
     let work = jobs.iter().filter_map(|job| job.config.as_ref()).map(|config| config.training.steps).fold(0, u64::saturating_add);
     let document = json!({"points": points, "seeds": seeds});
-    let spec = JobSpec { kind: JobKind::Sweep, name, config: None, sweep: Some(document), work, point: None, ..first.clone() };
+    let (kind, sweep) = (JobKind::Sweep, Some(document));
+    let spec = JobSpec { kind, name, webhooks, config: None, sweep, work, point: None, ..first.clone() };
     Ok(Sweep { spec, jobs })
 }
 

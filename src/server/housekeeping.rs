@@ -1,5 +1,5 @@
-//! Work in the background: expiry of sessions and environments, upkeep of metrics, the rules of retention, and space of the
-//! database file that nothing uses any more.
+//! Work in the background: expiry of sessions and environments, upkeep of metrics, the rules of retention, space of the database file
+//! that nothing uses any more, and messages of webhooks.
 
 use std::collections::VecDeque;
 use std::path::Path;
@@ -7,13 +7,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::inflight::Budget;
-use crate::service::{App, policies};
+use crate::service::{App, jobs, policies, webhooks};
 use crate::store::{self, Store};
 use crate::telemetry;
 
 /// Works until it is aborted. `ttl`: the shorter of the idle times of sessions and environments.
 pub(super) async fn run(app: Arc<App>, ttl: Duration, budget: Arc<Budget>) {
-    tokio::join!(expire(&app, ttl, &budget), apply_retention(&app), give_back_space(&app));
+    tokio::join!(expire(&app, ttl, &budget), apply_retention(&app), give_back_space(&app), webhooks::deliver(&app));
 }
 
 /// Expires idle sessions and environments, and maintains metrics.
@@ -42,6 +42,7 @@ async fn apply_retention(app: &App) {
     loop {
         tick.tick().await;
         let applied = async {
+            jobs::delete_old(app).await?;
             policies::delete_excess_versions(app).await?;
             let mut after = 0;
             while let Some(next) = policies::delete_excess_checkpoints(app, after).await? {
@@ -50,7 +51,7 @@ async fn apply_retention(app: &App) {
             Ok::<_, crate::service::Error>(())
         };
         if let Err(error) = applied.await {
-            tracing::warn!(reason = error.reason(), "old versions and checkpoints cannot be deleted; trying again later");
+            tracing::warn!(reason = error.reason(), "old jobs, versions and checkpoints cannot be deleted; trying again later");
         }
     }
 }

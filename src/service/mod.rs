@@ -15,6 +15,7 @@ pub mod policies;
 pub mod progress;
 pub mod sessions;
 mod watch_limit;
+pub mod webhooks;
 pub mod worker;
 
 use std::sync::Arc;
@@ -58,6 +59,8 @@ pub struct App {
     pub max_message_size: usize,
     /// Limits of watches of jobs.
     pub watchers: WatchLimit,
+    /// Tells receivers that jobs have ended.
+    pub webhooks: webhooks::Webhooks,
     /// Wall time and monotonic time.
     pub clock: Clock,
     /// Whether the server is shutting down.

@@ -56,6 +56,8 @@ pub struct AttemptTask {
     pub snapshot_every: std::time::Duration,
     /// Whether training begins with weights of a checkpoint, unless there is a snapshot.
     pub initial_weights: bool,
+    /// Most memory of the worker in bytes; `None`: no limit.
+    pub memory: Option<u64>,
     /// What is evaluated after training.
     pub report: Option<Value>,
     /// Whether the best checkpoint is compared with a policy, see [`rival`].
@@ -112,6 +114,7 @@ pub async fn fetch(app: &App, lease: Lease) -> Result<AttemptTask, Error> {
         snapshot,
         snapshot_every: app.scheduler.config().snapshot_every,
         initial_weights: spec.init.is_some_and(|init| init.from == InitKind::Weights),
+        memory: spec.limits.memory,
         report: spec.report,
         rival: spec.publish.is_some_and(|rule| rule.better_than.is_some()),
         stop: spec.stop,

@@ -82,6 +82,11 @@ impl Store {
         self.notifier.channel(job).subscribe()
     }
 
+    /// A receiver that changes whenever jobs may have ended, and sometimes when none has.
+    pub fn any_changes(&self) -> watch::Receiver<()> {
+        self.changes(0)
+    }
+
     /// A page of the events of the job with row id `job` after event `after`, oldest first. Every event is complete.
     ///
     /// # Errors

@@ -74,6 +74,11 @@ impl Store {
             (JobAction::Pause, Running, None) => set_pending_action(&mut tx, &job, PendingAction::Pause).await?,
             (JobAction::Delete, state, _) if state.ended() => {
                 release_dependents(&mut tx, job.row_id, state == Succeeded, now).await?;
+                let sql = "SELECT number, state FROM jobs WHERE parent = ?";
+                let children: Vec<(i64, String)> = sqlx::query_as(sql).bind(id.to_string()).fetch_all(&mut *tx).await?;
+                for (child, state) in children {
+                    release_dependents(&mut tx, child, JobState::from_column(&state)? == Succeeded, now).await?;
+                }
                 sqlx::query("DELETE FROM jobs WHERE parent = ?").bind(id.to_string()).execute(&mut *tx).await?;
                 sqlx::query("DELETE FROM jobs WHERE number = ?").bind(job.row_id).execute(&mut *tx).await?;
                 tx.commit().await?;

@@ -30,6 +30,7 @@ mod keys;
 mod metric_summaries;
 mod metrics;
 mod named_enum;
+mod old_jobs;
 mod policies;
 #[cfg(test)]
 mod query_plans;
@@ -41,6 +42,7 @@ mod submission;
 mod sweeps;
 mod transitions;
 mod upkeep;
+mod webhooks;
 mod writes;
 
 pub use aliases::{AliasHistoryEntry, AliasHistoryFilter, AliasMove, PolicyAlias};
@@ -59,6 +61,7 @@ pub use policies::{NewPolicyVersion, PolicyVersion, PublishedPolicy, VersionKey}
 pub use snapshots::{PartialSnapshot, Snapshot};
 pub use specs::{EarlyStop, InitKind, JobInit, JobKind, JobLimits, JobSpec, PublishRule, StoredSpec, UnreadableSpec};
 pub use submission::{Beginning, NewJob, SubmitResult};
+pub use webhooks::{Secret, Webhook, WebhookMessage};
 pub use writes::WriteFailure;
 
 use std::path::{Path, PathBuf};
@@ -92,6 +95,8 @@ const MIGRATIONS: &[(&str, &str)] = &migrations![
     "0010_finding_jobs.sql",
     "0011_lifecycle.sql",
     "0012_initial_weights.sql",
+    "0015_webhooks.sql",
+    "0016_old_jobs.sql",
 ];
 
 /// Name of the database file inside the data directory.

@@ -44,7 +44,7 @@ impl Store {
             let (to, attempt, reason) = (JobState::Failed, job.attempts, Some(reason));
             transition(&mut tx, Transition { job: job.row_id, to, attempt, reason, now }).await?;
             tx.commit().await?;
-            self.notify(job.row_id);
+            self.notify_all();
         } else {
             tx.abandon().await?;
         }

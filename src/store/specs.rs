@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use uuid::Uuid;
 
-use super::JobId;
 use super::named_enum::named_enum;
+use super::{JobId, Webhook};
 use crate::train_config::TrainConfig;
 
 named_enum! {
@@ -84,6 +84,9 @@ pub struct JobSpec {
     /// Jobs that must succeed before this one starts.
     #[serde(default)]
     pub after: Vec<JobId>,
+    /// Addresses that are told when the job ends.
+    #[serde(default)]
+    pub webhooks: Vec<Webhook>,
     /// When training ends before all steps are done; `None`: never.
     #[serde(default)]
     pub stop: Option<EarlyStop>,
@@ -127,6 +130,7 @@ impl JobSpec {
             priority: 0,
             limits: JobLimits::default(),
             after: Vec::new(),
+            webhooks: Vec::new(),
             stop: None,
             init: None,
             publish: None,
@@ -151,6 +155,9 @@ pub struct JobLimits {
     pub timeout: Option<u64>,
     /// Seconds between a failed attempt and the next one. They double with every further failure, up to an hour.
     pub backoff: u64,
+    /// Most memory of the worker in bytes; `None`: no limit.
+    #[serde(default)]
+    pub memory: Option<u64>,
 }
 
 impl JobLimits {

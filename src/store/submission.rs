@@ -11,6 +11,7 @@ use super::jobs::{find, get_existing};
 use super::snapshots::copy_snapshot;
 use super::specs::JobSpec;
 use super::transitions::{Transition, count_blockers, transition};
+use super::webhooks::insert_webhooks;
 use super::{Job, JobId, JobState, Result, Snapshot, Store, corrupt};
 
 /// A job to submit.
@@ -155,6 +156,7 @@ pub(super) async fn insert(tx: &mut SqliteConnection, new: &NewJob) -> Result<Jo
         let sql = "INSERT INTO job_dependencies (job, needs) SELECT ?, number FROM jobs WHERE id = ?";
         sqlx::query(sql).bind(row_id).bind(needed.to_string()).execute(&mut *tx).await?;
     }
+    insert_webhooks(tx, row_id, &new.spec.webhooks).await?;
     count_blockers(tx, row_id).await?;
     transition(tx, Transition { job: row_id, to: JobState::Queued, attempt: 0, reason: None, now: new.now }).await?;
     if let Some((key, body)) = &new.idempotency {

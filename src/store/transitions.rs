@@ -3,6 +3,7 @@
 use jiff::Timestamp;
 use sqlx::SqliteConnection;
 
+use super::webhooks::tell_end;
 use super::{JobState, Result};
 
 /// A change of state and its entry in the event log.
@@ -28,6 +29,9 @@ pub(super) async fn transition(db: &mut SqliteConnection, t: Transition<'_>) -> 
     let sql = "INSERT INTO events (job, at, state, attempt, reason, seq) VALUES (?, ?, ?, ?, ?, ?)";
     let insert = sqlx::query(sql).bind(t.job).bind(now).bind(state).bind(t.attempt).bind(t.reason).bind(seq);
     insert.execute(&mut *db).await?;
+    if t.to.ended() {
+        tell_end(db, t.job, t.to, t.now).await?;
+    }
     if t.to.ended() && t.to != JobState::Failed {
         sqlx::query("DELETE FROM snapshots WHERE job = ?").bind(t.job).execute(&mut *db).await?;
         release_dependents(db, t.job, t.to == JobState::Succeeded, t.now).await?;

@@ -35,6 +35,8 @@ fn describe() {
     describe_histogram!("grpc_server_handling_seconds", "Time from the header of a gRPC request to the end of its response.");
     describe_counter!("grpc_server_msg_received_total", "Messages received in gRPC calls.");
     describe_counter!("grpc_server_msg_sent_total", "Messages sent in gRPC calls.");
+    describe_counter!("qedgix_jobs_deleted_total", "Ended jobs that the rules of retention deleted.");
+    describe_counter!("qedgix_webhook_messages_total", "Tries to tell the receivers of webhooks, by result.");
     describe_counter!("http_requests_total", "REST requests completed.");
     describe_histogram!("http_request_duration_seconds", "Time from a REST request to the header of its response.");
     describe_gauge!("qedgix_connections", "Open connections, including those of local workers.");

@@ -133,12 +133,29 @@ async fn jobs_are_submitted_followed_compared_and_exported() {
     let newest = bed.rest.get("/v1/jobs?page_size=1").await["jobs"][0]["id"].as_str().unwrap().to_owned();
     assert_eq!(bed.rest.digests(&newest).await, digests);
 
+    // A sweep means its jobs, and has a result.
+    let mut sweep = tiny();
+    (sweep["kind"], sweep["sweep"]) = (json!("sweep"), json!({"grid": {"training.gamma": [0.5, 0.9]}, "seeds": 2}));
+    bed.write("sweep.json", &sweep);
+    let limits = ["--after", &ids[0], "--timeout", "10m", "--memory", "2G"];
+    bed.ok(&[&["jobs", "submit", "--file", "sweep.json", "--name", "gammas", "--watch"][..], &limits[..]].concat()).await;
+    let shown = bed.json(&["jobs", "show", "gammas"]).await;
+    assert_eq!((&shown["after"], &shown["timeout"], &shown["memory"]), (&json!([ids[0]]), &json!(600), &json!(2_u64 << 30)));
+    let compared = bed.json(&["jobs", "compare", "gammas"]).await;
+    let groups = compared["groups"].as_array().unwrap();
+    assert_eq!((compared["jobs"].as_array().unwrap().len(), groups.len()), (4, 2));
+    assert!(groups.iter().all(|group| group["best"]["interval"].is_array()), "{compared}");
+    bed.ok(&["jobs", "export", "gammas", "--out", "sweep"]).await;
+    let result: Value = serde_json::from_slice(&bed.file("sweep/result.json")).unwrap();
+    assert_eq!(result["states"], json!({"succeeded": 4}));
+
     bed.ok(&["jobs", "delete", &ids[0], &ids[1]]).await;
     for (words, says) in [
         (["jobs", "show", &ids[0]], "(not_found)"),
         (["jobs", "watch", "nonsense"], "no such job"),
         (["jobs", "cancel", "01ff"], "no such job"),
         (["jobs", "pause", &newest], "(wrong_state)"),
+        (["jobs", "submit", "--webhook=http://127.0.0.1/"], "webhooks[0].url"),
     ] {
         let Printed { code, err, .. } = bed.run(&words).await;
         assert_eq!((code, err.contains(says)), (Some(1), true), "{words:?}: {err}");

@@ -15,6 +15,7 @@ use qedgix::jobs::{Executor, Launch, Scheduler, SchedulerConfig, WorkerExit};
 use qedgix::server::{self, DataDir, Listeners};
 use qedgix::service::keys::Keyring;
 use qedgix::service::policies::{Loads, Retention, UploadLimit};
+use qedgix::service::webhooks::Webhooks;
 use qedgix::service::{App, WatchLimit};
 use qedgix::serving::{Engine, EngineConfig, Environments, Limits, Sessions};
 use qedgix::store::Store;
@@ -125,6 +126,7 @@ impl Server {
             keys: Keyring::new(None),
             uploads: UploadLimit::default(),
             watchers: WatchLimit::new(config.max_watchers, config.event_heartbeat),
+            webhooks: Webhooks::new(&["127.0.0.1".to_owned()]).retrying_after(Duration::from_millis(5)),
             clock,
             draining,
         });

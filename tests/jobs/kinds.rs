@@ -14,7 +14,7 @@ use super::process::PROGRAM;
 
 #[allow(clippy::unnecessary_wraps, reason = "the form that the harness takes")]
 fn processes() -> Option<Arc<dyn Executor>> {
-    Some(Arc::new(LocalProcess { program: PROGRAM.into() }))
+    Some(Arc::new(LocalProcess::new(PROGRAM)))
 }
 
 #[tokio::test]

@@ -117,8 +117,7 @@ async fn the_cpu_budget_changes_while_jobs_run() {
 #[tokio::test]
 async fn training_ends_early() {
     let dir = tempfile::tempdir().unwrap();
-    let program = env!("CARGO_BIN_EXE_qedgix").into();
-    let server = Server::start_on(dir.path(), 1, |_| {}, Some(Arc::new(LocalProcess { program }))).await;
+    let server = Server::start_on(dir.path(), 1, |_| {}, Some(Arc::new(LocalProcess::new(env!("CARGO_BIN_EXE_qedgix"))))).await;
     let early = json!({"name": "early", "stop": {"metric": "eval/mean_aoi", "at_most": 1e9}});
     let id = server.submit(&with(&early)).await;
     let job = server.reaches(&id, "succeeded").await;

@@ -8,14 +8,18 @@ mod harness;
 mod killed_sweep;
 mod kinds;
 mod lifecycle;
+mod limits;
 #[path = "../process/mod.rs"]
 mod process;
 mod processes;
 mod protocol;
 mod publishing;
+mod retention;
 mod scheduling;
 mod space;
 mod submission;
+mod timing;
 mod train_command;
 mod unreadable;
 mod warm_start;
+mod webhooks;

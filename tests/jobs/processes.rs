@@ -223,7 +223,7 @@ async fn paused_job_resumes_exactly_and_cancelled_job_stops() {
 async fn output_and_exit_code_of_a_worker_are_stored() {
     let dir = tempfile::tempdir().unwrap();
     // A program that fails with the arguments of a worker.
-    let executor = LocalProcess { program: "/bin/ls".into() };
+    let executor = LocalProcess::new("/bin/ls");
     let server = Server::start_on(dir.path(), 1, |_| {}, Some(Arc::new(executor))).await;
     let id = server.submit(&tiny()).await;
     let job = server.reaches(&id, "failed").await;
@@ -237,7 +237,7 @@ async fn output_and_exit_code_of_a_worker_are_stored() {
 async fn a_worker_that_cannot_be_started_is_not_a_failure_of_the_job() {
     let dir = tempfile::tempdir().unwrap();
     let program = dir.path().join("qedgix");
-    let executor = LocalProcess { program: program.clone() };
+    let executor = LocalProcess::new(&program);
     let server = Server::start_on(dir.path(), 1, |s| s.max_attempts = 1, Some(Arc::new(executor))).await;
     let id = server.submit(&tiny()).await;
     let logs = format!("/v1/jobs/{id}/logs");

@@ -154,8 +154,8 @@ async fn an_alias_moves_only_to_a_policy_that_is_better_than_the_rival_of_that_m
 #[tokio::test]
 async fn a_worker_compares_its_best_checkpoint_with_the_rival() {
     let dir = tempfile::tempdir().unwrap();
-    let program = env!("CARGO_BIN_EXE_qedgix").into();
-    let executor: std::sync::Arc<dyn qedgix::jobs::Executor> = std::sync::Arc::new(qedgix::jobs::LocalProcess { program });
+    let executor: std::sync::Arc<dyn qedgix::jobs::Executor> =
+        std::sync::Arc::new(qedgix::jobs::LocalProcess::new(env!("CARGO_BIN_EXE_qedgix")));
     let server = Server::start_on(dir.path(), 1, |_| {}, Some(executor)).await;
     let mut grpc = server.jobs().await;
     for (rival, policy) in [("uav@live", Value::Null), ("uav@live", json!("uav:1")), ("tour", json!("tour"))] {

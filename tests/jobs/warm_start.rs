@@ -16,7 +16,7 @@ use super::process::PROGRAM;
 
 #[allow(clippy::unnecessary_wraps, reason = "the form that the harness takes")]
 fn processes() -> Option<Arc<dyn Executor>> {
-    Some(Arc::new(LocalProcess { program: PROGRAM.into() }))
+    Some(Arc::new(LocalProcess::new(PROGRAM)))
 }
 
 /// The bits of the mean AoI of an evaluation.

@@ -165,7 +165,7 @@ async fn a_deletion_among_requests_is_before_or_after_each() {
 
 #[tokio::test]
 async fn old_versions_without_alias_are_deleted_at_publishing() {
-    let server = Server::with(|config| config.retention = Retention { versions: 2, checkpoints: 0 }).await;
+    let server = Server::with(|config| config.retention = Retention { versions: 2, ..Retention::default() }).await;
     let rest = Rest::new(&server);
     publish(&server, "mine", &numbered(1)).await;
     assert_eq!(rest.send(Method::PUT, "/v1/policies/mine/aliases/live", r#"{"version": 1}"#).await.0, StatusCode::CREATED);

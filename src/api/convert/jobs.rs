@@ -82,14 +82,17 @@ pub fn job_summary(view: JobView) -> v1::Job {
 
 impl From<JobView> for v1::Job {
     fn from(view: JobView) -> Self {
-        job_message(view, |JobSpec { limits, after, stop, init, publish, config, evaluation, sweep, experiment, point, .. }| {
-            let (environment, training) = config.as_ref().map(|config| (&config.environment, &config.training)).unzip();
-            json!({
-                "environment": environment, "training": training, "max_attempts": limits.max_attempts, "timeout": limits.timeout,
-                "backoff": limits.backoff, "after": after, "stop": stop, "init": init, "publish": publish.as_ref().map(publish_document), "evaluation": evaluation, "sweep": sweep, "experiment": experiment,
-                "point": point,
-            })
-        })
+        job_message(
+            view,
+            |JobSpec { limits, after, stop, init, publish, config, evaluation, sweep, experiment, point, webhooks, .. }| {
+                let (environment, training) = config.as_ref().map(|config| (&config.environment, &config.training)).unzip();
+                json!({
+                    "environment": environment, "training": training, "max_attempts": limits.max_attempts, "timeout": limits.timeout,
+                    "backoff": limits.backoff, "memory": limits.memory, "webhooks": webhooks, "after": after, "stop": stop, "init": init, "publish": publish.as_ref().map(publish_document), "evaluation": evaluation, "sweep": sweep, "experiment": experiment,
+                    "point": point,
+                })
+            },
+        )
     }
 }
 

@@ -65,6 +65,7 @@ impl WorkerService for Service {
             snapshot_every_ms: task.snapshot_every.as_millis() as u64,
             initial_weights: task.initial_weights,
             rival: task.rival,
+            memory: task.memory,
             report: json_text(task.report.as_ref())?,
             stop: json_text(task.stop.as_ref())?,
             observed: task.observed.into_iter().map(Into::into).collect(),

@@ -28,7 +28,7 @@ const MAX_JOBS: usize = 1000;
 /// Flags of `jobs compare`.
 #[derive(Args, Debug)]
 pub struct CompareArgs {
-    /// Ids of jobs, beginnings of ids, or names
+    /// Ids of jobs, beginnings of ids, or names; a sweep or an experiment means its jobs
     #[arg(value_name = "JOB")]
     jobs: Vec<String>,
     #[command(flatten)]
@@ -88,6 +88,7 @@ pub(super) async fn run(client: &Client, args: CompareArgs, print_json: bool) ->
         let found = list(client, &args.filter, None, &[], MAX_JOBS).await?;
         ids.extend(found.iter().map(|job| text(&job["id"])).filter(|id| !ids.contains(id)).collect::<Vec<_>>());
     }
+    let ids = with_jobs_of_sweeps(client, ids).await?;
     if ids.is_empty() || ids.len() > MAX_JOBS {
         bail!("{} jobs; expected 1 to {MAX_JOBS}: ids, or a filter such as --label", ids.len());
     }
@@ -109,6 +110,21 @@ pub(super) async fn run(client: &Client, args: CompareArgs, print_json: bool) ->
     }
     errln!("curves: {}", args.svg.display());
     Ok(())
+}
+
+/// The same ids, with the jobs of sweeps and experiments in place of these.
+async fn with_jobs_of_sweeps(client: &Client, ids: Vec<String>) -> anyhow::Result<Vec<String>> {
+    let mut all: Vec<String> = Vec::new();
+    for id in ids {
+        let path = format!(
+            "/v1/jobs{}",
+            query(&[("parent", Some(id.clone())), ("sort", Some("created".into())), ("page_size", Some("1000".into()))])
+        );
+        let made: Vec<String> = items(&client.get(&path).await?, "jobs").map(|job| text(&job["id"])).collect();
+        let found = if made.is_empty() { vec![id] } else { made };
+        all.extend(found.into_iter().filter(|id| !all.contains(id)).collect::<Vec<_>>());
+    }
+    Ok(all)
 }
 
 fn is_largest_best(metric: &str) -> bool {

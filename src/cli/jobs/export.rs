@@ -11,7 +11,7 @@ use serde_json::{Map, Value, json};
 use super::reference::resolve;
 use super::tensorboard::{self, Attempt};
 use crate::checkpoint::digest;
-use crate::cli::client::Client;
+use crate::cli::client::{Client, ClientError};
 use crate::cli::files::write_atomic;
 use crate::cli::output::outln;
 use crate::cli::rest::{items, text};
@@ -22,7 +22,8 @@ use crate::files::{partial_path, replace};
 pub struct ExportArgs {
     /// Id of the job, the beginning of it, or a name
     job: String,
-    /// Directory for config.json, job.json, metrics.csv, best.safetensors and last.safetensors [default: the id of the job]
+    /// Directory for config.json, job.json, metrics.csv, best.safetensors, last.safetensors and result.json, as far as the job has them
+    /// [default: the id of the job]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Also write the metrics as event files of TensorBoard, one per attempt, into the directory `tensorboard` in DIR
@@ -55,12 +56,25 @@ pub(super) async fn run(client: &Client, args: ExportArgs, print_json: bool) -> 
             files.push(name);
         }
     }
+    if let Some(result) = result(client, &id).await? {
+        write_atomic(&dir.join("result.json"), format!("{result:#}\n").as_bytes())?;
+        files.push("result.json".to_owned());
+    }
     if print_json {
         outln!("{:#}", json!({"job": id, "directory": dir, "files": files}))?;
     } else {
         outln!("wrote {} to {}", files.join(", "), dir.display())?;
     }
     Ok(())
+}
+
+/// The result of a job: a report, the means of a sweep; `None` if it has none.
+async fn result(client: &Client, id: &str) -> anyhow::Result<Option<Value>> {
+    match client.get(&format!("/v1/jobs/{id}/result")).await {
+        Ok(result) => Ok(Some(result)),
+        Err(ClientError::Refused { code, .. }) if code == "wrong_state" => Ok(None),
+        Err(error) => Err(error.into()),
+    }
 }
 
 /// What to submit to run the same job again. What it came after is left out, because that has ended.
@@ -75,6 +89,7 @@ fn config(job: &Value) -> Value {
         "max_attempts",
         "timeout",
         "backoff",
+        "memory",
         "stop",
         "publish",
         "algorithm",

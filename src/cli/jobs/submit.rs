@@ -8,13 +8,15 @@ use anyhow::{Context, bail, ensure};
 use clap::Args;
 use serde_json::{Map, Value, json};
 
-use super::reference::resolve;
+use super::reference::{resolve, resolve_all};
 use super::screen::{Lines, Screen};
 use super::view::JobView;
 use super::watch::{self, OnSignal};
 use crate::cli::client::{Client, ClientError};
 use crate::cli::output::{errln, outln};
 use crate::cli::run_args::{RunArgs, count, insert};
+use crate::cli::serve::duration;
+use crate::jobs::webhooks::Secret;
 
 /// Flags of `jobs submit`.
 #[derive(Args, Debug)]
@@ -30,10 +32,41 @@ pub struct SubmitArgs {
     #[arg(long, value_name = "FILE", conflicts_with = "file")]
     experiment: Option<PathBuf>,
     #[command(flatten)]
+    of_experiment: OfExperiment,
+    #[command(flatten)]
     job: JobArgs,
     /// Follow the job until its end; the exit status is then that of `jobs watch`
     #[arg(long)]
     watch: bool,
+}
+
+/// What overrides the file of `--experiment` besides the fields of its runs.
+#[derive(Args, Debug)]
+struct OfExperiment {
+    /// Seeds of the experiment; override those of the file
+    #[arg(long, value_delimiter = ',', requires = "experiment")]
+    seeds: Option<Vec<u64>>,
+    /// Number of seeds of the experiment: the first of the file, and beyond them the next numbers [default: all of the file]
+    #[arg(long, value_name = "NUMBER", requires = "experiment", conflicts_with = "seeds")]
+    num_seeds: Option<u16>,
+    /// Submits only the series with this name; may be repeated
+    #[arg(long, value_name = "NAME", requires = "experiment")]
+    series: Vec<String>,
+    /// Submits only the point with this name; may be repeated
+    #[arg(long, value_name = "NAME", requires = "experiment")]
+    point: Vec<String>,
+}
+
+impl OfExperiment {
+    /// The table `overrides` of the document.
+    fn overrides(&self) -> Map<String, Value> {
+        let mut overrides = Map::new();
+        insert(&mut overrides, "seeds", self.seeds.as_ref());
+        insert(&mut overrides, "num_seeds", self.num_seeds);
+        insert(&mut overrides, "series", Some(&self.series).filter(|names| !names.is_empty()));
+        insert(&mut overrides, "points", Some(&self.point).filter(|names| !names.is_empty()));
+        overrides
+    }
 }
 
 /// What a job has besides its training run.
@@ -55,12 +88,52 @@ pub struct JobArgs {
     /// Jobs with a higher priority start first, -100 to 100 [default: 0]
     #[arg(long, env = "QEDGIX_PRIORITY", allow_negative_numbers = true)]
     priority: Option<i64>,
+    /// Most memory of the worker, as 800M, 2G or a number of bytes; a worker that uses more is ended, and the job has failed [default:
+    /// several times the estimate]
+    #[arg(long, env = "QEDGIX_MEMORY", value_name = "SIZE", value_parser = size)]
+    memory: Option<u64>,
+    /// Job that must succeed before this one starts: its id, the beginning of it, or a name; may be repeated
+    #[arg(long, value_name = "JOB")]
+    after: Vec<String>,
+    /// URL that is told when the job ends, by a POST request; may be repeated
+    #[arg(long, value_name = "URL")]
+    webhook: Vec<String>,
+    /// Key of the signatures of the messages to --webhook; prefer the environment variable [default: messages are not signed]
+    #[arg(long, env = "QEDGIX_WEBHOOK_SECRET", hide_env_values = true, value_name = "SECRET")]
+    webhook_secret: Option<Secret>,
+    /// Time that all attempts together may run, as 90s, 10m or 2h; then the job has failed [default: no limit]
+    #[arg(long, env = "QEDGIX_TIMEOUT", value_name = "TIME", value_parser = duration)]
+    timeout: Option<Duration>,
+}
+
+/// Parses a size in bytes: a number, which may have the unit K, M, G or T (powers of 1024).
+fn size(text: &str) -> Result<u64, String> {
+    let expected = || "expected a number of bytes, or a number with a unit, as 800M or 2G".to_owned();
+    let (number, unit) = match text.char_indices().last() {
+        Some((at, 'K' | 'k')) => (&text[..at], 1 << 10),
+        Some((at, 'M' | 'm')) => (&text[..at], 1 << 20),
+        Some((at, 'G' | 'g')) => (&text[..at], 1 << 30),
+        Some((at, 'T' | 't')) => (&text[..at], 1 << 40),
+        _ => (text, 1),
+    };
+    count(number).ok().and_then(|number| number.checked_mul(unit)).ok_or_else(expected)
 }
 
 impl JobArgs {
     /// A job with a name, threads and initial weights only.
     pub fn new(name: Option<String>, threads: Option<usize>, init: Option<String>) -> Self {
-        Self { name, threads, label: Vec::new(), init, priority: None }
+        Self {
+            name,
+            threads,
+            label: Vec::new(),
+            init,
+            priority: None,
+            memory: None,
+            after: Vec::new(),
+            webhook: Vec::new(),
+            webhook_secret: None,
+            timeout: None,
+        }
     }
 }
 
@@ -73,6 +146,13 @@ pub fn body(mut document: Map<String, Value>, run: &RunArgs, job: &JobArgs) -> a
     insert(&mut document, "name", job.name.as_deref());
     insert(&mut document, "threads", job.threads);
     insert(&mut document, "priority", job.priority);
+    insert(&mut document, "memory", job.memory);
+    insert(&mut document, "after", Some(&job.after).filter(|ids| !ids.is_empty()));
+    if !job.webhook.is_empty() {
+        let webhook = |url: &String| json!({"url": url, "secret": job.webhook_secret});
+        document.insert("webhooks".into(), job.webhook.iter().map(webhook).collect());
+    }
+    insert(&mut document, "timeout", job.timeout.map(|time| time.as_secs_f64().ceil() as u64));
     if let Some(init) = &job.init {
         ensure!(
             !Path::new(init).is_file(),
@@ -120,19 +200,19 @@ async fn add(client: &Client, path: &str, body: &Value) -> Result<Value, ClientE
 }
 
 /// Runs the command.
-pub(super) async fn run(client: &Client, args: SubmitArgs, json: bool) -> anyhow::Result<()> {
+pub(super) async fn run(client: &Client, mut args: SubmitArgs, json: bool) -> anyhow::Result<()> {
+    args.job.after = resolve_all(client, &args.job.after).await?;
     let document = args.file.as_deref().map(read).transpose()?.unwrap_or_default();
     let mut body = body(document, &args.run, &args.job)?;
     if let Some(path) = &args.experiment {
-        body = experiment(read(path)?, body);
+        body = experiment(read(path)?, args.of_experiment.overrides(), body);
     }
     let job = submit(client, &body).await?;
     print_and_watch(client, &job, json, args.watch).await
 }
 
-/// A job of the kind `experiment`, with the fields of `body` for all runs.
-fn experiment(mut document: Map<String, Value>, mut body: Value) -> Value {
-    let mut overrides = Map::new();
+/// A job of the kind `experiment`, with `overrides` and the fields of `body` for all runs.
+fn experiment(mut document: Map<String, Value>, mut overrides: Map<String, Value>, mut body: Value) -> Value {
     if let Value::Object(body) = &mut body {
         for section in ["environment", "training"] {
             overrides.extend(body.remove_entry(section));

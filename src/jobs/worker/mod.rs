@@ -28,6 +28,7 @@ pub use self::rival::RivalComparison;
 use self::training::{ReportQueue, TrainingTask};
 use super::Directive;
 use super::evaluation::EvaluationSpec;
+use super::{cores, memory};
 use crate::store::WorkerResult;
 use crate::wire::v1;
 
@@ -37,6 +38,8 @@ pub const ENV_SERVER: &str = "QEDGIX_WORKER_SERVER";
 pub const ENV_JOB: &str = "QEDGIX_JOB";
 /// Environment variable with the number of the attempt.
 pub const ENV_ATTEMPT: &str = "QEDGIX_ATTEMPT";
+/// Environment variable with the cores that the worker runs on, as `0,3`; absent or empty: any.
+pub const ENV_CORES: &str = "QEDGIX_WORKER_CORES";
 /// Environment variable with the attempt's secret.
 pub const ENV_TOKEN: &str = "QEDGIX_TOKEN";
 
@@ -124,6 +127,13 @@ pub fn lower_priority() {
     let _ = std::fs::write("/proc/self/oom_score_adj", "500");
 }
 
+/// Confines this process to the cores of [`ENV_CORES`]. To be called before threads start, because threads inherit the cores.
+pub fn confine_to_cores() {
+    if let Ok(list) = std::env::var(ENV_CORES) {
+        cores::confine(&list);
+    }
+}
+
 /// Ends this process when its standard input is closed. The server that started this process holds the other end of the pipe,
 /// so the pipe closes when the server ends.
 ///
@@ -190,8 +200,8 @@ enum Work {
 }
 
 impl Work {
-    /// Fetches the task of the attempt and everything that it needs.
-    async fn fetch(client: &Client) -> Result<Self, Error> {
+    /// Fetches the task of the attempt and everything that it needs, and the limit of memory in bytes.
+    async fn fetch(client: &Client) -> Result<(Self, Option<u64>), Error> {
         let task = client.fetch().await?;
         let threads = task.threads as usize;
         if !task.evaluation.is_empty() {
@@ -201,7 +211,7 @@ impl Work {
                 checkpoints.push((name.clone(), client.download_policy(name).await?));
             }
             tracing::info!(threads, policies = spec.policies.len(), "evaluating");
-            return Ok(Self::Evaluate(EvaluationTask { spec, checkpoints, threads }));
+            return Ok((Self::Evaluate(EvaluationTask { spec, checkpoints, threads }), task.memory));
         }
         let config = serde_json::from_str(&task.config).map_err(Error::Configuration)?;
         let snapshot = match task.snapshot_step {
@@ -225,7 +235,9 @@ impl Work {
             report => Some(serde_json::from_str(report).map_err(Error::Configuration)?),
         };
         let rival = task.rival;
-        Ok(Self::Train(TrainingTask { config, threads, snapshot, initial_weights, snapshot_every, stop_rule, rival, report }))
+        let task_memory = task.memory;
+        let task = TrainingTask { config, threads, snapshot, initial_weights, snapshot_every, stop_rule, rival, report };
+        Ok((Self::Train(task), task_memory))
     }
 
     /// Does the work. Returns how it ended, and the result as JSON if it has one.
@@ -251,7 +263,7 @@ impl ServerHandle {
 
 /// Does the work of the attempt on a thread of its own, and reports it.
 async fn work(client: &Client, stop: Arc<StopSignal>) -> Result<(WorkerResult, Option<String>), Error> {
-    let work = Work::fetch(client).await?;
+    let (work, limit) = Work::fetch(client).await?;
     let (sender, receiver) = mpsc::channel(QUEUE);
     let reports = ReportQueue::new(sender);
     let snapshot_pending = reports.snapshot_pending();
@@ -269,8 +281,20 @@ async fn work(client: &Client, stop: Arc<StopSignal>) -> Result<(WorkerResult, O
         let _ = result_sender.send(result);
     };
     std::thread::Builder::new().name("training".into()).spawn(run)?;
-    report::send_all(client, receiver, &snapshot_pending).await?;
-    Ok(result.await.expect("the thread sends its result even if it panics"))
+    let done = async {
+        report::send_all(client, receiver, &snapshot_pending).await?;
+        Ok(result.await.expect("the thread sends its result even if it panics"))
+    };
+    let Some(limit) = limit else { return done.await };
+    tokio::select! {
+        done = done => done,
+        used = memory::exceeds(limit) => {
+            let [used, limit] = [used, limit].map(|bytes| bytes.div_ceil(1 << 20));
+            let reason = format!("the worker uses {used} MiB of memory, more than the limit of the job, {limit} MiB (memory)");
+            // Another attempt would need as much.
+            Ok((WorkerResult::Failed { reason, permanent: true }, None))
+        }
+    }
 }
 
 /// The message of a panic.

@@ -5,11 +5,12 @@ use bytes::Bytes;
 use crate::checkpoint::{self, Checkpoint};
 use crate::error_code::ErrorCode;
 use crate::invalid::{Invalid, in_range};
+use crate::jobs::memory::default_limit;
 use crate::jobs::spec::{ContinueRequest, InitRequest};
 use crate::service::keys::Caller;
 use crate::service::{App, Error, checkpoints, policies};
 use crate::serving::PolicySpec;
-use crate::store::{Beginning, CheckpointKind, InitKind, Job, JobInit, JobSpec};
+use crate::store::{Beginning, CheckpointKind, InitKind, Job, JobInit, JobLimits, JobSpec};
 use crate::train_config::{TrainConfig, Training};
 
 /// Weights that jobs begin with.
@@ -99,7 +100,15 @@ pub(super) async fn continued(
     let most = TrainConfig::MAX_STEPS;
     in_range("steps", request.steps, 1..=most)?;
     let labels = spec.labels.clone();
-    let spec = JobSpec { name: job.spec.name.clone(), labels, after: Vec::new(), report: None, point: None, ..spec };
+    let spec = JobSpec {
+        name: job.spec.name.clone(),
+        labels,
+        after: Vec::new(),
+        webhooks: Vec::new(),
+        report: None,
+        point: None,
+        ..spec
+    };
     if let Some(snapshot) = app.store.snapshot(job.id).await? {
         let init = JobInit {
             from: InitKind::Snapshot,
@@ -113,15 +122,23 @@ pub(super) async fn continued(
         in_range("steps", steps, config.training.steps..=most)?;
         let training = Training { steps, ..config.training.clone() };
         let config = TrainConfig { training, ..config };
-        return Ok((JobSpec { init: Some(init), config: Some(config), ..spec }, Beginning::Snapshot(snapshot)));
+        let spec = JobSpec { init: Some(init), limits: enough_memory(&spec, &config), config: Some(config), ..spec };
+        return Ok((spec, Beginning::Snapshot(snapshot)));
     }
     let last = app.store.checkpoints(job.id).await?.into_iter().max_by_key(|c| c.kind == CheckpointKind::Last);
     let Some(last) = last else { return Err(wrong_state("has neither a snapshot nor weights to continue from")) };
     let weights = InitRequest { policy: None, checkpoint: Some(last.id.to_string()) };
     let weights = InitialWeights::find(app, caller, &weights).await?;
     let training = config.training.continued(last.step, request.steps);
-    let mut spec = JobSpec { config: Some(TrainConfig { training, ..config }), ..spec };
+    let config = TrainConfig { training, ..config };
+    let mut spec = JobSpec { limits: enough_memory(&spec, &config), config: Some(config), ..spec };
     let beginning = weights.put_into(&mut spec)?;
     spec.init = spec.init.map(|init| JobInit { job: Some(job.id), ..init });
     Ok((spec, beginning))
+}
+
+/// The limits of a job that is continued with `config`, whose replay may be larger.
+fn enough_memory(spec: &JobSpec, config: &TrainConfig) -> JobLimits {
+    let memory = spec.limits.memory.map(|memory| memory.max(default_limit(config, spec.threads)));
+    JobLimits { memory, ..spec.limits }
 }

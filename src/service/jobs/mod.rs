@@ -6,6 +6,7 @@ mod init;
 mod listing;
 mod logs;
 mod publication;
+mod retention;
 mod sweep;
 mod view;
 
@@ -14,6 +15,7 @@ use uuid::Uuid;
 pub use evaluation::result;
 pub use listing::{ListRequest, list};
 pub use logs::{LogLines, follow_logs, logs};
+pub use retention::delete_old;
 pub use view::{JobView, Waiting};
 
 use super::keys::Caller;
@@ -62,6 +64,7 @@ async fn submit_job(
     }
     let (notes, init) = (request.notes.clone().unwrap_or_default(), request.init.clone());
     let mut spec = request.resolve(app.scheduler.cpu_budget())?;
+    app.webhooks.check(&spec.webhooks)?;
     if let Some(evaluation) = spec.evaluation.take() {
         spec.evaluation = Some(evaluation::pin_versions(app, evaluation)?);
     }

@@ -16,7 +16,9 @@ use crate::rng;
 use crate::service::keys::Caller;
 use crate::service::policies::Publisher;
 use crate::service::{App, Error};
-use crate::store::{Job, JobFilter, JobId, JobKind, JobList, JobOrder, JobSort, JobState, ListedJob, MetricSummary, NewJob, SubmitResult};
+use crate::store::{
+    Job, JobFilter, JobId, JobKind, JobList, JobOrder, JobSort, JobState, ListedJob, MetricSummary, NewJob, SubmitResult,
+};
 
 /// The metrics of the result of a sweep.
 const METRICS: [&str; 6] =
@@ -34,12 +36,16 @@ pub(super) async fn submit(
         Some(init) => Some(InitialWeights::find(app, caller, init).await?),
         None => None,
     };
-    let resolve = if request.kind == Some(JobKind::Experiment) { experiment_jobs::resolve } else { sweep_jobs::resolve };
-    let mut sweep = resolve(request, app.scheduler.cpu_budget())?;
+    let budget = app.scheduler.cpu_budget();
+    let (mut sweep, jobs) = match request.kind {
+        Some(JobKind::Experiment) => (experiment_jobs::resolve(request, budget)?, "experiment.runs"),
+        _ => (sweep_jobs::resolve(request, budget)?, "sweep.jobs"),
+    };
+    app.webhooks.check(&sweep.spec.webhooks)?;
     let memory = app.scheduler.config().memory;
     let mut beginning = None;
     for (i, job) in sweep.jobs.iter_mut().enumerate() {
-        let at = |e: crate::invalid::Invalid| e.with_prefix(&format!("sweep.jobs[{i}]"));
+        let at = |e: crate::invalid::Invalid| e.with_prefix(&format!("{jobs}[{i}]"));
         if let Some(weights) = &weights {
             beginning = Some(weights.put_into(job).map_err(at)?);
         }

@@ -1,5 +1,7 @@
 //! Deletes versions of policies: on request of a caller, and old ones by the rules of retention.
 
+use std::time::Duration;
+
 use super::{PolicyStores, one_at_a_time};
 use crate::error_code::ErrorCode;
 use crate::service::{App, Error};
@@ -13,6 +15,10 @@ pub struct Retention {
     pub checkpoints: u32,
     /// Versions of every policy, without those that an alias points to.
     pub versions: usize,
+    /// Jobs that have ended, the newest; jobs of a sweep or an experiment count with it.
+    pub jobs: usize,
+    /// Time after its end for which a job is kept.
+    pub jobs_for: Duration,
 }
 
 /// Maximum number of versions that one transaction deletes, so that other writers do not wait for long.

@@ -15,8 +15,9 @@ use crate::env::EnvConfig;
 use crate::jobs::evaluation::EvaluationRequest;
 use crate::jobs::spec;
 use crate::jobs::sweep::{self, SweepRequest};
+use crate::jobs::webhooks::WebhookRequest;
 use crate::learner;
-use crate::store::{self, JobKind};
+use crate::store::{self, JobKind, JobState, Secret};
 use crate::train_config::{Algorithm, Preset};
 
 /// A job to submit. All fields are optional.
@@ -56,6 +57,14 @@ pub(super) struct JobRequest {
     #[serde(default, deserialize_with = "json::optional_integer")]
     #[schema(minimum = 0, maximum = 31_622_400)]
     backoff: Option<u64>,
+    /// Most memory of the worker in bytes. A worker that uses more is ended, and the job has failed. Default: several times the estimate
+    /// of a training run; no limit for an evaluation.
+    #[serde(default, deserialize_with = "json::optional_integer")]
+    #[schema(minimum = 1_048_576, maximum = 1_125_899_906_842_624_u64)]
+    memory: Option<u64>,
+    /// Addresses that are told when the job ends. Default: none.
+    #[schema(max_items = 8)]
+    webhooks: Option<Vec<Webhook>>,
     /// Ids of the jobs that must succeed before this one starts. When one of them is cancelled or deleted, this job is cancelled.
     #[schema(value_type = Option<Vec<Uuid>>, max_items = 100)]
     after: Option<Vec<String>>,
@@ -95,12 +104,26 @@ impl From<JobRequest> for spec::JobRequest {
     fn from(request: JobRequest) -> Self {
         let JobRequest { kind, name, labels, notes, threads, priority, algorithm, preset, environment, training, seed, .. } =
             request;
-        let JobRequest { max_attempts, timeout, backoff, after, stop, init, publish, evaluation, sweep, experiment, .. } =
-            request;
+        let JobRequest {
+            max_attempts,
+            timeout,
+            backoff,
+            memory,
+            webhooks,
+            after,
+            stop,
+            init,
+            publish,
+            evaluation,
+            sweep,
+            experiment,
+            ..
+        } = request;
         let (init, publish) = (init.map(Into::into), publish.map(Into::into));
         let sweep = sweep.map(Into::into);
         let evaluation = evaluation.map(Into::into);
         let stop = stop.map(Into::into);
+        let webhooks = webhooks.map(|webhooks| webhooks.into_iter().map(Into::into).collect());
         Self {
             kind,
             name,
@@ -111,6 +134,8 @@ impl From<JobRequest> for spec::JobRequest {
             max_attempts,
             timeout,
             backoff,
+            memory,
+            webhooks,
             after,
             stop,
             init,
@@ -125,6 +150,36 @@ impl From<JobRequest> for spec::JobRequest {
             seed,
         }
     }
+}
+
+/// An address that is told when a job ends: it receives a POST request with a JSON object. The host must have a public address, or be
+/// one of `--webhook-allow` of the server.
+#[derive(Debug, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields, remote = "Self")]
+pub(super) struct Webhook {
+    /// An `http` or `https` URL without user and password.
+    #[schema(max_length = 2000, example = "https://hooks.example/qedgix")]
+    url: String,
+    /// The states that are told; default: all three.
+    #[schema(schema_with = ends)]
+    events: Option<Vec<JobState>>,
+    /// Key of the signatures (HMAC-SHA256): Base64 after `whsec_`, or any text. It is never returned. Default: messages are not signed.
+    #[schema(value_type = Option<String>, min_length = 1, max_length = 255, write_only = true)]
+    secret: Option<Secret>,
+}
+
+json::objects_only!(Webhook);
+
+impl From<Webhook> for WebhookRequest {
+    fn from(Webhook { url, events, secret }: Webhook) -> Self {
+        Self { url, events, secret }
+    }
+}
+
+/// States in which jobs end, each once.
+fn ends() -> RefOr<Schema> {
+    let states = [JobState::Succeeded, JobState::Failed, JobState::Cancelled];
+    schema(json!({"type": ["array", "null"], "items": {"type": "string", "enum": states}, "minItems": 1, "uniqueItems": true}))
 }
 
 /// Weights that training begins with: exactly one of `policy` and `checkpoint`. The agents must have the same architecture. The

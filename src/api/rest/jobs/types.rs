@@ -159,6 +159,11 @@ pub(super) struct Job {
     timeout: Option<u64>,
     /// Seconds between a failed attempt and the next one.
     backoff: u64,
+    /// Most memory of the worker in bytes; null: no limit.
+    #[schema(required = true)]
+    memory: Option<u64>,
+    /// Addresses that are told when the job ends.
+    webhooks: Vec<Webhook>,
     /// Jobs that must succeed before this one starts.
     #[schema(value_type = Vec<Uuid>)]
     after: Vec<JobId>,
@@ -188,6 +193,23 @@ pub(super) struct Job {
     /// Number of the combination of its sweep, or of the run of its experiment, that the job has, from 0; null without one.
     #[schema(required = true)]
     point: Option<u64>,
+}
+
+/// An address that is told when the job ends.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = StoredWebhook)]
+pub(super) struct Webhook {
+    url: String,
+    /// The states that are told.
+    events: Vec<JobState>,
+    /// Whether messages are signed. The secret is never returned.
+    signed: bool,
+}
+
+impl From<store::Webhook> for Webhook {
+    fn from(store::Webhook { url, events, signed, secret: _ }: store::Webhook) -> Self {
+        Self { url, events, signed }
+    }
 }
 
 /// What training begins with.
@@ -259,6 +281,7 @@ impl From<JobView> for Job {
         let limits = spec.as_ref().map(|spec| spec.limits).unwrap_or_default();
         let point = spec.as_ref().and_then(|spec| spec.point);
         let experiment = spec.as_ref().and_then(|spec| spec.experiment.clone());
+        let webhooks = spec.as_ref().map(|spec| spec.webhooks.clone()).unwrap_or_default();
         let (init, publish) = spec.as_ref().map(|spec| (spec.init.clone(), spec.publish.clone())).unwrap_or_default();
         let (after, stop, config, evaluation, sweep) =
             spec.map_or_else(Default::default, |spec| (spec.after, spec.stop, spec.config, spec.evaluation, spec.sweep));
@@ -296,6 +319,8 @@ impl From<JobView> for Job {
             max_attempts: limits.max_attempts,
             timeout: limits.timeout,
             backoff: limits.backoff,
+            memory: limits.memory,
+            webhooks: webhooks.into_iter().map(Into::into).collect(),
             after,
             stop: stop.map(Into::into),
             init: init.map(Into::into),
