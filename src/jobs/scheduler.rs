@@ -71,10 +71,9 @@ impl Scheduler {
 
     /// Returns when a job may start that waits for a time. If that cannot be found out, the next wake-up looks again.
     async fn delayed(&self) {
-        let now = self.0.clock.now();
-        match self.0.store.next_delayed(now).await {
+        match self.0.store.next_delayed(self.0.clock.now()).await {
             Ok(Some(time)) => {
-                let wait = Duration::try_from(time.duration_since(now)).unwrap_or_default();
+                let wait = Duration::try_from(time.duration_since(self.0.clock.now())).unwrap_or_default();
                 self.0.clock.sleep_until(self.0.clock.monotonic().saturating_add(wait)).await;
             }
             Ok(None) | Err(_) => std::future::pending().await,

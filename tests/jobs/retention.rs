@@ -3,8 +3,9 @@
 use jiff::{SignedDuration, Timestamp};
 use qedgix::store::{EndedAttempt, JobAction, JobId, JobSpec, NewJob, Store, SubmitResult, WorkerResult};
 use qedgix::train_config::{Algorithm, Preset, TrainConfig};
+use serde_json::json;
 
-use super::harness::{Rest, named, within};
+use super::harness::{Rest, with, within};
 use super::process::{POLL, Process, serve};
 
 fn at(second: i64) -> Timestamp {
@@ -103,8 +104,8 @@ async fn a_server_deletes_old_jobs_and_keeps_their_policies() {
         (process, rest)
     };
     let (mut process, rest) = start(&[]).await;
-    for _ in 0..2 {
-        let id = rest.submit(&named("mine")).await;
+    for seed in [1, 2] {
+        let id = rest.submit(&with(&json!({"name": "mine", "seed": seed}))).await;
         rest.reaches(&id, "succeeded").await;
     }
     process.terminate().await;
