@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use crate::inflight::Budget;
 use crate::invalid::{Invalid, in_range};
+use crate::jobs::SlurmConfig;
 use crate::service::keys::Rate;
 use crate::service::policies::Retention;
 use crate::serving::{DEFAULT_MEMORY, EngineConfig};
@@ -30,6 +31,10 @@ pub struct Config {
     pub heartbeat_timeout: Duration,
     /// Program of workers; `None`: this program.
     pub worker: Option<PathBuf>,
+    /// Where workers run.
+    pub executor: ExecutorConfig,
+    /// Address at which workers reach the server; `None`: a free port of loopback.
+    pub worker_addr: Option<WorkerAddr>,
     /// Idle time after which a session expires.
     pub session_ttl: Duration,
     /// Maximum open sessions.
@@ -91,6 +96,25 @@ pub struct Config {
     pub key_burst: Option<f64>,
 }
 
+/// Where workers run.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum ExecutorConfig {
+    /// As processes of this machine.
+    #[default]
+    Local,
+    /// As jobs of a Slurm cluster.
+    Slurm(SlurmConfig),
+}
+
+/// An address of this machine as others know it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct WorkerAddr {
+    /// Host and port, as `login1:50052`.
+    pub name: String,
+    /// The address of the host's name.
+    pub addr: SocketAddr,
+}
+
 /// PEM files of TLS. The server reads them again on SIGHUP.
 #[derive(Clone, Debug)]
 pub struct TlsFiles {
@@ -115,6 +139,8 @@ impl Config {
             snapshot_every: Duration::from_secs(10),
             heartbeat_timeout: Duration::from_secs(30),
             worker: None,
+            executor: ExecutorConfig::Local,
+            worker_addr: None,
             session_ttl: Duration::from_secs(600),
             max_sessions: 100_000,
             session_memory: 512 << 20,
@@ -147,16 +173,25 @@ impl Config {
         }
     }
 
+    /// The CPU budget if none is chosen: the cores of this machine, or what a cluster has at most.
+    pub fn default_cpu_budget(&self) -> usize {
+        match self.executor {
+            ExecutorConfig::Local => self.cpu_budget,
+            ExecutorConfig::Slurm(_) => MAX_CPU_BUDGET,
+        }
+    }
+
     /// Checks that every setting is in range.
     ///
     /// # Errors
     /// [`Invalid`] for the first setting that is not.
     pub fn validate(&self) -> Result<(), Invalid> {
-        in_range("--cpu-budget", self.cpu_budget, 1..=4096)?;
+        in_range("--cpu-budget", self.cpu_budget, 1..=MAX_CPU_BUDGET)?;
         in_range("--max-attempts", self.max_attempts, 1..=1000)?;
         in_seconds("--snapshot-every", self.snapshot_every, 0.0..=1e9)?;
         // Workers send a heartbeat every 0.4 s.
         in_seconds("--heartbeat-timeout", self.heartbeat_timeout, 2.0..=3600.0)?;
+        self.validate_executor()?;
         in_seconds("--session-ttl", self.session_ttl, 0.001..=1e9)?;
         in_range("--max-sessions", self.max_sessions, 1..=100_000_000)?;
         in_range("--session-memory", self.session_memory, 1 << 20..=1 << 40)?;
@@ -202,6 +237,19 @@ impl Config {
         Ok(())
     }
 
+    fn validate_executor(&self) -> Result<(), Invalid> {
+        let ExecutorConfig::Slurm(slurm) = &self.executor else { return Ok(()) };
+        if self.worker_addr.as_ref().is_none_or(|addr| addr.addr.port() == 0) {
+            let value = self.worker_addr.as_ref().map_or("none", |addr| &addr.name);
+            let expected = "host and port at which the nodes of the cluster reach this machine, such as login1:50052";
+            return Err(Invalid::new("--worker-addr", value, expected));
+        }
+        if let Some(time) = slurm.time {
+            in_seconds("--slurm-time", time, 60.0..=365.0 * 86_400.0)?;
+        }
+        slurm.validate()
+    }
+
     /// Checks that a server without API keys listens on loopback addresses only. `has_keys`: whether an API key exists.
     ///
     /// # Errors
@@ -217,6 +265,9 @@ impl Config {
         Ok(())
     }
 }
+
+/// Largest CPU budget.
+const MAX_CPU_BUDGET: usize = 4096;
 
 /// Checks that `time` lies in `range`, which is in seconds. The bounds keep sums of times from overflowing.
 fn in_seconds(flag: &str, time: Duration, range: RangeInclusive<f64>) -> Result<(), Invalid> {

@@ -34,12 +34,12 @@ pub use self::tls::Tls;
 use crate::api::body::{IncomingBody, TimeLimits};
 use crate::api::{AllowedHosts, grpc, rest};
 use crate::clock::Clock;
-use crate::config::Config;
+use crate::config::{Config, ExecutorConfig};
 use crate::draining::Draining;
 use crate::files;
 use crate::inflight::Budget;
 use crate::invalid::Invalid;
-use crate::jobs::{LocalProcess, Scheduler, SchedulerConfig};
+use crate::jobs::{self, Executor, LocalProcess, Scheduler, SchedulerConfig, Slurm};
 use crate::service::keys::{Keyring, Rate};
 use crate::service::policies::{Loads, UploadLimit};
 use crate::service::webhooks::Webhooks;
@@ -106,7 +106,7 @@ pub struct Listeners {
     pub grpc: TcpListener,
     /// REST.
     pub http: TcpListener,
-    /// Serves only `WorkerService`, to the workers of this machine: on loopback, without TLS, outside the connection limit.
+    /// Serves only `WorkerService`: without TLS, outside the connection limit, on loopback if workers run on this machine.
     workers: TcpListener,
     tls: Option<Arc<Tls>>,
 }
@@ -128,7 +128,8 @@ impl Listeners {
     pub async fn bind(config: &Config) -> Result<Self, Error> {
         let bind = async |addr| TcpListener::bind(addr).await.map_err(|cause| Error::Bind { addr, cause });
         let tls = config.tls.clone().map(Tls::open).transpose()?.map(Arc::new);
-        let workers = bind((Ipv4Addr::LOCALHOST, 0).into()).await?;
+        let loopback = (Ipv4Addr::LOCALHOST, 0).into();
+        let workers = bind(config.worker_addr.as_ref().map_or(loopback, |worker| worker.addr)).await?;
         Ok(Self { grpc: bind(config.grpc_addr).await?, http: bind(config.http_addr).await?, workers, tls })
     }
 
@@ -221,15 +222,14 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
     data.make_private();
     let store = Store::open(&data.path).await?;
     housekeeping::prepare_file(&store, &data.path).await?;
-    let executor = match &config.worker {
-        Some(program) => LocalProcess::new(program),
-        None => LocalProcess::same_program().map_err(Error::Worker)?,
-    };
+    let executor = executor(config, data)?;
     let scheduler = SchedulerConfig {
         max_attempts: config.max_attempts,
         snapshot_every: config.snapshot_every,
         heartbeat_timeout: config.heartbeat_timeout,
         pause_grace: config.drain_timeout,
+        // The nodes of a cluster may have more memory than this machine, and Slurm knows which.
+        memory: if executor.is_cluster() { u64::MAX } else { jobs::memory::available() },
         ..SchedulerConfig::new(config.cpu_budget)
     };
     let keys = Keyring::new(config.key_rate.map(|rate| Rate::new(rate, config.key_burst)));
@@ -242,7 +242,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
     let app = App {
         keys,
         uploads: UploadLimit::default(),
-        scheduler: Scheduler::open(store.clone(), scheduler, Arc::new(executor), clock.clone(), draining.clone()).await?,
+        scheduler: Scheduler::open(store.clone(), scheduler, executor, clock.clone(), draining.clone()).await?,
         store,
         registry: Arc::new(Registry::new(config.policy_memory)),
         loads: Loads::default(),
@@ -261,6 +261,22 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
     Ok(Arc::new(app))
 }
 
+/// What starts workers.
+fn executor(config: &Config, data: &DataDir) -> Result<Arc<dyn Executor>, Error> {
+    let program = config.worker.clone();
+    Ok(match &config.executor {
+        ExecutorConfig::Local => Arc::new(match program {
+            Some(program) => LocalProcess::new(program),
+            None => LocalProcess::same_program().map_err(Error::Worker)?,
+        }),
+        ExecutorConfig::Slurm(slurm) => {
+            let program = program.map_or_else(std::env::current_exe, Ok).map_err(Error::Worker)?;
+            let path = slurm.directory.clone().unwrap_or_else(|| data.path.join("slurm"));
+            Arc::new(Slurm::new(slurm.clone(), program, path.clone()).map_err(|cause| Error::File { path, cause })?)
+        }
+    })
+}
+
 /// Serves until `shutdown` resolves, then drains.
 ///
 /// # Errors
@@ -273,7 +289,10 @@ pub async fn run(
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Error> {
     let endpoints = listeners.endpoints().map_err(Error::Listener)?;
-    let workers = listeners.workers.local_addr().map_err(Error::Listener)?;
+    let workers = match &config.worker_addr {
+        Some(worker) if worker.addr.port() != 0 => worker.name.clone(),
+        _ => listeners.workers.local_addr().map_err(Error::Listener)?.to_string(),
+    };
     telemetry::install_metrics();
     let stop = CancellationToken::new();
     let health = grpc::Health::new(app.draining.clone(), stop.clone());

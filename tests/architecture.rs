@@ -29,6 +29,7 @@ const LAYERS: &[(&str, &[&str])] = &[
         &[
             "clock",
             "draining",
+            "files",
             "store",
             "experiment",
             "checkpoint",

@@ -1,5 +1,7 @@
 //! `qedgix serve`: flags, signals, and the run of one server.
 
+mod executor;
+
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -8,6 +10,7 @@ use std::time::Duration;
 use clap::{Args, ValueEnum};
 use tokio::signal::unix::{SignalKind, signal};
 
+use self::executor::ExecutorArgs;
 use super::output::{OutputError, outln};
 use super::signals::StopSignals;
 use crate::clock::Clock;
@@ -23,6 +26,9 @@ use crate::telemetry::{self, LogConfig, TraceExporter};
   qedgix serve
   qedgix serve --grpc-addr 127.0.0.1:0 --http-addr 127.0.0.1:0 --data-dir /var/lib/qedgix   # free ports, written to endpoints.json
   QEDGIX_CPU_BUDGET=2 QEDGIX_LOG=debug qedgix serve --log-format json
+
+Training on a cluster:
+  qedgix serve --executor slurm --worker-addr login1.cluster:50052 --slurm-dir /home/lab/qedgix --slurm-partition cpu --slurm-time 8h
 
 Remote access with API keys and TLS:
   qedgix keys create --name fleet --scopes read,act
@@ -40,7 +46,7 @@ pub struct ServeArgs {
     /// Directory of the database; created if missing
     #[arg(long, env = "QEDGIX_DATA_DIR", default_value = "./qedgix-data", value_name = "DIR")]
     data_dir: PathBuf,
-    /// CPU budget: threads that all running training jobs may use together [default: all cores]
+    /// CPU budget: threads that all running training jobs may use together [default: all cores; 4096 with Slurm]
     #[arg(long, env = "QEDGIX_CPU_BUDGET", value_name = "THREADS")]
     cpu_budget: Option<usize>,
     /// Failed attempts, without a new snapshot between them, after which a job fails
@@ -124,6 +130,8 @@ pub struct ServeArgs {
     /// [default: none]
     #[arg(long = "webhook-allow", help_heading = SECURITY, env = "QEDGIX_WEBHOOK_ALLOW", value_delimiter = ',', value_name = "HOST")]
     webhook_allow: Vec<String>,
+    #[command(flatten)]
+    executor: ExecutorArgs,
     #[command(flatten)]
     security: SecurityArgs,
     /// Format of the logs on standard error
@@ -273,11 +281,12 @@ fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
 
 impl ServeArgs {
     fn config(&self) -> Config {
-        let default = Config::new(&self.data_dir);
+        let (executor, worker_addr) = self.executor.config();
+        let default = Config { executor, worker_addr, ..Config::new(&self.data_dir) };
         Config {
             grpc_addr: self.grpc_addr,
             http_addr: self.http_addr,
-            cpu_budget: self.cpu_budget.unwrap_or(default.cpu_budget),
+            cpu_budget: self.cpu_budget.unwrap_or_else(|| default.default_cpu_budget()),
             max_attempts: self.max_attempts,
             snapshot_every: self.snapshot_every,
             heartbeat_timeout: self.heartbeat_timeout,

@@ -1,7 +1,8 @@
 //! Executors: the trait that starts workers, and its types.
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::Duration;
 
 use futures::future::BoxFuture;
 use tokio::sync::watch;
@@ -14,29 +15,101 @@ use crate::store::Lease;
 pub struct Launch {
     /// The attempt.
     pub lease: Lease,
-    /// Threads that the worker may use.
-    pub threads: usize,
-    /// Secret that the worker presents to the server.
+    /// Secret that the worker presents to the server; empty if an earlier server has started the worker.
     pub token: String,
     /// Address of the server's `WorkerService`, as `http://127.0.0.1:50051`.
     pub server: String,
+    /// What the worker needs.
+    pub resources: Resources,
+    /// Name of the launch, which is unique.
+    pub name: String,
+    /// Whether an earlier server has started the worker, or was about to.
+    pub started_before: bool,
+    /// What the executor and the scheduler know of the worker.
+    pub status: WorkerStatus,
     /// Receives the output of the worker.
     pub log: LogTail,
     /// Cancelled to kill the worker.
     pub kill: CancellationToken,
 }
 
-/// How a worker process ended, as text: `exit code 1`, `killed by signal 9`.
+/// What a worker needs of the machine it runs on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Resources {
+    /// Threads that compute.
+    pub threads: usize,
+    /// Memory in bytes.
+    pub memory: u64,
+}
+
+/// What the executor and the scheduler know of a worker; cheap to clone.
+#[derive(Clone, Debug, Default)]
+pub struct WorkerStatus(Arc<Status>);
+
+#[derive(Debug, Default)]
+struct Status {
+    /// Why the worker does not run.
+    waiting: Mutex<Option<String>>,
+    /// Monotonic time at which the attempt began.
+    began: OnceLock<Duration>,
+}
+
+impl WorkerStatus {
+    /// Why the worker does not run at present; `None`: it should run.
+    pub fn waiting(&self) -> Option<String> {
+        self.0.waiting.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Records why the worker does not run at present.
+    pub fn set_waiting(&self, reason: Option<String>) {
+        *self.0.waiting.lock().unwrap_or_else(PoisonError::into_inner) = reason;
+    }
+
+    /// Monotonic time at which the attempt began; `None`: the worker has not called.
+    pub fn began(&self) -> Option<Duration> {
+        self.0.began.get().copied()
+    }
+
+    /// Records that the attempt has begun.
+    pub fn set_began(&self, now: Duration) {
+        // The first call counts.
+        let _ = self.0.began.set(now);
+    }
+}
+
+/// How a worker ended.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct WorkerExit(pub String);
+pub struct WorkerExit {
+    /// In words: `exit code 1`, `killed by signal 9`.
+    pub description: String,
+    /// Whether the host or cluster ended it, which is not the fault of its job.
+    pub by_host: bool,
+}
+
+impl WorkerExit {
+    /// The worker ended by itself, because of its job.
+    pub fn of_worker(description: impl Into<String>) -> Self {
+        Self { description: description.into(), by_host: false }
+    }
+
+    /// The host or cluster ended the worker.
+    pub fn of_host(description: impl Into<String>) -> Self {
+        Self { description: description.into(), by_host: true }
+    }
+}
 
 /// Starts workers, for example as local processes.
 pub trait Executor: Send + Sync + 'static {
-    /// Starts a worker. The inner future resolves when the worker has ended.
+    /// Starts a worker, or finds the one that an earlier server has started. The inner future resolves when the worker has ended.
     ///
     /// # Errors
     /// [`std::io::Error`] when the worker cannot be started.
     fn start(&self, launch: Launch) -> BoxFuture<'_, std::io::Result<BoxFuture<'static, WorkerExit>>>;
+
+    /// Whether workers wait in a queue of their own and outlive this server. Then a job stays queued until its worker calls.
+    fn is_cluster(&self) -> bool {
+        false
+    }
 }
 
 /// The last part of a worker's output; cheap to clone.

@@ -43,7 +43,7 @@ impl LocalProcess {
 impl Executor for LocalProcess {
     fn start(&self, launch: Launch) -> BoxFuture<'_, std::io::Result<BoxFuture<'static, WorkerExit>>> {
         async move {
-            let cores = self.cores.take(launch.threads);
+            let cores = self.cores.take(launch.resources.threads);
             let mut command = Command::new(&self.program);
             command
                 .args(["worker", "--tethered"])
@@ -91,7 +91,7 @@ async fn supervise(mut child: Child, launch: Launch, _cores: TakenCores) -> Work
     drop(stdin);
     // A timeout is ignored: the output read so far is in the log.
     let _ = tokio::time::timeout(OUTPUT_TIMEOUT, copying).await;
-    WorkerExit(status.map_or_else(|e| format!("an unknown status: {e}"), describe_exit))
+    WorkerExit::of_worker(status.map_or_else(|e| format!("an unknown status: {e}"), describe_exit))
 }
 
 /// Copies output of a worker to its log. A worker that floods its output waits for this, instead of taking the server's time.

@@ -8,9 +8,11 @@ mod cores;
 pub mod evaluation;
 mod executor;
 pub mod experiment_jobs;
+mod launched;
 mod local;
 pub mod memory;
 mod scheduler;
+mod slurm;
 pub mod spec;
 pub mod sweep;
 pub mod sweep_jobs;
@@ -26,8 +28,9 @@ use sha2::{Digest, Sha256};
 use subtle::ConstantTimeEq;
 use tokio::sync::{Notify, watch};
 
-pub use executor::{Executor, Launch, LogTail, WorkerExit};
+pub use executor::{Executor, Launch, LogTail, Resources, WorkerExit, WorkerStatus};
 pub use local::LocalProcess;
+pub use slurm::{Slurm, SlurmConfig};
 
 use crate::clock::Clock;
 use crate::draining::Draining;
@@ -107,13 +110,20 @@ struct RunningAttempt {
     log: LogTail,
     /// Notified when the job has changed while its worker runs.
     job_changed: Arc<Notify>,
-    /// Monotonic time at which the job exceeds its timeout.
-    deadline: Option<Duration>,
+    /// What the executor knows of the worker.
+    status: WorkerStatus,
+    /// Time from the begin of the attempt until the job exceeds its timeout.
+    time_left: Option<Duration>,
     /// Monotonic time of the last call of the worker.
     last_heartbeat: Arc<Mutex<Duration>>,
 }
 
 impl RunningAttempt {
+    /// Monotonic time at which the job exceeds its timeout.
+    fn deadline(&self) -> Option<Duration> {
+        Some(self.status.began()?.saturating_add(self.time_left?))
+    }
+
     fn last_heartbeat(&self) -> MutexGuard<'_, Duration> {
         self.last_heartbeat.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -132,7 +142,7 @@ impl Scheduler {
         clock: Clock,
         draining: Draining,
     ) -> Result<Self, store::Error> {
-        for job in store.recover_jobs(clock.now()).await? {
+        for job in store.recover_jobs(executor.is_cluster(), clock.now()).await? {
             tracing::info!(job = %job.id, state = %job.state, step = job.step, "recovered a job of a server that stopped");
         }
         Ok(Self(Arc::new(Inner {
@@ -197,12 +207,25 @@ impl Scheduler {
         }
     }
 
-    /// The directive for the worker of a job with this pending action.
+    /// Records that the attempt of a launch has begun, with the first call of its worker.
+    pub fn attempt_begun(&self, lease: Lease) {
+        if let Some(running) = self.running().get(&lease.job_row).filter(|running| running.attempt == lease.attempt) {
+            running.status.set_began(self.0.clock.monotonic());
+            running.status.set_waiting(None);
+        }
+    }
+
+    /// Why the worker of a job, which the cluster was asked for, does not run at present.
+    pub fn waiting(&self, job: i64) -> Option<String> {
+        self.running().get(&job)?.status.waiting()
+    }
+
+    /// The directive for the worker of a job with this pending action. The workers of a cluster go on while this server restarts.
     pub fn directive(&self, pending: Option<PendingAction>) -> Directive {
         match pending {
             Some(PendingAction::Cancel) => Directive::Cancel,
             Some(PendingAction::Pause) => Directive::Pause,
-            None if self.0.draining.begun() => Directive::Pause,
+            None if self.0.draining.begun() && !self.0.executor.is_cluster() => Directive::Pause,
             None => Directive::Continue,
         }
     }
@@ -214,7 +237,7 @@ impl Scheduler {
     }
 
     /// Begins draining, lets the workers pause, and waits until their processes have ended, at most for `timeout`. Workers
-    /// that do not pause in time are killed. The jobs are queued again. gRPC must be served meanwhile: workers upload
+    /// that do not pause in time are killed. The jobs are queued again. Workers of a cluster go on. gRPC must be served meanwhile: workers upload
     /// snapshots.
     pub async fn drain(&self, timeout: Duration) {
         self.0.draining.begin();

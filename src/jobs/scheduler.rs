@@ -14,7 +14,8 @@ use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
 use super::backfill::backfill_limit;
-use super::{Launch, LogTail, RunningAttempt, Scheduler, WorkerExit, token_digest};
+use super::launched::{new_launch, resources};
+use super::{Launch, LogTail, RunningAttempt, Scheduler, WorkerExit, WorkerStatus, token_digest};
 use crate::store::{EndedAttempt, Job, JobState, Lease, PendingAction, WorkerResult};
 
 /// Why the scheduler kills a worker.
@@ -33,15 +34,24 @@ const RETRY_DELAY: Duration = Duration::from_secs(1);
 
 /// Delays before a worker that could not be started is started again: the first, which doubles, and the longest.
 const START_DELAY: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5)];
+/// Time in which a worker of a cluster ends after its attempt, before it is killed.
+const CLUSTER_GRACE: Duration = Duration::from_secs(10);
 /// Time in which output of a worker is collected before it is stored.
 const LOG_DELAY: Duration = Duration::from_millis(100);
 /// Time between two writes of a worker's output, and that time when the worker floods its output.
 const LOG_INTERVAL: [Duration; 2] = [Duration::from_millis(400), Duration::from_secs(10)];
 
 /// Why no attempt could begin: the database, or the system's source of random numbers.
-type StartError = Box<dyn std::error::Error + Send + Sync>;
+pub(super) type StartError = Box<dyn std::error::Error + Send + Sync>;
 
-fn failed(reason: String) -> WorkerResult {
+/// A secret for a worker.
+pub(super) fn new_token() -> Result<String, StartError> {
+    let mut secret = [0; 32];
+    getrandom::fill(&mut secret)?;
+    Ok(hex::encode(secret))
+}
+
+pub(super) fn failed(reason: String) -> WorkerResult {
     WorkerResult::Failed { reason, permanent: false }
 }
 
@@ -52,6 +62,9 @@ pub(super) fn threads_used(all: &HashMap<i64, RunningAttempt>) -> usize {
 impl Scheduler {
     /// Starts jobs until draining begins. Workers reach this server's gRPC at `server`, as `http://127.0.0.1:50051`.
     pub async fn run(self, server: String) {
+        if self.0.executor.is_cluster() {
+            self.adopt_launches(&server).await;
+        }
         while !self.0.draining.begun() {
             let wake = self.0.wake.notified();
             let started = self.start_all(&server).await;
@@ -104,6 +117,10 @@ impl Scheduler {
                 continue;
             }
             let Some(running) = self.reserve(&job) else { break };
+            if self.0.executor.is_cluster() {
+                self.launch(&job, server, running).await?;
+                continue;
+            }
             let begun = self.begin(&job).await;
             let Ok(Some((lease, token))) = begun else {
                 // Cancelled or paused in the meantime, or an error.
@@ -114,8 +131,8 @@ impl Scheduler {
             let (scheduler, span) = (self.clone(), tracing::info_span!("attempt", job = %lease.job_id, attempt = lease.attempt));
             let server = server.to_owned();
             let attempt = async move {
-                let (log, kill) = (running.log.clone(), CancellationToken::new());
-                let launch = Launch { lease, threads: running.threads, token, server, log, kill };
+                let resources = resources(&job, running.threads);
+                let launch = Launch { token, server, ..new_launch(lease, resources, &running) };
                 scheduler.supervise(launch, &running).await;
                 scheduler.release(lease.job_row);
             };
@@ -137,31 +154,36 @@ impl Scheduler {
         if self.0.draining.begun() || threads_used(&all) + threads > budget || all.contains_key(&job.row_id) {
             return None;
         }
-        let running = RunningAttempt {
-            attempt: job.attempts + 1,
-            threads,
-            log: LogTail::default(),
-            job_changed: Arc::new(Notify::new()),
-            deadline: job.spec.decode().ok().and_then(|spec| spec.limits.timeout).map(|seconds| {
-                let left = Duration::from_secs(seconds).saturating_sub(job.ran);
-                self.0.clock.monotonic().saturating_add(left)
-            }),
-            last_heartbeat: Arc::new(Mutex::new(self.0.clock.monotonic())),
-        };
+        let running = self.new_attempt(job, job.attempts + 1, threads);
+        if !self.0.executor.is_cluster() {
+            running.status.set_began(self.0.clock.monotonic());
+        }
         all.insert(job.row_id, running.clone());
         Some(running)
     }
 
-    fn release(&self, job: i64) {
+    /// Attempt `number` of a job, which runs on `threads` threads.
+    pub(super) fn new_attempt(&self, job: &Job, number: u32, threads: usize) -> RunningAttempt {
+        let timeout = job.spec.decode().ok().and_then(|spec| spec.limits.timeout);
+        RunningAttempt {
+            attempt: number,
+            threads,
+            log: LogTail::default(),
+            job_changed: Arc::new(Notify::new()),
+            status: WorkerStatus::default(),
+            time_left: timeout.map(|seconds| Duration::from_secs(seconds).saturating_sub(job.ran)),
+            last_heartbeat: Arc::new(Mutex::new(self.0.clock.monotonic())),
+        }
+    }
+
+    pub(super) fn release(&self, job: i64) {
         self.running().remove(&job);
         self.0.removed.notify_waiters();
         self.0.wake.notify_one();
     }
 
     async fn begin(&self, job: &Job) -> Result<Option<(Lease, String)>, StartError> {
-        let mut secret = [0; 32];
-        getrandom::fill(&mut secret)?;
-        let token = hex::encode(secret);
+        let token = new_token()?;
         let lease = self.0.store.begin_attempt(job.id, token_digest(&token), self.0.clock.now()).await?;
         Ok(lease.map(|lease| (lease, token)))
     }
@@ -194,24 +216,31 @@ impl Scheduler {
                     launch.log.push(format!("a worker could not be started: {error}; trying again in {delay:?}\n").as_bytes());
                 }
             }
-            let next = self.0.clock.monotonic().saturating_add(delay);
+            if !self.wait_to_retry(launch.lease, running, delay).await {
+                return None;
+            }
             delay = (delay * 2).min(longest);
-            loop {
-                tokio::select! {
-                    () = self.0.clock.sleep_until(next) => break,
-                    () = running.job_changed.notified() => {
-                        if !matches!(self.grace(launch.lease, false).await, Ok(None)) {
-                            return None;
-                        }
+        }
+    }
+
+    /// Waits before a worker is started again. Returns false if the job or this server is to stop before.
+    pub(super) async fn wait_to_retry(&self, lease: Lease, running: &RunningAttempt, delay: Duration) -> bool {
+        let next = self.0.clock.monotonic().saturating_add(delay);
+        loop {
+            tokio::select! {
+                () = self.0.clock.sleep_until(next) => return true,
+                () = running.job_changed.notified() => {
+                    if !matches!(self.grace(lease, running, false).await, Ok(None)) {
+                        return false;
                     }
-                    () = self.0.draining.wait() => return None,
                 }
+                () = self.0.draining.wait() => return false,
             }
         }
     }
 
     /// Stores the output of the worker while it runs, so that it survives a crash of this server. Never returns.
-    async fn store_log(&self, lease: Lease, log: &LogTail) -> Infallible {
+    pub(super) async fn store_log(&self, lease: Lease, log: &LogTail) -> Infallible {
         let [short, long] = LOG_INTERVAL;
         let (mut stored, mut arrivals) = (0, log.subscribe());
         loop {
@@ -234,7 +263,7 @@ impl Scheduler {
 
     /// Waits for the end of the worker process, and kills it if it does not stop in time. Returns the result of an attempt whose
     /// worker has reported none.
-    async fn wait(
+    pub(super) async fn wait(
         &self,
         lease: Lease,
         mut exit: BoxFuture<'_, WorkerExit>,
@@ -248,7 +277,15 @@ impl Scheduler {
             reason
         };
         tokio::select! {
-            exit = &mut exit => failed(format!("the worker ended with {}", exit.0)),
+            exit = &mut exit => {
+                if !exit.by_host {
+                    return failed(format!("the worker ended with {}", exit.description));
+                }
+                tracing::warn!(reason = exit.description, "the host has ended the worker");
+                running.log.push(format!("the host has ended the worker: {}\n", exit.description).as_bytes());
+                running.status.set_waiting(Some(exit.description));
+                WorkerResult::Stopped
+            }
             reason = force => {
                 exit.await;
                 match reason {
@@ -276,13 +313,14 @@ impl Scheduler {
         let mut last_tick = clock.monotonic();
         let mut deadline: Option<Duration> = None;
         let mut drained = false;
+        let cluster = self.0.executor.is_cluster();
         let next_tick = |last_tick: Duration, deadline: Option<Duration>| {
-            [deadline, running.deadline].into_iter().flatten().fold(last_tick.saturating_add(tick), Duration::min)
+            [deadline, running.deadline()].into_iter().flatten().fold(last_tick.saturating_add(tick), Duration::min)
         };
         loop {
             let ticked = tokio::select! {
                 () = running.job_changed.notified() => false,
-                () = self.0.draining.wait(), if !drained => {
+                () = self.0.draining.wait(), if !drained && !cluster => {
                     drained = true;
                     false
                 }
@@ -296,11 +334,15 @@ impl Scheduler {
                 *running.last_heartbeat() = now;
                 deadline = deadline.map(|deadline| deadline.saturating_add(gap));
             }
+            if running.status.waiting().is_some() {
+                // A worker that does not run sends no heartbeats.
+                *running.last_heartbeat() = now;
+            }
             if ticked {
                 if deadline.is_some_and(|deadline| deadline <= now) {
                     return KillReason::GraceExpired;
                 }
-                if running.deadline.is_some_and(|deadline| deadline <= now) {
+                if running.deadline().is_some_and(|deadline| deadline <= now) {
                     return KillReason::TimedOut;
                 }
                 if running.last_heartbeat().saturating_add(config.heartbeat_timeout) <= now {
@@ -308,7 +350,7 @@ impl Scheduler {
                 }
                 continue;
             }
-            match self.grace(lease, drained).await {
+            match self.grace(lease, running, drained).await {
                 Ok(Some(grace)) => {
                     let by = now.saturating_add(grace);
                     deadline = Some(deadline.map_or(by, |deadline| deadline.min(by)));
@@ -320,21 +362,30 @@ impl Scheduler {
     }
 
     /// The time that the worker has to stop; `None` while it may run.
-    async fn grace(&self, lease: Lease, drained: bool) -> Result<Option<Duration>, crate::store::Error> {
+    async fn grace(
+        &self,
+        lease: Lease,
+        running: &RunningAttempt,
+        drained: bool,
+    ) -> Result<Option<Duration>, crate::store::Error> {
         let config = &self.0.config;
+        let begun = running.status.began().is_some();
         Ok(match self.0.store.job(lease.job_id).await? {
             Some(Job { state: JobState::Running, pending_action, .. }) => match pending_action {
                 Some(PendingAction::Cancel) => Some(config.cancel_grace),
                 Some(PendingAction::Pause) => Some(config.pause_grace),
                 None => drained.then_some(config.pause_grace),
             },
-            // The attempt has ended, so its process has to end, too.
+            // The job waits for its worker.
+            Some(Job { state: JobState::Queued, attempts, .. }) if !begun && attempts + 1 == lease.attempt => None,
+            // The attempt has ended, so its process has to end, too. A cluster notices later that a process has ended.
+            _ if begun && self.0.executor.is_cluster() => Some(CLUSTER_GRACE),
             _ => Some(config.cancel_grace),
         })
     }
 
     /// Stores the log of the worker, and ends the attempt unless the worker has ended it. Retries until the database works.
-    async fn end(&self, lease: Lease, result: &WorkerResult, log: &LogTail) {
+    pub(super) async fn end(&self, lease: Lease, result: &WorkerResult, log: &LogTail) {
         let text = log.text();
         loop {
             let ended = async {
@@ -375,7 +426,7 @@ mod tests {
         fn start(&self, launch: Launch) -> BoxFuture<'_, std::io::Result<BoxFuture<'static, WorkerExit>>> {
             let exit = async move {
                 launch.kill.cancelled().await;
-                WorkerExit("killed by signal 9".into())
+                WorkerExit::of_worker("killed by signal 9")
             };
             async { Ok(exit.boxed()) }.boxed()
         }

@@ -14,7 +14,7 @@ use crate::jobs::worker::RivalComparison;
 use crate::jobs::{Directive, equal_secrets, token_digest};
 use crate::policy::baselines;
 use crate::store::{
-    EarlyStop, EndedAttempt, InitKind, Job, JobId, Lease, Metric, NewCheckpoint, PartialSnapshot, PublishRule, Snapshot,
+    EarlyStop, EndedAttempt, InitKind, Job, JobId, Lease, LeaseRecord, Metric, NewCheckpoint, PartialSnapshot, PublishRule, Snapshot,
     WorkerResult, is_metric_name,
 };
 use crate::train_config::TrainConfig;
@@ -68,14 +68,18 @@ pub struct AttemptTask {
     pub observed: Vec<Metric>,
 }
 
-/// The attempt that the credentials belong to. Counts as a heartbeat.
+const WRONG: Error = Error::Unauthenticated("the token does not belong to this attempt");
+
+/// The attempt that the credentials belong to. Counts as a heartbeat. The first call of the worker of a cluster begins its attempt.
 ///
 /// # Errors
 /// [`Error::Unauthenticated`] for wrong credentials, [`Error::Precondition`] when the attempt has ended.
 pub async fn authenticate(app: &App, credentials: &Credentials) -> Result<Lease, Error> {
-    const WRONG: Error = Error::Unauthenticated("the token does not belong to this attempt");
     let (Some(id), Ok(attempt)) = (JobId::parse(&credentials.job), credentials.attempt.parse()) else { return Err(WRONG) };
-    let record = app.store.lease(id, attempt).await?.ok_or(WRONG)?;
+    let record = match app.store.lease(id, attempt).await? {
+        Some(record) => record,
+        None => begin_launched(app, id, attempt, token_digest(&credentials.token)).await?,
+    };
     if !equal_secrets(&record.token, &token_digest(&credentials.token)) {
         return Err(WRONG);
     }
@@ -84,6 +88,19 @@ pub async fn authenticate(app: &App, credentials: &Credentials) -> Result<Lease,
     }
     app.scheduler.record_heartbeat(record.lease);
     Ok(record.lease)
+}
+
+/// Begins the attempt of a launch with this token.
+async fn begin_launched(app: &App, id: JobId, attempt: u32, token: [u8; 32]) -> Result<LeaseRecord, Error> {
+    if !app.store.is_launched(id, attempt, token).await? {
+        return Err(WRONG);
+    }
+    if let Some(lease) = app.store.begin_launched(id, attempt, token, app.clock.now()).await? {
+        tracing::info!(job = %id, attempt, "the worker of a cluster has called");
+        app.scheduler.attempt_begun(lease);
+    }
+    // Another call of the same worker may have begun it, or the job is not queued any more.
+    app.store.lease(id, attempt).await?.ok_or(WRONG)
 }
 
 fn attempt_ended(lease: Lease) -> Error {

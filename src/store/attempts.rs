@@ -195,6 +195,21 @@ async fn end(db: &mut SqliteConnection, ended: EndedAttempt<'_>) -> Result<Optio
     Ok(find(db, lease.job_id).await?.map(|job| (job, published)))
 }
 
+/// Begins the next attempt of a job.
+pub(super) async fn begin(db: &mut SqliteConnection, job: &Job, token: &[u8], now: Timestamp) -> Result<Lease> {
+    let lease = Lease { job_id: job.id, job_row: job.row_id, attempt: job.attempts + 1 };
+    let sql = "INSERT INTO attempts (job, number, token, started_at) VALUES (?, ?, ?, ?)";
+    let insert = sqlx::query(sql).bind(lease.job_row).bind(lease.attempt).bind(token).bind(now.as_millisecond());
+    insert.execute(&mut *db).await?;
+    let sql = "DELETE FROM attempts WHERE job = ? AND number <= ?";
+    sqlx::query(sql).bind(lease.job_row).bind(i64::from(lease.attempt) - KEPT_ATTEMPTS).execute(&mut *db).await?;
+    let sql = "UPDATE jobs SET attempts = ? WHERE number = ?";
+    sqlx::query(sql).bind(lease.attempt).bind(lease.job_row).execute(&mut *db).await?;
+    let to = JobState::Running;
+    transition(db, Transition { job: lease.job_row, to, attempt: lease.attempt, reason: None, now }).await?;
+    Ok(lease)
+}
+
 impl Store {
     /// Begins an attempt of the job `id` whose worker presents the token with the SHA-256 `token`. Returns `None` unless the
     /// job is queued.
@@ -207,21 +222,7 @@ impl Store {
             tx.abandon().await?;
             return Ok(None);
         };
-        let lease = Lease { job_id: id, job_row: job.row_id, attempt: job.attempts + 1 };
-        let sql = "INSERT INTO attempts (job, number, token, started_at) VALUES (?, ?, ?, ?)";
-        sqlx::query(sql)
-            .bind(lease.job_row)
-            .bind(lease.attempt)
-            .bind(token.as_slice())
-            .bind(now.as_millisecond())
-            .execute(&mut *tx)
-            .await?;
-        let sql = "DELETE FROM attempts WHERE job = ? AND number <= ?";
-        sqlx::query(sql).bind(lease.job_row).bind(i64::from(lease.attempt) - KEPT_ATTEMPTS).execute(&mut *tx).await?;
-        let sql = "UPDATE jobs SET attempts = ? WHERE number = ?";
-        sqlx::query(sql).bind(lease.attempt).bind(lease.job_row).execute(&mut *tx).await?;
-        let to = JobState::Running;
-        transition(&mut tx, Transition { job: lease.job_row, to, attempt: lease.attempt, reason: None, now }).await?;
+        let lease = begin(&mut tx, &job, &token, now).await?;
         tx.commit().await?;
         self.notify(lease.job_row);
         Ok(Some(lease))
@@ -251,13 +252,17 @@ impl Store {
         tx.commit().await
     }
 
-    /// Ends the attempts that were running when the server last stopped, and queues their jobs again. Returns these jobs.
+    /// Ends the attempts that were running when the server last stopped, and queues their jobs again. Returns these jobs. The
+    /// workers of a cluster have gone on: with `keep_launches`, their attempts stay; without, they are given up.
     ///
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
-    pub async fn recover_jobs(&self, now: Timestamp) -> Result<Vec<Job>> {
+    pub async fn recover_jobs(&self, keep_launches: bool, now: Timestamp) -> Result<Vec<Job>> {
         let mut tx = self.begin().await?;
-        let sql = "SELECT id, number, attempts FROM jobs WHERE state = 'running'";
+        if !keep_launches {
+            sqlx::query("DELETE FROM launches").execute(&mut *tx).await?;
+        }
+        let sql = "SELECT id, number, attempts FROM jobs WHERE state = 'running' AND number NOT IN (SELECT job FROM launches)";
         let rows: Vec<(String, i64, i64)> = sqlx::query_as(sql).fetch_all(&mut *tx).await?;
         let mut jobs = Vec::with_capacity(rows.len());
         for (id, job, attempt) in rows {

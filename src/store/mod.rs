@@ -27,6 +27,7 @@ mod job_id;
 mod job_list;
 mod jobs;
 mod keys;
+mod launches;
 mod metric_summaries;
 mod metrics;
 mod named_enum;
@@ -55,6 +56,7 @@ pub use job_id::JobId;
 pub use job_list::{JobCursor, JobFilter, JobList, JobOrder, JobSort, ListedJob, SortKey};
 pub use jobs::{Job, JobAction, JobState, PendingAction};
 pub use keys::KeyRecord;
+pub use launches::LaunchRecord;
 pub use metric_summaries::{MetricSummary, larger_is_better};
 pub use metrics::{Metric, MetricCursor, MetricRow, is_metric_name};
 pub use policies::{NewPolicyVersion, PolicyVersion, PublishedPolicy, VersionKey};
@@ -95,6 +97,7 @@ const MIGRATIONS: &[(&str, &str)] = &migrations![
     "0010_finding_jobs.sql",
     "0011_lifecycle.sql",
     "0012_initial_weights.sql",
+    "0013_launches.sql",
     "0015_webhooks.sql",
     "0016_old_jobs.sql",
 ];

@@ -10,13 +10,14 @@ use super::{Job, JobState, Result, Store, timestamp};
 
 impl Store {
     /// The first job of the queue with at most `threads` threads that may start at `now`: highest priority, then first come, first
-    /// served.
+    /// served. Jobs that wait in the queue of a cluster are not in this one.
     ///
     /// # Errors
     /// [`Error`](super::Error) when the database fails.
     pub async fn first_in_queue(&self, threads: usize, now: Timestamp) -> Result<Option<Job>> {
         let sql = "SELECT * FROM jobs WHERE state = 'queued' AND blocked = 0 AND threads <= ?
-                   AND (not_before IS NULL OR not_before <= ?) ORDER BY priority DESC, number LIMIT 1";
+                   AND (not_before IS NULL OR not_before <= ?) AND number NOT IN (SELECT job FROM launches)
+                   ORDER BY priority DESC, number LIMIT 1";
         let threads = i64::try_from(threads).unwrap_or(i64::MAX);
         let query = sqlx::query_as(sql).bind(threads).bind(now.as_millisecond());
         let row: Option<JobRow> = query.fetch_optional(&self.read).await?;
@@ -59,7 +60,7 @@ impl Store {
         // The whole queue is numbered, because counting for each of the jobs would read it once per job.
         let sql = "SELECT number, place - 1 FROM (
                        SELECT number, row_number() OVER (ORDER BY priority DESC, number) AS place FROM jobs
-                       WHERE state = 'queued' AND blocked = 0
+                       WHERE state = 'queued' AND blocked = 0 AND number NOT IN (SELECT job FROM launches)
                    ) WHERE number IN (SELECT value FROM json_each(?))";
         let rows = sqlx::query_as(sql).bind(serde_json::Value::from(jobs).to_string());
         let rows: Vec<(i64, i64)> = rows.fetch_all(&self.read).await?;

@@ -42,7 +42,7 @@ pub struct Worker {
 impl Worker {
     /// Ends the process.
     pub fn exit(self, how: &str) {
-        self.exit.send(WorkerExit(how.into())).expect("the scheduler waits for the exit");
+        self.exit.send(WorkerExit::of_worker(how)).expect("the scheduler waits for the exit");
     }
 
     /// Waits until the scheduler kills the process.
@@ -63,7 +63,7 @@ impl Executor for Manual {
     fn start(&self, launch: Launch) -> BoxFuture<'_, std::io::Result<BoxFuture<'static, WorkerExit>>> {
         let (exit, ended) = oneshot::channel();
         self.0.send(Worker { launch, exit }).expect("the test receives workers");
-        async move { Ok(async move { ended.await.unwrap_or(WorkerExit("dropped by the test".into())) }.boxed()) }.boxed()
+        async move { Ok(async move { ended.await.unwrap_or(WorkerExit::of_worker("dropped by the test")) }.boxed()) }.boxed()
     }
 }
 

@@ -50,7 +50,7 @@ const QUEUE: usize = 1024;
 const HEARTBEAT_INTERVAL: Duration = Duration::from_millis(400);
 
 /// The attempt to work on, and the server to report to.
-#[derive(Clone)]
+#[derive(Clone, serde::Serialize, serde::Deserialize)]
 pub struct Assignment {
     /// Address of the server's gRPC, as `http://127.0.0.1:50051`.
     pub server: String,
@@ -60,6 +60,21 @@ pub struct Assignment {
     pub attempt: String,
     /// The attempt's secret.
     pub token: String,
+}
+
+impl Assignment {
+    /// The assignment as JSON.
+    pub fn to_json(&self) -> String {
+        serde_json::to_string(self).expect("texts are plain data")
+    }
+
+    /// The assignment that [`Assignment::to_json`] wrote.
+    ///
+    /// # Errors
+    /// [`ClientError::Assignment`] for another text.
+    pub fn from_json(text: &str) -> Result<Self, ClientError> {
+        serde_json::from_str(text).map_err(|error| ClientError::Assignment(error.to_string()))
+    }
 }
 
 /// Why a worker failed.

@@ -30,7 +30,7 @@ pub struct JobView {
 /// Why a queued job has not started.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Waiting {
-    /// In words: `comes after 1 job that has not succeeded`, or `needs 2 threads, 1 free; 3 jobs before it`.
+    /// In words: `comes after 1 job that has not succeeded`, `needs 2 threads, 1 free; 3 jobs before it`, or what a cluster says.
     pub reason: String,
     /// Threads that the job needs.
     pub threads: usize,
@@ -100,7 +100,8 @@ async fn waiting(app: &App, jobs: impl Iterator<Item = &Job>) -> Result<BTreeMap
     let waiting = |job: &&Job| {
         let before = before.get(&job.row_id).copied().unwrap_or_default();
         let not_before = job.not_before.filter(|time| *time > now);
-        (job.row_id, Waiting::new(job.blocked, not_before, job.spec.threads.min(budget), free, before))
+        let waiting = Waiting::new(job.blocked, not_before, job.spec.threads.min(budget), free, before);
+        (job.row_id, app.scheduler.waiting(job.row_id).map_or(waiting.clone(), |reason| Waiting { reason, ..waiting }))
     };
     Ok(queued.iter().map(waiting).collect())
 }
