@@ -74,9 +74,10 @@ SwitchType=switch/none
 MpiDefault=none
 ReturnToService=2
 SlurmdTimeout=300
+SlurmdParameters=config_overrides
 KillWait=5
 SchedulerParameters=sched_interval=1
-NodeName={host} NodeAddr=127.0.0.1 CPUs={os.cpu_count()} RealMemory=1000000
+NodeName={host} NodeAddr=127.0.0.1 CPUs=2 RealMemory=1000000
 PartitionName=main Nodes={host} Default=YES MaxTime=INFINITE State=UP
 """
         )
@@ -151,7 +152,7 @@ class Server:
         training = {"steps": steps, "envs": 4, "batch": 8, "buffer": 60, "eval_every": steps, "eval_episodes": 4}
         environment = {"uavs": 2, "users": 3, "slots": 20}
         config = {"algorithm": "vdn", "preset": "practical", "seed": 7, "environment": environment, "training": training}
-        return self.call("POST", "/v1/jobs", {"name": name, "threads": 1, "config": config})["id"]
+        return self.call("POST", "/v1/jobs", {"name": name, "threads": 1, **config})["id"]
 
     def job(self, job: str) -> dict:
         return self.call("GET", f"/v1/jobs/{job}")
@@ -216,7 +217,7 @@ def follow(cluster: Cluster, server: Server, steps: int, expected: str) -> None:
     until("its worker is found again", lambda: "PENDING" in (server.job(job).get("waiting") or {}).get("reason", ""))
     reason = server.job(job)["waiting"]["reason"]
     assert len(cluster.workers("PENDING")) == 1
-    cancelled = server.submit("cancelled before it runs", steps)
+    cancelled = server.submit("cancelled-early", steps)
     until("both wait in Slurm", lambda: len(cluster.workers("PENDING")) == 2)
     server.call("POST", f"/v1/jobs/{cancelled}/cancel")
     assert server.job(cancelled)["state"] == "cancelled"
