@@ -149,7 +149,7 @@ class Server:
             raise AssertionError(f"{method} {path}: {error.code} {error.read().decode()}") from error
 
     def submit(self, name: str, steps: int) -> str:
-        training = {"steps": steps, "envs": 4, "batch": 8, "buffer": 60, "eval_every": steps, "eval_episodes": 4}
+        training = {"steps": steps, "envs": 4, "batch": 8, "buffer": 60, "eval_every": 6000, "eval_episodes": 4}
         environment = {"uavs": 2, "users": 3, "slots": 20}
         config = {"algorithm": "vdn", "preset": "practical", "seed": 7, "environment": environment, "training": training}
         return self.call("POST", "/v1/jobs", {"name": name, "threads": 1, **config})["id"]

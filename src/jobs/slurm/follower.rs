@@ -51,9 +51,10 @@ impl Follower {
         Self { known_at: now, patience: if sure { PATIENCE } else { UNSURE_PATIENCE }, ran: false }
     }
 
-    /// The verdict at `now`. `called`: the worker has called the server.
-    pub(super) fn observe(&mut self, now: Duration, seen: &Seen, called: bool) -> Verdict {
-        let started = self.ran || called;
+    /// The verdict at `now`. `called`: the worker has called the server; `called_before`: before Slurm was asked. A list that is older
+    /// than the first call can say that the job waits.
+    pub(super) fn observe(&mut self, now: Duration, seen: &Seen, called: bool, called_before: bool) -> Verdict {
+        let started = self.ran || called_before;
         match seen {
             Seen::Listed(job) => {
                 (self.known_at, self.patience) = (now, PATIENCE);
@@ -71,7 +72,7 @@ impl Follower {
                     Phase::Ended(Ending::OfJob) => Verdict::Ended(WorkerExit::of_worker(job.to_string())),
                 }
             }
-            _ if started => Verdict::Running,
+            _ if started || called => Verdict::Running,
             Seen::Unknown(reason) => {
                 self.known_at = now;
                 Verdict::Waiting(format!("Slurm does not answer: {reason}"))
@@ -96,7 +97,7 @@ mod tests {
 
     /// A letter for each verdict: waiting, running, ended by the worker, ended by the host.
     fn verdicts(follower: &mut Follower, seen: &[(u64, Seen, bool)]) -> String {
-        let letter = |(at, seen, called): &(u64, Seen, bool)| match follower.observe(Duration::from_secs(*at), seen, *called) {
+        let letter = |(at, seen, called): &(u64, Seen, bool)| match follower.observe(Duration::from_secs(*at), seen, *called, *called) {
             Verdict::Waiting(_) => 'w',
             Verdict::Running => 'r',
             Verdict::Ended(exit) if exit.by_host => 'h',
@@ -130,6 +131,14 @@ mod tests {
         assert_eq!(after(&[(1, listed("RUNNING", 0), true), (2, listed("PREEMPTED+REQUEUED", 0), true)]), "rh");
         // A job that is suspended goes on later.
         assert_eq!(after(&[(1, listed("RUNNING", 0), true), (2, listed("SUSPENDED", 0), true)]), "rw");
+    }
+
+    #[test]
+    fn a_list_that_is_older_than_the_first_call_ends_nothing() {
+        let mut follower = Follower::new(Duration::ZERO, true);
+        let mut verdict = |called_before| follower.observe(Duration::from_secs(1), &listed("PENDING", 0), true, called_before);
+        assert!(matches!(verdict(false), Verdict::Waiting(_)));
+        assert!(matches!(verdict(true), Verdict::Ended(exit) if exit.by_host));
     }
 
     #[test]

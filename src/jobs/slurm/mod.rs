@@ -49,7 +49,7 @@ struct Inner {
     program: PathBuf,
     directory: PathBuf,
     commands: Commands,
-    /// The last list of all jobs, and when it was made.
+    /// The last list of all jobs, and when Slurm was asked for it.
     listed: Mutex<Option<(Instant, Listing)>>,
 }
 
@@ -102,12 +102,21 @@ impl Slurm {
         let mut follower = Follower::new(Duration::ZERO, !launch.started_before);
         let mut output = Output { path: files.output.clone(), read: 0 };
         let mut accounting = Accounting::default();
+        let mut called_at = None;
         let exit = loop {
-            let seen = tokio::select! {
+            if launch.status.began().is_some() {
+                called_at.get_or_insert_with(Instant::now);
+            }
+            let (seen, asked_at) = tokio::select! {
                 seen = self.find(&launch.name, &mut accounting) => seen,
                 () = launch.kill.cancelled() => break self.kill(&launch.name).await,
             };
-            match follower.observe(begin.elapsed(), &seen, launch.status.began().is_some()) {
+            match follower.observe(
+                begin.elapsed(),
+                &seen,
+                launch.status.began().is_some(),
+                called_at.is_some_and(|at| at < asked_at),
+            ) {
                 Verdict::Waiting(reason) => launch.status.set_waiting(Some(reason)),
                 Verdict::Running => launch.status.set_waiting(None),
                 Verdict::Ended(exit) => {
@@ -129,16 +138,17 @@ impl Slurm {
         exit
     }
 
-    /// What Slurm says about the job `name`.
-    async fn find(&self, name: &str, accounting: &mut Accounting) -> Seen {
-        let listing = self.list().await;
-        match &*listing {
+    /// What Slurm says about the job `name`, and when it was asked.
+    async fn find(&self, name: &str, accounting: &mut Accounting) -> (Seen, Instant) {
+        let (asked_at, listing) = self.list().await;
+        let seen = match &*listing {
             Err(reason) => Seen::Unknown(reason.clone()),
             Ok(jobs) => match newest(jobs, name) {
                 Some(job) => Seen::Listed(job.clone()),
                 None => self.find_ended(name, accounting).await.map_or(Seen::Missing, Seen::Listed),
             },
-        }
+        };
+        (seen, asked_at)
     }
 
     /// The job `name` in the accounting, which is asked rarely, and may be missing or broken.
@@ -165,20 +175,21 @@ impl Slurm {
     }
 
     /// All jobs of this user, at most as old as [`LIST_INTERVAL`]. Followers share one command.
-    async fn list(&self) -> Listing {
+    async fn list(&self) -> (Instant, Listing) {
         let mut listed = self.0.listed.lock().await;
         let [fresh, after_error] = LIST_INTERVAL;
         if let Some((at, listing)) = &*listed
             && at.elapsed() < if listing.is_ok() { fresh } else { after_error }
         {
-            return listing.clone();
+            return (*at, listing.clone());
         }
+        let asked_at = Instant::now();
         let listing = Arc::new(self.ask().await);
         if let Err(reason) = &*listing {
             tracing::warn!(reason, "the jobs of Slurm cannot be listed; trying again");
         }
-        *listed = Some((Instant::now(), listing.clone()));
-        listing
+        *listed = Some((asked_at, listing.clone()));
+        (asked_at, listing)
     }
 
     /// Asks Slurm for all jobs of this user, also those that ended a short time ago.
