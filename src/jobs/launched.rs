@@ -23,10 +23,12 @@ const BASE_MEMORY: u64 = 512 << 20;
 
 /// What a worker of a job needs.
 pub(super) fn resources(job: &Job, threads: usize) -> Resources {
-    let config = job.spec.decode().ok().and_then(|spec| spec.config);
-    let needed = config.map_or(BASE_MEMORY, |config| MemoryEstimate::of(&config, threads).total());
+    let spec = job.spec.decode().ok();
+    let limit = spec.as_ref().and_then(|spec| spec.limits.memory);
+    let needed = spec.and_then(|spec| spec.config).map_or(0, |config| MemoryEstimate::of(&config, threads).total());
     // The estimate counts the large arrays only. A snapshot is a copy of the replay.
-    Resources { threads, memory: needed.saturating_mul(2).saturating_add(BASE_MEMORY) }
+    let memory = limit.unwrap_or(needed.saturating_mul(2)).saturating_add(BASE_MEMORY);
+    Resources { threads, memory }
 }
 
 /// A launch that is not sent yet.
