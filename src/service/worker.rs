@@ -14,8 +14,8 @@ use crate::jobs::worker::RivalComparison;
 use crate::jobs::{Directive, equal_secrets, token_digest};
 use crate::policy::baselines;
 use crate::store::{
-    EarlyStop, EndedAttempt, InitKind, Job, JobId, Lease, LeaseRecord, Metric, NewCheckpoint, PartialSnapshot, PublishRule, Snapshot,
-    WorkerResult, is_metric_name,
+    EarlyStop, EndedAttempt, InitKind, Job, JobId, Lease, LeaseRecord, Metric, NewCheckpoint, PartialSnapshot, PublishRule,
+    Snapshot, WorkerResult, is_metric_name,
 };
 use crate::train_config::TrainConfig;
 

@@ -97,12 +97,13 @@ mod tests {
 
     /// A letter for each verdict: waiting, running, ended by the worker, ended by the host.
     fn verdicts(follower: &mut Follower, seen: &[(u64, Seen, bool)]) -> String {
-        let letter = |(at, seen, called): &(u64, Seen, bool)| match follower.observe(Duration::from_secs(*at), seen, *called, *called) {
-            Verdict::Waiting(_) => 'w',
-            Verdict::Running => 'r',
-            Verdict::Ended(exit) if exit.by_host => 'h',
-            Verdict::Ended(_) => 'e',
-        };
+        let letter =
+            |(at, seen, called): &(u64, Seen, bool)| match follower.observe(Duration::from_secs(*at), seen, *called, *called) {
+                Verdict::Waiting(_) => 'w',
+                Verdict::Running => 'r',
+                Verdict::Ended(exit) if exit.by_host => 'h',
+                Verdict::Ended(_) => 'e',
+            };
         seen.iter().map(letter).collect()
     }
 
@@ -143,7 +144,10 @@ mod tests {
 
     #[test]
     fn a_job_may_be_missing_for_minutes() {
-        assert_eq!(after(&[(1, listed("PENDING", 0), false), (500, Seen::Missing, false), (501, listed("RUNNING", 0), false)]), "wwr");
+        assert_eq!(
+            after(&[(1, listed("PENDING", 0), false), (500, Seen::Missing, false), (501, listed("RUNNING", 0), false)]),
+            "wwr"
+        );
         assert_eq!(after(&[(1, listed("PENDING", 0), false), (602, Seen::Missing, false)]), "wh");
         // Calls of the worker say more than the list.
         assert_eq!(after(&[(1, listed("PENDING", 0), false), (9999, Seen::Missing, true)]), "wr");

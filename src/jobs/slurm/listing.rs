@@ -255,7 +255,8 @@ mod tests {
             ("Slurm job 1 is RUNNING on vm", Phase::Running),
         ];
         assert_eq!(described(&from_squeue_text(squeue)), expected.map(|(text, phase)| (text.to_owned(), phase)));
-        let sacct = "7|qedgix-e|CANCELLED by 1000|0:15|n1\n7.batch|batch|CANCELLED|0:15|n1\n8|qedgix-f|PREEMPTED|0:0|None assigned\n";
+        let sacct =
+            "7|qedgix-e|CANCELLED by 1000|0:15|n1\n7.batch|batch|CANCELLED|0:15|n1\n8|qedgix-f|PREEMPTED|0:0|None assigned\n";
         let expected = [
             ("Slurm job 7 is CANCELLED, signal 15 on n1", Phase::Ended(Ending::OfJob)),
             ("Slurm job 8 is PREEMPTED, exit code 0", Phase::Ended(Ending::OfCluster)),

@@ -207,7 +207,8 @@ impl Slurm {
             Err(CommandError::Failed(..)) => {}
         }
         let columns = ["--noheader", "--format", SQUEUE_FORMAT].map(str::to_owned);
-        let output = self.0.commands.run("squeue", &[&all[..], &columns].concat(), "").await.map_err(|error| error.to_string())?;
+        let output =
+            self.0.commands.run("squeue", &[&all[..], &columns].concat(), "").await.map_err(|error| error.to_string())?;
         Ok(listing::from_squeue_text(&String::from_utf8_lossy(&output)))
     }
 
@@ -232,9 +233,10 @@ impl Slurm {
         loop {
             if self.cancel(name).await {
                 // The shared list may be older than the cancel.
-                let ended = self.ask().await.is_ok_and(|jobs| {
-                    newest(&jobs, name).is_none_or(|job| matches!(job.phase(), Phase::Ended(_)))
-                });
+                let ended = self
+                    .ask()
+                    .await
+                    .is_ok_and(|jobs| newest(&jobs, name).is_none_or(|job| matches!(job.phase(), Phase::Ended(_))));
                 if ended {
                     return WorkerExit::of_worker("cancelled in Slurm");
                 }

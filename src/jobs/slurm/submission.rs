@@ -25,8 +25,27 @@ pub struct SlurmConfig {
 
 /// Flags of `sbatch` that the server sets itself, or that would start several workers for one attempt.
 const OWN_FLAGS: [&str; 21] = [
-    "--array", "-a", "--requeue", "--no-requeue", "--job-name", "-J", "--output", "-o", "--error", "-e", "--input", "-i",
-    "--open-mode", "--export", "--parsable", "--wrap", "--wait", "-W", "--ntasks", "-n", "--test-only",
+    "--array",
+    "-a",
+    "--requeue",
+    "--no-requeue",
+    "--job-name",
+    "-J",
+    "--output",
+    "-o",
+    "--error",
+    "-e",
+    "--input",
+    "-i",
+    "--open-mode",
+    "--export",
+    "--parsable",
+    "--wrap",
+    "--wait",
+    "-W",
+    "--ntasks",
+    "-n",
+    "--test-only",
 ];
 
 impl SlurmConfig {
@@ -113,8 +132,19 @@ mod tests {
         let resources = Resources { threads: 4, memory: (2 << 30) + 1 };
         let arguments = arguments(&config, "qedgix-1-2-ab", resources, Path::new("/share/50%/a.log"));
         let expected = [
-            "--parsable", "--job-name=qedgix-1-2-ab", "--nodes=1", "--ntasks=1", "--cpus-per-task=4", "--mem=2049M", "--no-requeue",
-            "--export=PATH", "--open-mode=append", "--output=/share/50%%/a.log", "--partition=long", "--account=lab", "--time=61",
+            "--parsable",
+            "--job-name=qedgix-1-2-ab",
+            "--nodes=1",
+            "--ntasks=1",
+            "--cpus-per-task=4",
+            "--mem=2049M",
+            "--no-requeue",
+            "--export=PATH",
+            "--open-mode=append",
+            "--output=/share/50%%/a.log",
+            "--partition=long",
+            "--account=lab",
+            "--time=61",
             "--qos=high",
         ];
         assert_eq!(arguments, expected);
