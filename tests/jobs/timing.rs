@@ -26,7 +26,7 @@ impl Executor for Workers {
             if !fail {
                 launch.kill.cancelled().await;
             }
-            WorkerExit("an exit of the test".into())
+            WorkerExit::of_worker("an exit of the test")
         };
         async { Ok(exit.boxed()) }.boxed()
     }
