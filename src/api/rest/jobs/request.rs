@@ -158,13 +158,13 @@ impl From<JobRequest> for spec::JobRequest {
 #[serde(deny_unknown_fields, remote = "Self")]
 pub(super) struct Webhook {
     /// An `http` or `https` URL without user and password.
-    #[schema(max_length = 2000, example = "https://hooks.example/qedgix")]
+    #[schema(max_length = 2000, pattern = "^https?://", example = "https://hooks.example/qedgix")]
     url: String,
     /// The states that are told; default: all three.
     #[schema(schema_with = ends)]
     events: Option<Vec<JobState>>,
     /// Key of the signatures (HMAC-SHA256): Base64 after `whsec_`, or any text. It is never returned. Default: messages are not signed.
-    #[schema(value_type = Option<String>, min_length = 1, max_length = 255, write_only = true)]
+    #[schema(value_type = Option<String>, pattern = "^[!-~]{1,255}$", write_only = true)]
     secret: Option<Secret>,
 }
 
