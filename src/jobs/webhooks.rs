@@ -7,7 +7,7 @@ use url::Url;
 
 use crate::invalid::{Invalid, in_range};
 pub use crate::store::Secret;
-use crate::store::{JobState, Webhook};
+use crate::store::{JobEnd, Webhook};
 
 /// Most webhooks of a job.
 const MAX_WEBHOOKS: usize = 8;
@@ -21,9 +21,9 @@ const MAX_SECRET: usize = 255;
 pub struct WebhookRequest {
     /// The address.
     pub url: String,
-    /// The states that are told; default: all in which a job ends.
+    /// The ends that are told; default: all.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub events: Option<Vec<JobState>>,
+    pub events: Option<Vec<JobEnd>>,
     /// Key of the signatures; default: messages are not signed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub secret: Option<Secret>,
@@ -33,12 +33,12 @@ impl WebhookRequest {
     fn resolve(self, path: &str) -> Result<Webhook, Invalid> {
         let field = |name: &str| format!("{path}.{name}");
         check_url(&field("url"), &self.url)?;
-        let ends = [JobState::Succeeded, JobState::Failed, JobState::Cancelled];
+        let ends = [JobEnd::Succeeded, JobEnd::Failed, JobEnd::Cancelled];
         let events = self.events.unwrap_or_else(|| ends.to_vec());
         in_range(&field("events"), events.len(), 1..=ends.len())?;
         for (i, event) in events.iter().enumerate() {
-            if !event.ended() || events[..i].contains(event) {
-                return Err(Invalid::new(field(&format!("events[{i}]")), event, "succeeded, failed or cancelled, each once"));
+            if events[..i].contains(event) {
+                return Err(Invalid::new(field(&format!("events[{i}]")), event, "succeeded, failed and cancelled, each once"));
             }
         }
         if self.secret.as_ref().is_some_and(|secret| !is_secret(secret)) {
@@ -106,7 +106,6 @@ mod tests {
             (json!({"url": "https://me:hunter2@example.org"}), "url"),
             (json!({"url": format!("https://example.org/{}", "x".repeat(2000))}), "url"),
             (json!({"url": url, "events": []}), "events"),
-            (json!({"url": url, "events": ["running"]}), "events[0]"),
             (json!({"url": url, "events": ["failed", "failed"]}), "events[1]"),
             (json!({"url": url, "secret": ""}), "secret"),
             (json!({"url": url, "secret": "hunter 2"}), "secret"),

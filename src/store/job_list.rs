@@ -135,8 +135,13 @@ impl Store {
         let more = sorted.len() > list.limit;
         sorted.truncate(list.limit);
         let numbers = Value::from(sorted.iter().map(|row| row.0).collect::<Vec<_>>()).to_string();
-        // CROSS JOIN keeps the order of the list without sorting, which would read all documents first.
-        let sql = "SELECT j.* FROM json_each(?) w CROSS JOIN jobs j ON j.number = w.value";
+        // CROSS JOIN keeps the order of the list without sorting, which would read all documents first. The results of jobs, which
+        // may be large, are not read.
+        let sql = "SELECT j.number, j.id, j.owner, j.any_name, j.state, j.wanted, j.reason, j.notes, j.parent, j.spec, j.kind,
+                   j.name, j.labels, j.threads, j.priority, j.algorithm, j.preset, j.seed, j.steps, j.attempts, j.failures,
+                   j.consecutive_failures, j.step, j.policy, j.seq, j.blocked, j.not_before, j.ran, j.created_at,
+                   j.started_at, j.ended_at
+                   FROM json_each(?) w CROSS JOIN jobs j ON j.number = w.value";
         let (mut rows, mut jobs, mut bytes) = (sqlx::query_as(sql).bind(numbers).fetch(&mut *db), Vec::new(), 0);
         let mut keys: HashMap<i64, Option<SortKey>> = sorted.into_iter().map(sort_key).collect();
         while let Some(row) = rows.try_next().await? {

@@ -63,7 +63,7 @@ pub use policies::{NewPolicyVersion, PolicyVersion, PublishedPolicy, VersionKey}
 pub use snapshots::{PartialSnapshot, Snapshot};
 pub use specs::{EarlyStop, InitKind, JobInit, JobKind, JobLimits, JobSpec, PublishRule, StoredSpec, UnreadableSpec};
 pub use submission::{Beginning, NewJob, SubmitResult};
-pub use webhooks::{Secret, Webhook, WebhookMessage};
+pub use webhooks::{JobEnd, Secret, Webhook, WebhookMessage};
 pub use writes::WriteFailure;
 
 use std::path::{Path, PathBuf};

@@ -30,7 +30,7 @@ pub(super) async fn transition(db: &mut SqliteConnection, t: Transition<'_>) -> 
     let insert = sqlx::query(sql).bind(t.job).bind(now).bind(state).bind(t.attempt).bind(t.reason).bind(seq);
     insert.execute(&mut *db).await?;
     if t.to.ended() {
-        tell_end(db, t.job, t.to, t.now).await?;
+        tell_end(db, t.job, state, t.now).await?;
     }
     if t.to.ended() && t.to != JobState::Failed {
         sqlx::query("DELETE FROM snapshots WHERE job = ?").bind(t.job).execute(&mut *db).await?;

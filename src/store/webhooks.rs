@@ -7,7 +7,20 @@ use serde_json::{Value, json};
 use sqlx::SqliteConnection;
 use uuid::Uuid;
 
-use super::{JobState, Result, Store, corrupt, timestamp};
+use super::named_enum::named_enum;
+use super::{Result, Store, corrupt, timestamp};
+
+named_enum! {
+    /// How a job ends.
+    JobEnd {
+        /// All steps are done.
+        Succeeded = "succeeded",
+        /// Too many attempts failed.
+        Failed = "failed",
+        /// A caller cancelled it.
+        Cancelled = "cancelled",
+    }
+}
 
 /// Text that `Debug` hides.
 #[derive(Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -32,8 +45,8 @@ impl std::fmt::Debug for Secret {
 pub struct Webhook {
     /// The address.
     pub url: String,
-    /// The states that are told.
-    pub events: Vec<JobState>,
+    /// The ends that are told.
+    pub events: Vec<JobEnd>,
     /// Whether messages are signed.
     pub signed: bool,
     /// Key of the signatures. It is in the table of webhooks only, not in the document of the job.
@@ -86,10 +99,10 @@ pub(super) async fn insert_webhooks(db: &mut SqliteConnection, job: i64, webhook
     Ok(())
 }
 
-/// Writes the messages about the end of a job.
-pub(super) async fn tell_end(db: &mut SqliteConnection, job: i64, state: JobState, now: Timestamp) -> Result<()> {
+/// Writes the messages about the end of a job, which is in the state `state` now.
+pub(super) async fn tell_end(db: &mut SqliteConnection, job: i64, state: &str, now: Timestamp) -> Result<()> {
     let sql = "SELECT w.url, w.secret FROM webhooks w, json_each(w.events) e WHERE w.job = ? AND e.value = ? ORDER BY w.place";
-    let webhooks: Vec<(String, Option<String>)> = sqlx::query_as(sql).bind(job).bind(state.as_str()).fetch_all(&mut *db).await?;
+    let webhooks: Vec<(String, Option<String>)> = sqlx::query_as(sql).bind(job).bind(state).fetch_all(&mut *db).await?;
     if webhooks.is_empty() {
         return Ok(());
     }
@@ -149,7 +162,8 @@ impl Store {
     /// [`Error`](super::Error) when the database fails.
     pub async fn hurry_webhook_messages(&self, now: Timestamp) -> Result<()> {
         let mut tx = self.begin().await?;
-        sqlx::query("UPDATE webhook_messages SET next_at = min(next_at, ?)").bind(now.as_millisecond()).execute(&mut *tx).await?;
+        let sql = "UPDATE webhook_messages SET next_at = ?1 WHERE next_at > ?1";
+        sqlx::query(sql).bind(now.as_millisecond()).execute(&mut *tx).await?;
         tx.commit().await
     }
 

@@ -204,7 +204,7 @@ async fn receivers_are_public_or_permitted() {
     {
         assert_eq!(refused(json!({"url": url})).await, "webhooks[0].url", "{url}");
     }
-    assert_eq!(refused(json!({"url": "http://127.0.0.1", "events": ["running"]})).await, "webhooks[0].events[0]");
+    assert_eq!(refused(json!({"url": "http://127.0.0.1", "events": ["failed", "failed"]})).await, "webhooks[0].events[1]");
     // A name is looked up when the message is sent; then the job has ended, and only the message fails.
     server.submit(&with(&json!({"webhooks": [{"url": "https://hooks.invalid/"}]}))).await;
 }

@@ -17,7 +17,7 @@ use crate::jobs::spec;
 use crate::jobs::sweep::{self, SweepRequest};
 use crate::jobs::webhooks::WebhookRequest;
 use crate::learner;
-use crate::store::{self, JobKind, JobState, Secret};
+use crate::store::{self, JobEnd, JobKind, Secret};
 use crate::train_config::{Algorithm, Preset};
 
 /// A job to submit. All fields are optional.
@@ -160,9 +160,9 @@ pub(super) struct Webhook {
     /// An `http` or `https` URL without user and password.
     #[schema(max_length = 2000, pattern = "^https?://", example = "https://hooks.example/qedgix")]
     url: String,
-    /// The states that are told; default: all three.
-    #[schema(schema_with = ends)]
-    events: Option<Vec<JobState>>,
+    /// The ends that are told; default: all three.
+    #[schema(schema_with = optional_ends)]
+    events: Option<Vec<JobEnd>>,
     /// Key of the signatures (HMAC-SHA256): Base64 after `whsec_`, or any text. It is never returned. Default: messages are not signed.
     #[schema(value_type = Option<String>, pattern = "^[!-~]{1,255}$", write_only = true)]
     secret: Option<Secret>,
@@ -176,10 +176,14 @@ impl From<Webhook> for WebhookRequest {
     }
 }
 
-/// States in which jobs end, each once.
-fn ends() -> RefOr<Schema> {
-    let states = [JobState::Succeeded, JobState::Failed, JobState::Cancelled];
-    schema(json!({"type": ["array", "null"], "items": {"type": "string", "enum": states}, "minItems": 1, "uniqueItems": true}))
+/// How jobs end, each once.
+pub(super) fn ends() -> RefOr<Schema> {
+    schema(json!({"type": "array", "items": {"type": "string", "enum": JobEnd::NAMES}, "minItems": 1, "uniqueItems": true}))
+}
+
+fn optional_ends() -> RefOr<Schema> {
+    let items = json!({"type": "string", "enum": JobEnd::NAMES});
+    schema(json!({"type": ["array", "null"], "items": items, "minItems": 1, "uniqueItems": true}))
 }
 
 /// Weights that training begins with: exactly one of `policy` and `checkpoint`. The agents must have the same architecture. The

@@ -8,11 +8,11 @@ use serde_json::Value;
 use utoipa::ToSchema;
 use uuid::Uuid;
 
-use super::request::{EarlyStop, optional_kind};
+use super::request::{EarlyStop, ends, optional_kind};
 use crate::env::EnvConfig;
 use crate::service::jobs::{self, JobView};
 use crate::service::progress;
-use crate::store::{self, AttemptOutcome, CheckpointKind, InitKind, JobId, JobState, PendingAction, StoredSpec};
+use crate::store::{self, AttemptOutcome, CheckpointKind, InitKind, JobEnd, JobId, JobState, PendingAction, StoredSpec};
 use crate::train_config::{Algorithm, Preset, Training};
 
 /// A job without its environment and its training configuration.
@@ -200,8 +200,9 @@ pub(super) struct Job {
 #[schema(as = StoredWebhook)]
 pub(super) struct Webhook {
     url: String,
-    /// The states that are told.
-    events: Vec<JobState>,
+    /// The ends that are told.
+    #[schema(schema_with = ends)]
+    events: Vec<JobEnd>,
     /// Whether messages are signed. The secret is never returned.
     signed: bool,
 }
