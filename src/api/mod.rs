@@ -4,6 +4,7 @@ pub mod access;
 mod auth;
 pub mod body;
 mod browser;
+mod compression;
 mod config_schemas;
 pub mod convert;
 mod errors;

@@ -21,6 +21,7 @@ mod reference;
 mod registry;
 mod roster;
 mod sessions;
+mod statistics;
 mod table;
 
 pub use engine::{Decision, Engine, EngineConfig, NamedInfluence, OutputBuffers, Task, TaskOutput, Timings};
@@ -47,4 +48,5 @@ pub use registry::{
 };
 pub use roster::{FleetChange, Roster, RosterRules, UserMemory};
 pub use sessions::{Listed, PendingStep, Session, SessionInfo, SessionOptions, Sessions, StepStart};
+pub use statistics::{ComputeCounts, ComputeTimes, Statistics, StatisticsTable, TimedCount, VersionStatistics};
 pub use table::{LastUse, Limits, Table, TableEntry};

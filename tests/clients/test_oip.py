@@ -1,11 +1,16 @@
 """The Open Inference Protocol with Triton's own clients, and actions that are those of Act."""
 
+import gzip
 import queue
+import zlib
 
+import grpc
+import httpx
 import numpy as np
 import pytest
 import tritonclient.grpc as triton_grpc
 import tritonclient.http as triton_http
+from google.protobuf.json_format import MessageToDict
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 from world import GRPC, HTTP, Slot, act_headings, rest
 
@@ -298,3 +303,193 @@ def test_models_are_unloaded_and_loaded(client):
         with pytest.raises(InferenceServerException, match='no model "nobody"'):
             call("nobody")
     way.close()
+
+
+def statistics(client, *model):
+    """The statistics of a client as nested dictionaries with whole numbers, by name and version."""
+    told = client.get_inference_statistics(*model)
+    if not isinstance(told, dict):
+        told = MessageToDict(told, preserving_proto_field_name=True)
+
+    def as_numbers(value):
+        if isinstance(value, dict):
+            return {key: as_numbers(inner) if key != "name" else inner for key, inner in value.items()}
+        if isinstance(value, list):
+            return [as_numbers(inner) for inner in value]
+        return int(value) if isinstance(value, str) and value.isdigit() else value
+
+    return {(model["name"], model["version"]): model for model in as_numbers(told)["model_stats"]}
+
+
+def test_statistics_count_what_was_computed(client):
+    way = OverGrpc()
+    before = statistics(client, "max-aoi").get(("max-aoi", 1), {})
+    for step, slot in enumerate(SLOTS):
+        way.infer("max-aoi", slot.scene_tensors(), **flags(step, len(SLOTS) - 1, 301))
+    with pytest.raises(InferenceServerException):
+        way.infer("max-aoi", {"user_aoi": SLOTS[0].aoi})
+    rest("/v1/act", {"policy": "max-aoi", "scene": SLOTS[0].scene()})
+    after = statistics(client, "max-aoi", "1")["max-aoi", 1]
+    # Every protocol counts; a request that does not become a slot of a fleet does not.
+    count = len(SLOTS) + 1
+    grown = lambda *path: pick(after, path) - pick(before, path)
+    assert grown("inference_count") == count
+    assert 1 <= grown("execution_count") <= count
+    for name in ("success", "queue", "compute_input", "compute_infer", "compute_output"):
+        assert grown("inference_stats", name, "count") == count, name
+    assert grown("inference_stats", "success", "ns") >= grown("inference_stats", "compute_infer", "ns") > 0
+    assert grown("inference_stats", "fail", "count") == 0
+    batches = lambda told: sum(pick(batch, ["compute_infer", "count"]) for batch in told.get("batch_stats", []))
+    assert batches(after) - batches(before) == grown("execution_count")
+    assert after["last_inference"] > 1_700_000_000_000
+    everything = statistics(client)
+    assert everything["max-aoi", 1]["inference_count"] >= after["inference_count"]
+    assert ("qedgix", 1) in everything
+    for unknown in (("nobody",), ("max-aoi", "9")):
+        with pytest.raises(InferenceServerException, match="no model"):
+            client.get_inference_statistics(*unknown)
+    way.close()
+
+
+def pick(told, path):
+    """A number in nested dictionaries, in which protocol buffers leave out zeros."""
+    for name in path:
+        told = told.get(name, {})
+    return told or 0
+
+
+def test_settings_are_told_and_not_changed(client):
+    traces, logs = client.get_trace_settings(), client.get_log_settings()
+    if not isinstance(traces, dict):
+        traces = {name: list(setting.value) for name, setting in traces.settings.items()}
+        logs = {name: getattr(s, s.WhichOneof("parameter_choice")) for name, s in logs.settings.items()}
+    assert traces["trace_level"] == ["OFF"]
+    assert logs["log_error"] is True and logs["log_file"] == ""
+    assert client.get_trace_settings("qedgix") == client.get_trace_settings()
+    # What is so already, and the default.
+    client.update_trace_settings(settings={"trace_level": ["OFF"], "trace_file": None})
+    client.update_log_settings({"log_error": True, "log_verbose_level": logs["log_verbose_level"], "log_file": None})
+    with pytest.raises(InferenceServerException, match="settings.trace_level: "):
+        client.update_trace_settings(settings={"trace_level": ["TIMESTAMPS"]})
+    with pytest.raises(InferenceServerException, match="settings: .*trace_colour"):
+        client.update_trace_settings(settings={"trace_colour": "red"})
+    with pytest.raises(InferenceServerException, match="no model"):
+        client.update_trace_settings("nobody", settings={"trace_level": ["OFF"]})
+    with pytest.raises(InferenceServerException, match="settings.log_error: "):
+        client.update_log_settings({"log_error": False})
+    with pytest.raises(InferenceServerException, match="settings.log_file: "):
+        client.update_log_settings({"log_file": "/tmp/server.log"})
+
+
+def test_there_is_no_shared_memory(client):
+    for kind, arguments in (("system", ("/key", 64)), ("cuda", (b"aGFuZGxl", 0, 64))):
+        status = getattr(client, f"get_{kind}_shared_memory_status")
+        regions = status()
+        assert not (regions if isinstance(regions, list) else regions.regions)
+        with pytest.raises(InferenceServerException, match='no region of shared memory "mine"'):
+            status("mine")
+        with pytest.raises(InferenceServerException, match="name: .*not supported"):
+            getattr(client, f"register_{kind}_shared_memory")("mine", *arguments)
+        # Tools begin with this.
+        getattr(client, f"unregister_{kind}_shared_memory")()
+
+
+@pytest.mark.parametrize("encoding", ["gzip", "deflate"])
+def test_compressed_requests_are_answered_alike(encoding):
+    slot = Slot(12, uavs=40, users=200)
+    plain = OverHttp().infer("sweep", slot.scene_tensors())
+    over_grpc = OverGrpc()
+    over_http = OverHttp()
+    algorithms = {"request_compression_algorithm": encoding, "response_compression_algorithm": encoding}
+    answers = [
+        over_grpc.infer("sweep", slot.scene_tensors(), compression_algorithm=encoding),
+        over_http.infer("sweep", slot.scene_tensors(), **algorithms),
+        OverJson().infer("sweep", slot.scene_tensors(), **algorithms),
+    ]
+    for answer in answers:
+        assert headings(answer) == headings(plain)
+    assert answers[1].get_response()["model_name"] == "sweep"
+    stream = triton_grpc.InferenceServerClient(GRPC)
+    received = queue.Queue()
+    stream.start_stream(lambda result, error: received.put((result, error)), compression_algorithm=encoding)
+    for _ in range(3):
+        stream.async_stream_infer("sweep", over_grpc.inputs(slot.scene_tensors()))
+    for _ in range(3):
+        result, error = received.get(timeout=60)
+        assert error is None and headings(result) == headings(plain)
+    stream.stop_stream()
+
+
+def test_what_inflates_beyond_the_limit_is_refused():
+    # 24 MiB of spaces in 24 KiB.
+    bomb = {"gzip": gzip.compress(b" " * (24 << 20)), "deflate": zlib.compress(b" " * (24 << 20))}
+    for encoding, body in bomb.items():
+        headers = {"content-encoding": encoding, "content-type": "application/json"}
+        answer = httpx.post(f"http://{HTTP}/v2/models/sweep/infer", content=body, headers=headers)
+        assert (answer.status_code, answer.json()["code"]) == (413, "too_large")
+        # Other routes, and other encodings, take no compressed bodies.
+        assert httpx.post(f"http://{HTTP}/v1/act", content=body, headers=headers).status_code == 415
+    headers = {"content-encoding": "br", "content-type": "application/json"}
+    assert httpx.post(f"http://{HTTP}/v2/models/sweep/infer", content=b"x", headers=headers).status_code == 415
+    headers = {"content-encoding": "gzip", "content-type": "application/json"}
+    answer = httpx.post(f"http://{HTTP}/v2/models/sweep/infer", content=b"not gzip", headers=headers)
+    assert (answer.status_code, answer.json()["code"], answer.json()["field"]) == (400, "invalid_argument", "body")
+    with grpc.insecure_channel(GRPC) as channel:
+        for algorithm in (grpc.Compression.Gzip, grpc.Compression.Deflate):
+            call = channel.unary_unary("/inference.GRPCInferenceService/ModelInfer")
+            with pytest.raises(grpc.RpcError) as refused:
+                call(b"\x0a\x00" * (12 << 20), timeout=60, compression=algorithm)
+            assert refused.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+            call = channel.unary_unary("/qedgix.v1.PolicyService/Act")
+            with pytest.raises(grpc.RpcError) as refused:
+                call(b"\x0a\x00" * 1000, timeout=60, compression=algorithm)
+            assert refused.value.code() == grpc.StatusCode.UNIMPLEMENTED
+
+
+SEQUENCES = 48
+LOADED = [Slot(100 + step, uavs=4, users=9) for step in range(6)]
+
+
+def loaded(sequence, step):
+    """Arguments of one request of the load."""
+    return {"request_id": f"{sequence}/{step}", "parameters": {"step": step, "seed": 7} if step == 0 else {"step": step}}
+
+
+def test_load_over_grpc_as_perf_analyzer_makes_it():
+    expected, _ = act_headings("qedgix", LOADED)
+    way, received = OverGrpc(), queue.Queue()
+    last = len(LOADED) - 1
+    before = statistics(way.client, "qedgix", "1")["qedgix", 1]
+    sent = [way.inputs(slot.scene_tensors()) for slot in LOADED]
+
+    def send(sequence, step):
+        done = lambda result, error: received.put((sequence, step, result, error))
+        more = {**loaded(sequence, step), **flags(step, last, 1000 + sequence)}
+        way.client.async_infer("qedgix", sent[step], done, **more)
+
+    for sequence in range(SEQUENCES):
+        send(sequence, 0)
+    for _ in range(SEQUENCES * len(LOADED)):
+        sequence, step, result, error = received.get(timeout=60)
+        assert error is None, error
+        assert headings(result) == expected[step], f"sequence {sequence}, step {step}"
+        if step < last:
+            send(sequence, step + 1)
+    after = statistics(way.client, "qedgix", "1")["qedgix", 1]
+    assert after["inference_count"] - before.get("inference_count", 0) >= SEQUENCES * len(LOADED)
+    assert after["execution_count"] <= after["inference_count"]
+    way.close()
+
+
+def test_load_over_http_as_perf_analyzer_makes_it():
+    expected, _ = act_headings("qedgix", LOADED)
+    way = OverHttp()
+    client = triton_http.InferenceServerClient(HTTP, concurrency=16)
+    last = len(LOADED) - 1
+    sent = [way.inputs(slot.scene_tensors()) for slot in LOADED]
+    for step in range(len(LOADED)):
+        more = lambda sequence: {**loaded(sequence, step), **flags(step, last, 2000 + sequence)}
+        answers = [client.async_infer("qedgix", sent[step], **more(sequence)) for sequence in range(SEQUENCES)]
+        for sequence, answer in enumerate(answers):
+            assert headings(answer.get_result()) == expected[step], f"sequence {sequence}, step {step}"
+    client.close()

@@ -99,7 +99,11 @@ pub(super) fn with_code(status: &Status) -> Option<Status> {
         // An unknown method has no message.
         Code::Unimplemented if status.message().contains("compressed") => {
             let encoding = status.message().split('`').nth(1).unwrap_or("an encoding");
-            Error::MediaType(Invalid::new("grpc-encoding", encoding, "identity: messages without compression"))
+            Error::MediaType(Invalid::new(
+                "grpc-encoding",
+                encoding,
+                "identity, or for the Open Inference Protocol also gzip or deflate",
+            ))
         }
         _ => return None,
     }))

@@ -15,6 +15,7 @@ use super::worker::MAX_WORKER_MESSAGE;
 use crate::api::access::{Requirement, grpc_requirement};
 use crate::api::request_log::has_debug_span;
 use crate::inflight::Class;
+use crate::wire::oip::grpc_inference_service_server;
 use crate::wire::v1::worker_service_server;
 
 /// Maximum size of a message of health checks, probes and reflection, and of unknown methods.
@@ -47,6 +48,8 @@ pub(super) struct Method {
     pub(super) debug_span: bool,
     /// Maximum size of a message in bytes.
     pub(super) limit: usize,
+    /// Whether its messages may be compressed.
+    pub(super) compressed: bool,
     /// Which part of the budget of bytes in flight its calls use.
     pub(super) class: Class,
     metrics: OnceLock<MethodMetrics>,
@@ -73,7 +76,8 @@ impl Method {
             _ if is_open || service.starts_with("grpc.reflection.") => MAX_SMALL_MESSAGE,
             _ => max_message,
         };
-        Self { path, streams, debug_span, limit, class, metrics: OnceLock::new(), completed: Default::default() }
+        let compressed = service == grpc_inference_service_server::SERVICE_NAME;
+        Self { path, streams, debug_span, limit, compressed, class, metrics: OnceLock::new(), completed: Default::default() }
     }
 
     fn labels(&self) -> [(&'static str, String); 3] {

@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Instant;
 
-use axum::http::{Request, Response};
+use axum::http::{HeaderMap, Request, Response};
 use pin_project_lite::pin_project;
 use tokio::time::Sleep;
 use tokio_util::sync::CancellationToken;
@@ -21,9 +21,11 @@ use tower::Service;
 
 use super::call::{Call, CallContext, ResponseBody, with_code};
 use super::deadline::{Deadline, read_deadline};
+use super::inflated_body::InflatedBody;
 use super::metrics::Methods;
 use super::request_body::RequestBody;
 use crate::api::body::{Exchange, IncomingBody};
+use crate::api::compression::Encoding;
 use crate::api::is_probe;
 use crate::api::request_log::{LogLimiter, REQUEST_ID, RequestIds, span};
 use crate::inflight::Exhausted;
@@ -57,7 +59,7 @@ where
     }
 
     fn call(&mut self, request: Request<IncomingBody>) -> Self::Future {
-        let request = read_deadline(request);
+        let mut request = read_deadline(request);
         let deadline = request.extensions().get::<Deadline>().map(|deadline| deadline.0);
         let number = self.context.methods.find(request.uri().path());
         let method = self.context.methods.get(number);
@@ -75,13 +77,30 @@ where
         } else {
             exchange.holding.admit(method.class)
         };
+        let encoding = if method.compressed { take_encoding(request.headers_mut()) } else { None };
         let work = admitted.is_ok().then(|| {
-            let request = request.map(|body| Body::new(RequestBody::new(body, self.context.clone(), number)));
+            let request = request.map(|body| {
+                let body = RequestBody::new(body, self.context.clone(), number, encoding.is_some());
+                match encoding {
+                    None => Body::new(body),
+                    Some(encoding) => Body::new(InflatedBody::new(body, exchange.clone(), encoding, method.limit)),
+                }
+            });
             call.span().in_scope(|| self.inner.call(request))
         });
         ResponseFuture { work, deadline, sleep: None, call: Some(call), exchange }
     }
 }
+
+/// Removes the encoding of compressed messages from the headers, because they are inflated before tonic sees them. Leaves encodings
+/// that are not supported, which tonic refuses.
+fn take_encoding(headers: &mut HeaderMap) -> Option<Encoding> {
+    let encoding = Encoding::parse(headers.get(ENCODING)?.to_str().ok()?)?;
+    headers.remove(ENCODING);
+    Some(encoding)
+}
+
+const ENCODING: &str = "grpc-encoding";
 
 pin_project! {
     /// The head of the response to a call, or the error if the deadline passes first.

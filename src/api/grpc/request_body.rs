@@ -40,14 +40,14 @@ pub(super) struct RequestBody {
 }
 
 impl RequestBody {
-    /// The body of a call of method number `method`.
-    pub(super) fn new(body: IncomingBody, context: Arc<CallContext>, method: usize) -> Self {
+    /// The body of a call of method number `method`. `compressed`: its messages may be compressed.
+    pub(super) fn new(body: IncomingBody, context: Arc<CallContext>, method: usize, compressed: bool) -> Self {
         let is_stream = context.methods.get(method).streams.client;
         if is_stream {
             body.exchange().between_parts();
         }
         let closing = is_stream.then(|| Box::pin(context.closing.clone().cancelled_owned()));
-        let framing = Framing { limit: context.methods.get(method).limit, ..Framing::default() };
+        let framing = Framing { limit: context.methods.get(method).limit, compressed, ..Framing::default() };
         let (partial, ready) = Default::default();
         Self { body, context, method, framing, partial, ready, messages: 0, ended: false, closing, timed: false, handed_over: 0 }
     }
@@ -149,13 +149,15 @@ fn incomplete(reason: &dyn std::fmt::Display) -> Error {
 }
 
 /// Length of the head of a message: a flag for compression, and the length of the message in 4 bytes.
-const HEAD: usize = 5;
+pub(super) const HEAD: usize = 5;
 
 /// Finds the borders of messages.
 #[derive(Debug, Default)]
 struct Framing {
     /// Maximum size of a message in bytes.
     limit: usize,
+    /// Whether messages may be compressed.
+    compressed: bool,
     head: [u8; HEAD],
     /// Bytes of the head that have arrived.
     have: usize,
@@ -205,6 +207,7 @@ impl Framing {
         let [flag, length @ ..] = self.head;
         match flag {
             0 => {}
+            1 if self.compressed => {}
             1 => {
                 let expected = "a message without compression (grpc-encoding: identity)";
                 return Err(Error::MediaType(Invalid::new("message", "a compressed message", expected)));

@@ -4,6 +4,9 @@
 mod model;
 mod outputs;
 mod parameters;
+mod settings;
+pub mod shared_memory;
+mod statistics;
 
 use std::time::Instant;
 
@@ -13,6 +16,8 @@ use bytes::Bytes;
 
 pub use model::{Model, config_type, describe, index, is_ready, load, state, unload};
 pub use parameters::Parameter;
+pub use settings::{LogSetting, TRACE_SETTINGS, check_log_settings, check_trace_settings, log_settings};
+pub use statistics::statistics;
 
 use self::model::{model_error, policy_spec};
 use self::outputs::OutputSelection;
@@ -28,8 +33,17 @@ pub const NAME: &str = "qedgix";
 /// Version of the server in its metadata.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 /// Supported extensions of the protocol.
-pub const EXTENSIONS: [&str; 6] =
-    ["sequence", "sequence(string_id)", "model_repository", "model_configuration", "binary_tensor_data", "parameters"];
+pub const EXTENSIONS: [&str; 9] = [
+    "sequence",
+    "sequence(string_id)",
+    "model_repository",
+    "model_configuration",
+    "binary_tensor_data",
+    "parameters",
+    "statistics",
+    "trace",
+    "logging",
+];
 /// Input and output with the recurrent state that callers keep.
 const STATE: &str = "recurrent_state";
 

@@ -14,6 +14,7 @@ use futures::StreamExt;
 use serde::de::DeserializeOwned;
 
 use crate::api::body::Exchange;
+use crate::api::compression::{Encoding, Inflater};
 pub use crate::api::json::parse;
 pub use crate::api::media_type::{media_type, unsupported};
 use crate::api::offload;
@@ -66,6 +67,38 @@ fn limit(request: &Request) -> usize {
     request.extensions().get().map_or(4 << 20, |&MaxBody(limit)| limit)
 }
 
+/// A body that may be compressed, inflated.
+#[derive(Debug)]
+pub struct Inflated(pub Bytes);
+
+impl<S: Sync> FromRequest<S> for Inflated {
+    type Rejection = Error;
+
+    async fn from_request(request: Request, _: &S) -> Result<Self, Error> {
+        let limit = limit(&request);
+        let encoding = request.headers().get(header::CONTENT_ENCODING).and_then(|name| Encoding::parse(name.to_str().ok()?));
+        let Some(encoding) = encoding else { return read(request, limit).await.map(Self) };
+        let exchange = request.extensions().get::<Arc<Exchange>>().cloned();
+        let body = read_encoded(request, limit).await?;
+        // A few bytes may inflate to many.
+        offload(true, move || inflate(body, (encoding, limit), exchange.as_deref())).await?.map(Self)
+    }
+}
+
+/// Inflates a body. What it inflates to counts against the budget of bytes in flight.
+fn inflate(body: Bytes, (encoding, limit): (Encoding, usize), exchange: Option<&Exchange>) -> Result<Bytes, Error> {
+    let mut inflater = Inflater::new(encoding, body, &[], limit);
+    loop {
+        let bytes = inflater.step()?;
+        if bytes == 0 {
+            return Ok(inflater.finish().freeze());
+        }
+        if let Some(exchange) = exchange {
+            exchange.holding.grow(bytes)?;
+        }
+    }
+}
+
 /// Reads a body of at most `limit` bytes.
 ///
 /// # Errors
@@ -73,6 +106,11 @@ fn limit(request: &Request) -> usize {
 /// [`Error::Overloaded`] where the budget of bytes in flight has no room for it.
 pub async fn read(request: Request, limit: usize) -> Result<Bytes, Error> {
     check_encoding(request.headers())?;
+    read_encoded(request, limit).await
+}
+
+/// As [`read`], whatever the encoding.
+async fn read_encoded(request: Request, limit: usize) -> Result<Bytes, Error> {
     let too_large =
         || Error::TooLarge { message: format!("the body is larger than the limit of {limit} bytes"), limit: Some(limit as u64) };
     let announced = announced_size(request.headers());

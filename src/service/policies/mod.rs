@@ -10,6 +10,7 @@ mod info;
 mod loading;
 mod promotion;
 mod publish;
+mod statistics;
 mod stored;
 mod upload_limit;
 
@@ -23,6 +24,7 @@ pub(super) use loading::{pinned, resolve};
 pub(super) use promotion::{JobResult, Promotion};
 pub use publish::{CheckpointSource, PublishRequest, Publisher, check_owner, check_publishable, publish, publish_bytes};
 pub(super) use publish::{NewVersion, publish_and_end};
+pub use statistics::{VersionStatistics, statistics};
 pub use upload_limit::{UploadLimit, UploadPermit};
 
 use super::paging::{json_bytes, parse_number};

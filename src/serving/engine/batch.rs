@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
-use super::metrics::{EngineMetrics, PolicyMetrics};
+use super::metrics::EngineMetrics;
 use super::task::{Task, TaskOutput, Timings};
 use crate::policy::FleetStep;
-use crate::serving::{Error, LoadedPolicy, Owner};
+use crate::serving::{ComputeTimes, Error, LoadedPolicy, Owner};
 
 /// What waits in the queue.
 pub(super) struct Queued {
@@ -87,6 +87,8 @@ pub(super) struct TaskBatch {
     pub(super) queued: Vec<Queued>,
     fleets: Vec<Fleet>,
     fleet_steps: Vec<FleetStep<'static>>,
+    /// Time in the queue of each fleet, and whether its caller received the decision.
+    outcomes: Vec<(Duration, bool)>,
 }
 
 /// A fleet of a batch.
@@ -100,7 +102,7 @@ impl TaskBatch {
     /// Computes what was taken from the queue, unless the callers stopped waiting, and replies. Returns the number of fleets computed.
     pub(super) fn run(&mut self, metrics: &EngineMetrics) -> usize {
         let started = Instant::now();
-        let (mut policy, mut failed) = (None, 0);
+        let mut policy = None;
         for Queued { job, since, deadline, .. } in self.queued.drain(..) {
             let late = deadline.is_some_and(|deadline| deadline <= started);
             match job {
@@ -108,13 +110,13 @@ impl TaskBatch {
                 Job::Call(call) if call.is_abandoned() => drop(call),
                 Job::Call(call) => call.run(),
                 Job::Fleet { mut task, reply } => {
-                    let counters = policy.get_or_insert_with(|| task.policy().clone());
-                    debug_assert!(Arc::ptr_eq(counters, task.policy()));
+                    let policy = policy.get_or_insert_with(|| task.policy().clone());
+                    debug_assert!(Arc::ptr_eq(policy, task.policy()));
                     let prepared = if late { Err(Error::Deadline("in the engine's queue")) } else { Ok(()) };
                     if reply.is_closed() {
-                        failed += 1;
+                        metrics.record_failure(policy, since.elapsed());
                     } else if let Err(error) = prepared.and_then(|()| prepare(&mut task)) {
-                        failed += 1;
+                        metrics.record_failure(policy, since.elapsed());
                         // Nothing to do if the caller stopped waiting.
                         let _ = reply.send(Err(error));
                     } else {
@@ -124,46 +126,46 @@ impl TaskBatch {
             }
         }
         let Some(policy) = policy else { return 0 };
-        let counters = metrics.policy(&policy.reference.name);
-        counters.failure.increment(failed);
-        self.run_fleets(&policy, &counters, metrics, started)
+        self.run_fleets(&policy, metrics, started)
     }
 
     /// Computes all fleets of the batch in one forward pass.
-    fn run_fleets(
-        &mut self,
-        policy: &LoadedPolicy,
-        counters: &PolicyMetrics,
-        metrics: &EngineMetrics,
-        started: Instant,
-    ) -> usize {
+    fn run_fleets(&mut self, policy: &LoadedPolicy, metrics: &EngineMetrics, started: Instant) -> usize {
         let size = self.fleets.len();
         if size == 0 {
             return 0;
         }
+        let prepared = Instant::now();
         let mut fleet_steps = recycle(std::mem::take(&mut self.fleet_steps));
         fleet_steps.extend(self.fleets.iter_mut().map(|fleet| fleet.task.as_fleet_step()));
         // Unwind safe: after a panic, the outputs are dropped below.
         let result = catch_unwind(AssertUnwindSafe(|| policy.implementation.act(&mut fleet_steps)));
         self.fleet_steps = recycle(fleet_steps);
-        let compute = started.elapsed();
+        let computed = Instant::now();
         if result.is_err() {
-            counters.failure.increment(size as u64);
             for fleet in self.fleets.drain(..) {
+                metrics.record_failure(policy, computed - fleet.since);
                 let _ = fleet.reply.send(Err(panicked(policy)));
             }
             return size;
         }
-        metrics.record_batch(counters, size);
+        let counters = metrics.policy(&policy.reference.name);
+        metrics.record_batch(&counters, size);
         let mut received = 0;
+        self.outcomes.clear();
         for Fleet { task, since, reply } in self.fleets.drain(..) {
-            let timings = Timings { queue: started - since, compute, batch_size: size as u32 };
+            let timings = Timings { queue: started - since, compute: computed - started, batch_size: size as u32 };
             metrics.record_times(timings.queue, timings.compute);
             // The caller may have stopped waiting during the forward pass.
-            received += u64::from(reply.send(Ok(task.finish(timings))).is_ok());
+            let is_received = reply.send(Ok(task.finish(timings))).is_ok();
+            received += u64::from(is_received);
+            self.outcomes.push((timings.queue, is_received));
         }
         counters.success.increment(received);
         counters.failure.increment(size as u64 - received);
+        let end = Instant::now();
+        let times = ComputeTimes { input: prepared - started, infer: computed - prepared, output: end - computed };
+        metrics.of_version(policy).record_batch(self.outcomes.iter().copied(), &times, end);
         size
     }
 }
@@ -181,22 +183,28 @@ fn prepare(task: &mut Task) -> Result<(), Error> {
 pub(super) fn run_single(mut task: Task, metrics: &EngineMetrics) -> Result<TaskOutput, Error> {
     let started = Instant::now();
     let policy = task.policy().clone();
-    let counters = metrics.policy(&policy.reference.name);
     if let Err(error) = prepare(&mut task) {
-        counters.failure.increment(1);
+        metrics.record_failure(&policy, started.elapsed());
         return Err(error);
     }
+    let prepared = Instant::now();
     // Unwind safe: after a panic, the output is dropped.
     let result = catch_unwind(AssertUnwindSafe(|| policy.implementation.act(&mut [task.as_fleet_step()])));
+    let computed = Instant::now();
     if result.is_err() {
-        counters.failure.increment(1);
+        metrics.record_failure(&policy, computed - started);
         return Err(panicked(&policy));
     }
+    let counters = metrics.policy(&policy.reference.name);
     metrics.record_batch(&counters, 1);
     counters.success.increment(1);
-    let timings = Timings { queue: Duration::ZERO, compute: started.elapsed(), batch_size: 1 };
+    let timings = Timings { queue: Duration::ZERO, compute: computed - started, batch_size: 1 };
     metrics.record_times(timings.queue, timings.compute);
-    Ok(task.finish(timings))
+    let output = task.finish(timings);
+    let end = Instant::now();
+    let times = ComputeTimes { input: prepared - started, infer: computed - prepared, output: end - computed };
+    metrics.of_version(&policy).record_batch([(Duration::ZERO, true)].into_iter(), &times, end);
+    Ok(output)
 }
 
 fn panicked(policy: &LoadedPolicy) -> Error {

@@ -7,6 +7,8 @@ use std::time::Duration;
 
 use metrics::{Counter, Histogram};
 
+use crate::serving::{LoadedPolicy, StatisticsTable, VersionStatistics};
+
 /// Maximum number of policies with counters of their own. Later ones share counters with the label `other`.
 const MAX_POLICIES: usize = 256;
 
@@ -16,6 +18,7 @@ pub(super) struct EngineMetrics {
     compute: Histogram,
     batch_size: Histogram,
     by_policy: RwLock<HashMap<String, Arc<PolicyMetrics>>>,
+    pub(super) statistics: StatisticsTable,
 }
 
 /// Metrics of one policy, over all its versions.
@@ -49,7 +52,19 @@ impl EngineMetrics {
             compute: metrics::histogram!("qedgix_act_compute_seconds"),
             batch_size: metrics::histogram!("qedgix_act_batch_size"),
             by_policy: RwLock::default(),
+            statistics: StatisticsTable::default(),
         }
+    }
+
+    /// The statistics of a version.
+    pub(super) fn of_version<'a>(&self, policy: &'a LoadedPolicy) -> &'a VersionStatistics {
+        policy.statistics.get_or_init(|| self.statistics.begin(&policy.reference))
+    }
+
+    /// Counts a fleet whose caller got no decision, `time` after its request.
+    pub(super) fn record_failure(&self, policy: &LoadedPolicy, time: Duration) {
+        self.policy(&policy.reference.name).failure.increment(1);
+        self.of_version(policy).record_failure(time);
     }
 
     /// Records a forward pass over `fleets` fleets.

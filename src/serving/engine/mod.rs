@@ -33,7 +33,7 @@ use queue::{Lane, Queue};
 use tokio::sync::oneshot;
 use tokio::sync::oneshot::error::TryRecvError;
 
-use super::{Error, Owner};
+use super::{Error, Owner, Statistics};
 
 /// Maximum work of a batch. A higher limit would delay small fleets that share a batch with large ones.
 const MAX_BATCH_WORK: usize = 1 << 17;
@@ -161,9 +161,9 @@ impl EngineState {
     }
 
     /// Counts what leaves the queue without being computed.
-    fn count_failure(&self, job: &Job) {
+    fn count_failure(&self, job: &Job, since: Instant) {
         if let Job::Fleet { task, .. } = job {
-            self.metrics.policy(&task.policy().reference.name).failure.increment(1);
+            self.metrics.record_failure(task.policy(), since.elapsed());
         }
     }
 
@@ -220,8 +220,8 @@ impl EngineState {
     /// Adds `queued` to the queue.
     fn enqueue(&self, queued: Queued) -> Result<(), Error> {
         let removed = self.lock().queue.push(queued, self.config.threads)?;
-        for Queued { job, .. } in removed {
-            self.count_failure(&job);
+        for Queued { job, since, .. } in removed {
+            self.count_failure(&job, since);
             job.refuse(Error::Busy("the engine's queue is full, mostly of requests of this caller".into()));
         }
         Ok(())
@@ -293,6 +293,11 @@ impl Engine {
         Ok(engine)
     }
 
+    /// What a version has computed since the server started.
+    pub fn statistics(&self, name: &str, version: u64) -> Statistics {
+        self.shared.metrics.statistics.get(name, version)
+    }
+
     /// Number of tasks in the queue.
     pub fn waiting(&self) -> usize {
         self.shared.lock().queue.len()
@@ -318,7 +323,7 @@ impl Engine {
         let lane = Lane::of(work);
         let mut guard = AbandonGuard { shared, lane, replied: false };
         shared.enqueue(Queued::new(Job::Fleet { task, reply }, work, owner, deadline)).inspect_err(|_| {
-            shared.metrics.policy(&policy.reference.name).failure.increment(1);
+            shared.metrics.record_failure(&policy, Duration::ZERO);
         })?;
         if small {
             if expects_batch {

@@ -1,8 +1,8 @@
 //! A version of a policy: its description, and the version in memory, ready to run.
 
 use std::ops::Deref;
-use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
+use std::sync::{Arc, OnceLock};
 
 use jiff::Timestamp;
 use serde_json::Value;
@@ -10,7 +10,7 @@ use serde_json::Value;
 use super::memory::MemoryShare;
 use crate::invalid::Invalid;
 use crate::policy::{Policy, RequiredInput};
-use crate::serving::{FleetIds, PolicyRef};
+use crate::serving::{FleetIds, PolicyRef, VersionStatistics};
 
 /// Origin of a policy.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -58,12 +58,14 @@ pub struct LoadedPolicy {
     pub(super) memory: MemoryShare,
     /// Number of the last use by a request without a session.
     pub(super) last_use: AtomicU64,
+    /// What the version has computed, from its first computation on.
+    pub statistics: OnceLock<Arc<VersionStatistics>>,
 }
 
 impl LoadedPolicy {
     /// A policy that takes `memory` from the budget of the registry while anybody uses it.
     pub fn new(info: Arc<PolicyInfo>, implementation: Arc<dyn Policy>, memory: MemoryShare) -> Self {
-        Self { info, implementation, memory, last_use: AtomicU64::new(0) }
+        Self { info, implementation, memory, last_use: AtomicU64::new(0), statistics: OnceLock::new() }
     }
 
     /// Bytes that it takes from the budget.

@@ -126,8 +126,15 @@ async fn a_message_that_does_not_come_is_an_error_and_a_silent_stream_is_not() {
 #[tokio::test]
 async fn compressed_bodies_are_refused_on_both_transports() {
     let server = Server::start().await;
-    for path in ["/v1/act", "/v2/models/sweep/infer", "/v1/jobs"] {
-        for encoding in ["gzip", "identity, br", "unknown"] {
+    // The Open Inference Protocol reads gzip and deflate.
+    let cases = [
+        ("/v1/act", &["gzip", "deflate", "identity, br", "unknown"][..]),
+        ("/v2/models/sweep/infer", &["br", "identity, br", "gzip, gzip", "unknown"]),
+        ("/v2/repository/index", &["gzip"]),
+        ("/v1/jobs", &["gzip", "identity, br", "unknown"]),
+    ];
+    for (path, encodings) in cases {
+        for &encoding in encodings {
             let request = reqwest::Client::new().post(server.url(path)).header("content-type", "application/json");
             let answer = request.header("content-encoding", encoding).body("{}").send().await.unwrap();
             assert_eq!(answer.status(), 415, "{path} {encoding}");

@@ -135,7 +135,10 @@ async fn binary_data_before_and_after() {
         let answer: Value = serde_json::from_slice(&answer).unwrap();
         assert_eq!((status, &answer["field"]), (400, &json!("Inference-Header-Content-Length")), "{answer}");
     }
-    let (status, _, answer) = http.send(Method::POST, INFER, &[("content-encoding", "gzip".into())], body).await;
+    let (status, _, answer) = http.send(Method::POST, INFER, &[("content-encoding", "gzip".into())], body.clone()).await;
+    let answer: Value = serde_json::from_slice(&answer).unwrap();
+    assert_eq!((status, &answer["field"]), (400, &json!("body")), "{answer}");
+    let (status, _, answer) = http.send(Method::POST, INFER, &[("content-encoding", "br".into())], body).await;
     let answer: Value = serde_json::from_slice(&answer).unwrap();
     assert_eq!((status, &answer["field"]), (415, &json!("content-encoding")), "{answer}");
 }

@@ -1,6 +1,7 @@
 //! `GRPCInferenceService` of the Open Inference Protocol.
 
 mod messages;
+mod tools;
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -146,5 +147,71 @@ impl GrpcInferenceService for Service {
         let parameters: Vec<&str> = parameters.keys().map(String::as_str).collect();
         oip::unload(&self.0, &repository_name, &model_name, &parameters).await?;
         Ok(Response::new(wire::RepositoryModelUnloadResponse {}))
+    }
+
+    async fn model_statistics(
+        &self,
+        request: Request<wire::ModelStatisticsRequest>,
+    ) -> GrpcResult<wire::ModelStatisticsResponse> {
+        let wire::ModelStatisticsRequest { name, version } = request.into_inner();
+        let model_stats = oip::statistics(&self.0, &name, &version)?.into_iter().map(tools::statistics).collect();
+        Ok(Response::new(wire::ModelStatisticsResponse { model_stats }))
+    }
+
+    async fn trace_setting(&self, request: Request<wire::TraceSettingRequest>) -> GrpcResult<wire::TraceSettingResponse> {
+        let wire::TraceSettingRequest { settings, model_name } = request.into_inner();
+        oip::check_trace_settings(&self.0, &model_name, &tools::wanted_traces(settings))?;
+        Ok(Response::new(tools::traces()))
+    }
+
+    async fn log_settings(&self, request: Request<wire::LogSettingsRequest>) -> GrpcResult<wire::LogSettingsResponse> {
+        oip::check_log_settings(&tools::wanted_logs(request.into_inner().settings))?;
+        Ok(Response::new(tools::logs()))
+    }
+
+    async fn system_shared_memory_status(
+        &self,
+        request: Request<wire::SystemSharedMemoryStatusRequest>,
+    ) -> GrpcResult<wire::SystemSharedMemoryStatusResponse> {
+        oip::shared_memory::status(&request.into_inner().name)?;
+        Ok(Response::new(wire::SystemSharedMemoryStatusResponse::default()))
+    }
+
+    async fn system_shared_memory_register(
+        &self,
+        request: Request<wire::SystemSharedMemoryRegisterRequest>,
+    ) -> GrpcResult<wire::SystemSharedMemoryRegisterResponse> {
+        oip::shared_memory::register(&request.into_inner().name)?;
+        Ok(Response::new(wire::SystemSharedMemoryRegisterResponse {}))
+    }
+
+    async fn system_shared_memory_unregister(
+        &self,
+        _: Request<wire::SystemSharedMemoryUnregisterRequest>,
+    ) -> GrpcResult<wire::SystemSharedMemoryUnregisterResponse> {
+        Ok(Response::new(wire::SystemSharedMemoryUnregisterResponse {}))
+    }
+
+    async fn cuda_shared_memory_status(
+        &self,
+        request: Request<wire::CudaSharedMemoryStatusRequest>,
+    ) -> GrpcResult<wire::CudaSharedMemoryStatusResponse> {
+        oip::shared_memory::status(&request.into_inner().name)?;
+        Ok(Response::new(wire::CudaSharedMemoryStatusResponse::default()))
+    }
+
+    async fn cuda_shared_memory_register(
+        &self,
+        request: Request<wire::CudaSharedMemoryRegisterRequest>,
+    ) -> GrpcResult<wire::CudaSharedMemoryRegisterResponse> {
+        oip::shared_memory::register(&request.into_inner().name)?;
+        Ok(Response::new(wire::CudaSharedMemoryRegisterResponse {}))
+    }
+
+    async fn cuda_shared_memory_unregister(
+        &self,
+        _: Request<wire::CudaSharedMemoryUnregisterRequest>,
+    ) -> GrpcResult<wire::CudaSharedMemoryUnregisterResponse> {
+        Ok(Response::new(wire::CudaSharedMemoryUnregisterResponse {}))
     }
 }

@@ -2,19 +2,21 @@
 
 mod request;
 mod response;
+mod tools;
 mod values;
 
 use std::sync::Arc;
 
 use axum::extract::State;
-use axum::http::{HeaderMap, HeaderName, StatusCode};
+use axum::http::{HeaderMap, HeaderName, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use axum::{Json, Router};
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
-use super::extract::{Path, Raw};
+use super::extract::{Inflated, Path, Raw};
+use crate::api::compression::Encoding;
 use crate::api::convert::tensors::TensorShape;
 use crate::api::errors::Problem;
 use crate::api::json::object;
@@ -47,6 +49,7 @@ pub fn router() -> Router<Arc<App>> {
         .route("/v2/repository/index", post(index))
         .route("/v2/repository/models/{model}/load", post(load))
         .route("/v2/repository/models/{model}/unload", post(unload))
+        .merge(tools::router())
 }
 
 /// Whether a path belongs to `/v2`, known or not.
@@ -140,13 +143,15 @@ async fn infer(
     caller: Caller,
     Path(path): Path<ModelPath>,
     headers: HeaderMap,
-    Raw(body): Raw,
+    Inflated(body): Inflated,
 ) -> Result<Response, Error> {
+    let encoding = Encoding::accepted(&headers, header::ACCEPT_ENCODING.as_str());
     let ModelPath { model, version } = path;
     let cost = body.len() / BYTES_PER_COST;
     let decode = move || request::decode(&headers, body, model, version);
     let (request, binary) = act::decode(&app, &caller, cost, None, decode).await??;
-    Ok(response::encode(oip::infer(&app, &caller, request, None).await?, &binary))
+    let response = response::encode(oip::infer(&app, &caller, request, None).await?, &binary);
+    response::compressed(response, encoding).await
 }
 
 #[derive(Debug, Default, Deserialize)]

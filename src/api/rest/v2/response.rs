@@ -1,6 +1,6 @@
 //! Responses to inference requests: JSON, followed by the binary data of the outputs for which the request selects it.
 
-use axum::http::{HeaderValue, header};
+use axum::http::{HeaderMap, HeaderValue, header};
 use axum::response::{IntoResponse, Response};
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
@@ -9,7 +9,9 @@ use serde::Serialize;
 
 use super::HEADER_LENGTH;
 use super::request::BinaryOutputs;
+use crate::api::compression::Encoding;
 use crate::api::convert::tensors::{Data, Tensor};
+use crate::api::offload;
 use crate::api::oip::InferResponse;
 use crate::service::Error;
 
@@ -71,8 +73,37 @@ impl From<Data> for Values {
     }
 }
 
+/// A response that is encoded: its headers and its body.
+pub(super) struct Encoded {
+    headers: HeaderMap,
+    body: Bytes,
+}
+
+/// Smaller bodies are not compressed: the rest of the response would be larger than what is saved.
+const MIN_COMPRESSED: usize = 1 << 10;
+/// Larger bodies are compressed on a thread of their own.
+const LARGE: usize = 64 << 10;
+
+/// The response, compressed if the caller accepts an `encoding`.
+///
+/// # Errors
+/// None in practice: the result of the compression is in memory.
+pub(super) async fn compressed(response: Result<Encoded, Error>, encoding: Option<Encoding>) -> Result<Response, Error> {
+    let Encoded { mut headers, body } = response?;
+    headers.insert(header::VARY, HeaderValue::from_name(header::ACCEPT_ENCODING));
+    let Some(encoding) = encoding.filter(|_| body.len() >= MIN_COMPRESSED) else {
+        return Ok((headers, body).into_response());
+    };
+    let body = offload(body.len() > LARGE, move || encoding.compress(&body)).await?.map_err(Error::internal)?;
+    headers.insert(header::CONTENT_ENCODING, HeaderValue::from_static(encoding.name()));
+    Ok((headers, body).into_response())
+}
+
 /// Encodes a response.
-pub(super) fn encode(response: InferResponse, binary: &BinaryOutputs) -> Response {
+///
+/// # Errors
+/// [`Error::Internal`] if it cannot be written as JSON.
+pub(super) fn encode(response: InferResponse, binary: &BinaryOutputs) -> Result<Encoded, Error> {
     let InferResponse { model, version, id, step, digest, outputs } = response;
     let mut binary_data = Vec::new();
     let outputs = outputs.into_iter().enumerate().map(|(i, Tensor { name, datatype, shape, data })| {
@@ -87,16 +118,15 @@ pub(super) fn encode(response: InferResponse, binary: &BinaryOutputs) -> Respons
     let outputs = outputs.collect();
     let parameters = Parameters { step, digest };
     let body = Body { model_name: model, model_version: version.to_string(), id, parameters, outputs };
-    let json = match serde_json::to_vec(&body) {
-        Ok(json) => json,
-        Err(error) => return Error::internal(error).into_response(),
-    };
+    let json = serde_json::to_vec(&body).map_err(Error::internal)?;
     if binary_data.is_empty() {
-        return ([(header::CONTENT_TYPE, HeaderValue::from_static("application/json"))], json).into_response();
+        let headers = [(header::CONTENT_TYPE, HeaderValue::from_static("application/json"))].into_iter().collect();
+        return Ok(Encoded { headers, body: json.into() });
     }
     let mut body = BytesMut::with_capacity(json.len() + binary_data.iter().map(Bytes::len).sum::<usize>());
     body.put_slice(&json);
     binary_data.into_iter().for_each(|raw| body.put(raw));
     let kind = HeaderValue::from_static("application/octet-stream");
-    ([(header::CONTENT_TYPE, kind), (HEADER_LENGTH, json.len().into())], body.freeze()).into_response()
+    let headers = [(header::CONTENT_TYPE, kind), (HEADER_LENGTH, json.len().into())].into_iter().collect();
+    Ok(Encoded { headers, body: body.freeze() })
 }
