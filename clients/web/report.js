@@ -18,6 +18,7 @@ export function Evaluation({ job }) {
   const report = useLoad((signal) => (done ? get(`/v1/jobs/${job.id}/result`, signal) : null), [job.id, done], 0);
   if (!done) return html`<${Card}><${Empty} title=${job.state === 'failed' ? 'The evaluation failed.' : 'The evaluation has not ended.'}><p>Its report appears here when it has succeeded.</p><//><//>`;
   return html`<${Loaded} of=${report} what="the report">${(r) => {
+    if (r.sizes) return html`<${Plan} of=${r} />`;
     const policies = [...r.policies].sort((a, b) => a.summary.mean_aoi.mean - b.summary.mean_aoi.mean);
     const end = Math.max(...policies.map((p) => p.summary.mean_aoi.high));
     return html`<${Card} title="Mean AoI (slots; lower is better)">
@@ -28,6 +29,19 @@ export function Evaluation({ job }) {
       ${r.differences.length > 0 && html`<${Card} title="Differences on the same layouts"><div class="scroll"><table><thead><tr><th scope="col">Policies</th><th scope="col" class="number">Difference of mean AoI</th><th scope="col" class="number">95 % interval</th><th scope="col" class="number">First is better</th></tr></thead>
         <tbody>${r.differences.map(({ first, second, difference: d }) => html`<tr><td>${first} minus ${second}</td><td class="number">${d.mean_aoi.mean > 0 ? '+' : ''}${number(d.mean_aoi.mean, 3)}</td><td class="number">${interval(d.mean_aoi)}</td><td class="number">${(100 * d.wins).toFixed(0)} %</td></tr>`)}</tbody></table></div><//>`}`;
   }}<//>`;
+}
+
+/** How many UAVs a policy needs: the fleets that were tried, and what the loss of a UAV changes. */
+function Plan({ of: r }) {
+  const end = Math.max(...[...r.sizes, ...r.failures.flatMap((failure) => failure.sizes)].map((size) => size.p95_aoi.high));
+  const colour = algorithmColour(r.policy.split(/[:@]/)[0]);
+  const row = (name, size) => html`<tr><th scope="row">${name}</th><td><${IntervalBar} of=${size.p95_aoi} end=${end} colour=${colour} /></td>
+    <td class="number"><strong>${number(size.p95_aoi.mean)}</strong></td><td class="number">${number(size.mean_aoi.mean)}</td></tr>`;
+  const table = (first, rows) => html`<div class="scroll"><table class="report"><thead><tr><th scope="col">${first}</th><th scope="col" class="wide">p95 AoI with 95 % interval over layouts</th><th scope="col" class="number">p95</th><th scope="col" class="number">Mean AoI</th></tr></thead><tbody>${rows}</tbody></table></div>`;
+  return html`<${Card} title=${r.uavs ? `${r.uavs} UAVs keep p95 AoI at ${number(r.target_p95)}` : `No fleet keeps p95 AoI at ${number(r.target_p95)}`}>
+      ${table('UAVs', r.sizes.map((size) => row(size.uavs, size)))}
+      <p class="hint">${r.policy}, ${r.users} users, ${r.episodes} layouts of ${r.layouts}.${r.uavs ? ` 95 % interval: ${r.interval.map((n) => n ?? 'more').join(' to ')} UAVs.` : ''}</p><//>
+    ${r.failures.length > 0 && html`<${Card} title="A UAV is lost">${table('Fleet and slot', r.failures.flatMap((failure) => failure.sizes.map((size) => row(`${size.uavs} UAVs, slot ${failure.slot}`, size))))}<//>`}`;
 }
 
 function IntervalBar({ of, end, colour }) {

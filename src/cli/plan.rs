@@ -10,9 +10,9 @@ use super::output::{Exit, outln};
 use super::run_args::all_cores;
 use super::table::text_table;
 use super::{evaluate, progress};
-use crate::env::{EnvConfig, LostUav};
+use crate::env::{EnvConfig, EpisodeMetrics, LostUav};
 use crate::files;
-use crate::learner::{Disturbance, Interval, evaluate_traced, interval, layout_list};
+use crate::learner::{Disturbance, Failure, FleetSize, Interval, Sizing, SizingTarget, evaluate_traced, layout_list};
 use crate::plot::{self, Chart, Series};
 
 /// Flags of `plan`.
@@ -70,38 +70,12 @@ pub struct PlanArgs {
     json: bool,
 }
 
-/// A fleet of some size on the layouts. Intervals are over layouts.
-#[derive(Clone, Copy, Debug)]
-struct Size {
-    uavs: usize,
-    p95: Interval,
-    mean_aoi: Interval,
-}
-
-/// A UAV lost at `slot`, in fleets of two sizes.
-#[derive(Clone, Copy, Debug)]
-struct Failure {
-    slot: usize,
-    sizes: [Size; 2],
-}
-
-/// The plan.
-#[derive(Debug)]
-struct Plan {
-    sizes: Vec<Size>,
-    /// The smallest fleet whose p95 meets the target, and those by the ends of its interval; `None`: not tried large enough.
-    uavs: Option<usize>,
-    interval: [Option<usize>; 2],
-    failures: Vec<Failure>,
-}
-
 /// Runs the command.
 ///
 /// # Errors
 /// A policy that does not fit, flags out of range, files that cannot be written; exit status 1 if no fleet meets the target.
 pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
-    ensure!(args.target_p95 > 0.0, "--target-p95: got {}, expected a number above 0", args.target_p95);
-    ensure!((1..=256).contains(&args.max_uavs), "--max-uavs: got {}, expected a number from 1 to 256", args.max_uavs);
+    args.target().validate()?;
     ensure!(args.episodes > 0, "--episodes: got 0, expected at least 1");
     let list = layout_list(&args.layouts)?;
     ensure!(!list.mixed, "--layouts {}: it draws the environments itself; choose a list that is not mixed", list.name);
@@ -129,34 +103,23 @@ pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
 }
 
 impl PlanArgs {
-    fn plan(&self, seeds: &[u64]) -> anyhow::Result<Plan> {
-        let bar = progress::bar(self.max_uavs as u64, "fleets");
-        let mut sizes = Vec::new();
-        for uavs in 1..=self.max_uavs {
-            let size = self.evaluate(uavs, None, seeds)?;
-            sizes.push(size);
-            bar.inc(1);
-            if size.p95.high <= self.target_p95 {
-                break;
-            }
-        }
-        let first = |p95: fn(&Interval) -> f64| sizes.iter().find(|size| p95(&size.p95) <= self.target_p95).map(|size| size.uavs);
-        let (uavs, interval) = (first(|p95| p95.mean), [first(|p95| p95.low), first(|p95| p95.high)]);
-        let mut failures = Vec::new();
-        // A fleet of one that loses it does nothing.
-        if let Some(uavs) = uavs.filter(|_| self.failures) {
-            const TIMES: usize = 8;
-            for k in 0..TIMES.min(self.slots) {
-                let slot = k * self.slots / TIMES.min(self.slots);
-                let lost = |uavs| self.evaluate(uavs, Some(LostUav { uav: 0, slot }), seeds);
-                failures.push(Failure { slot, sizes: [lost(uavs)?, lost(uavs + 1)?] });
-            }
-        }
-        bar.finish_and_clear();
-        Ok(Plan { sizes, uavs, interval, failures })
+    fn target(&self) -> SizingTarget {
+        let Self { target_p95, max_uavs, failures, .. } = *self;
+        SizingTarget { target_p95, max_uavs, failures }
     }
 
-    fn evaluate(&self, uavs: usize, lose: Option<LostUav>, seeds: &[u64]) -> anyhow::Result<Size> {
+    fn plan(&self, seeds: &[u64]) -> anyhow::Result<Sizing> {
+        let bar = progress::bar(self.target().evaluations(self.slots) as u64, "fleets");
+        let sizing = self.target().run(self.slots, |uavs, lose| {
+            let episodes = self.evaluate(uavs, lose, seeds)?;
+            bar.inc(1);
+            Ok::<_, anyhow::Error>(Some(episodes))
+        })?;
+        bar.finish_and_clear();
+        sizing.context("the plan was stopped")
+    }
+
+    fn evaluate(&self, uavs: usize, lose: Option<LostUav>, seeds: &[u64]) -> anyhow::Result<Vec<EpisodeMetrics>> {
         let env = EnvConfig {
             uavs,
             users: self.users,
@@ -171,14 +134,11 @@ impl PlanArgs {
         let env = EnvConfig { hover: policy.actions() > EnvConfig::COMPASS, ..env };
         let disturbance = Disturbance { lose, ..Disturbance::default() };
         let threads = self.threads.unwrap_or_else(all_cores);
-        let traced = evaluate_traced(&*policy, &env, seeds, 0, &disturbance, threads)
-            .with_context(|| format!("policy {} with {uavs} UAVs", self.policy))?;
-        let of =
-            |metric: fn(&crate::env::EpisodeMetrics) -> f64| interval(&traced.episodes.iter().map(metric).collect::<Vec<_>>());
-        Ok(Size { uavs, p95: of(|episode| episode.p95_aoi)?, mean_aoi: of(|episode| episode.mean_aoi)? })
+        let evaluation = evaluate_traced(&*policy, &env, seeds, 0, &disturbance, threads);
+        Ok(evaluation.with_context(|| format!("policy {} with {uavs} UAVs", self.policy))?.episodes)
     }
 
-    fn print(&self, plan: &Plan) -> anyhow::Result<()> {
+    fn print(&self, plan: &Sizing) -> anyhow::Result<()> {
         let mut before = None;
         let rows = plan.sizes.iter().map(|size| {
             let gain =
@@ -203,9 +163,9 @@ impl PlanArgs {
         Ok(())
     }
 
-    fn figure(&self, plan: &Plan) -> String {
-        let points = |of: fn(&Size) -> Interval| -> (Vec<[f64; 2]>, Option<Vec<[f64; 2]>>) {
-            let ends = |size: &Size| [of(size).low, of(size).high];
+    fn figure(&self, plan: &Sizing) -> String {
+        let points = |of: fn(&FleetSize) -> Interval| -> (Vec<[f64; 2]>, Option<Vec<[f64; 2]>>) {
+            let ends = |size: &FleetSize| [of(size).low, of(size).high];
             let points = plan.sizes.iter().map(|size| [size.uavs as f64, of(size).mean]).collect();
             (points, Some(plan.sizes.iter().map(ends).collect()))
         };
@@ -224,7 +184,7 @@ impl PlanArgs {
         })
     }
 
-    fn failure_figure(&self, plan: &Plan) -> String {
+    fn failure_figure(&self, plan: &Sizing) -> String {
         let series = |which: usize| {
             let of = |failure: &Failure| failure.sizes[which];
             Series {
@@ -244,21 +204,16 @@ impl PlanArgs {
         })
     }
 
-    fn document(&self, plan: &Plan) -> Value {
-        let size = |size: &Size| json!({"uavs": size.uavs, "p95_aoi": size.p95, "mean_aoi": size.mean_aoi});
-        json!({
+    fn document(&self, plan: &Sizing) -> Value {
+        let mut document = json!({
             "policy": self.policy,
             "users": self.users,
             "target_p95": self.target_p95,
             "layouts": self.layouts,
             "episodes": self.episodes,
-            "uavs": plan.uavs,
-            "interval": plan.interval,
-            "sizes": plan.sizes.iter().map(size).collect::<Vec<_>>(),
-            "failures": plan.failures.iter().map(|failure| {
-                json!({"slot": failure.slot, "sizes": failure.sizes.iter().map(size).collect::<Vec<_>>()})
-            }).collect::<Vec<_>>(),
-        })
+        });
+        plan.add_to(&mut document);
+        document
     }
 }
 

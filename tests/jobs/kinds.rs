@@ -71,6 +71,44 @@ async fn an_evaluation_returns_the_report_of_the_command() {
     }
 }
 
+#[tokio::test]
+async fn a_plan_returns_the_document_of_the_command() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = Server::start_on(dir.path(), 2, |_| {}, processes()).await;
+    // The longest AoI of 12 slots is 12: one UAV suffices, and its loss is tried. None keeps 0.5.
+    for (target, failures, steps) in [(12.5, true, 3 * 17 - 12), (0.5, false, 0)] {
+        let plan = json!({"target_p95": target, "max_uavs": 2, "failures": failures});
+        let job = json!({
+            "kind": "evaluate", "environment": {"slots": 12, "users": 3},
+            "evaluation": {"policies": ["nearest"], "episodes": 3, "plan": plan},
+        });
+        let id = server.submit(&job).await;
+        let job = server.reaches(&id, "succeeded").await;
+        assert_eq!(job["evaluation"]["plan"], plan);
+        assert!(job["progress"]["step"].as_u64().unwrap() >= steps, "{}", job["progress"]);
+        let result = server.get(&format!("/v1/jobs/{id}/result")).await;
+        let mut command = Command::new(PROGRAM);
+        command.args(["plan", "--json", "--policy", "nearest", "--users", "3", "--slots", "12", "--episodes", "3"]);
+        command.args(["--max-uavs", "2", "--target-p95", &target.to_string()]);
+        let output = if failures { command.arg("--failures") } else { &mut command }.output().unwrap();
+        assert_eq!(output.status.code(), Some(i32::from(target < 1.0)), "{}", String::from_utf8_lossy(&output.stderr));
+        let expected: Value = serde_json::from_slice(&output.stdout).unwrap();
+        for (field, value) in expected.as_object().unwrap() {
+            assert_eq!(result[field], *value, "{field}");
+        }
+        assert_eq!(result["failures"].as_array().unwrap().len(), if failures { 8 } else { 0 });
+    }
+    for (evaluation, field) in [
+        (json!({"policies": ["sweep"], "plan": {"target_p95": 0}}), "evaluation.plan.target_p95"),
+        (json!({"policies": ["sweep"], "plan": {"target_p95": 1, "max_uavs": 257}}), "evaluation.plan.max_uavs"),
+        (json!({"policies": ["sweep", "nearest"], "plan": {"target_p95": 1}}), "evaluation.policies"),
+        (json!({"policies": ["sweep"], "position_noise": 0.1, "plan": {"target_p95": 1}}), "evaluation.plan"),
+    ] {
+        let request = server.request(Method::POST, "/v1/jobs").json(&json!({"kind": "evaluate", "evaluation": evaluation}));
+        assert_eq!(expect(request, StatusCode::BAD_REQUEST).await["field"], field, "{evaluation}");
+    }
+}
+
 fn sweep() -> Value {
     with(&json!({
         "kind": "sweep", "name": "gammas",

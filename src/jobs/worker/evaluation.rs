@@ -2,13 +2,18 @@
 
 use std::sync::Arc;
 
+use serde_json::json;
+
 use super::StopSignal;
 use super::training::{Report, ReportQueue};
 use crate::checkpoint::Checkpoint;
 use crate::env::EnvConfig;
 use crate::invalid::Invalid;
 use crate::jobs::evaluation::EvaluationSpec;
-use crate::learner::{Comparison, PolicyEvaluation, TracedEvaluation, Trajectory, evaluate_until, layout_list, layouts_per_part};
+use crate::learner::{
+    Comparison, Disturbance, PolicyEvaluation, SizingTarget, TracedEvaluation, Trajectory, evaluate_until, layout_list,
+    layouts_per_part,
+};
 use crate::policy::{Policy, baselines};
 use crate::store::WorkerResult;
 
@@ -29,7 +34,49 @@ pub(super) fn evaluate(task: &EvaluationTask, reports: &ReportQueue, stop: &Stop
     }
 }
 
+/// Tries fleets of growing size, as `qedgix plan` does.
+fn try_plan(
+    task: &EvaluationTask,
+    target: &SizingTarget,
+    reports: &ReportQueue,
+    stop: &StopSignal,
+) -> Result<Option<String>, String> {
+    let EvaluationSpec { layouts, episodes, environment, policies, .. } = &task.spec;
+    let name = policies.first().ok_or("no policy")?;
+    let seeds = layout_list(layouts).map_err(|e| e.to_string())?.seeds(*episodes);
+    let (policy, stop, mut fleets) = (task.open(name)?, stop.flag(), 0);
+    let sizing = target.run(environment.slots, |uavs, lose| {
+        let env = EnvConfig { uavs, hover: policy.actions() > EnvConfig::COMPASS, ..environment.clone() };
+        env.validate()?;
+        let disturbance = Disturbance { lose, ..Disturbance::default() };
+        let mut metrics = Vec::with_capacity(seeds.len());
+        for part in seeds.chunks(layouts_per_part(&env, 1)) {
+            let Some(part) = evaluate_until(policy.as_ref(), &env, part, task.threads, &disturbance, &stop)? else {
+                return Ok(None);
+            };
+            metrics.extend(part);
+            reports.push(Report::Progress { step: (fleets * seeds.len() + metrics.len()) as u64 });
+        }
+        fleets += 1;
+        Ok::<_, Invalid>(Some(metrics))
+    });
+    let Some(sizing) = sizing.map_err(|e| format!("policy {name}: {e}"))? else { return Ok(None) };
+    let mut document = json!({
+        "policy": name,
+        "users": environment.users,
+        "target_p95": target.target_p95,
+        "layouts": layouts,
+        "episodes": seeds.len(),
+        "environment": environment,
+    });
+    sizing.add_to(&mut document);
+    Ok(Some(document.to_string()))
+}
+
 fn try_evaluate(task: &EvaluationTask, reports: &ReportQueue, stop: &StopSignal) -> Result<Option<String>, String> {
+    if let Some(target) = &task.spec.plan {
+        return try_plan(task, target, reports, stop);
+    }
     let EvaluationSpec { layouts: list, episodes, environment, disturbance, .. } = &task.spec;
     let list = layout_list(list).map_err(|e| e.to_string())?;
     let layouts = list.seeds(*episodes).len();

@@ -12,7 +12,7 @@ use crate::api::config_schemas::{partial_training, schema};
 use crate::api::json;
 use crate::api::rest::schemas;
 use crate::env::EnvConfig;
-use crate::jobs::evaluation::EvaluationRequest;
+use crate::jobs::evaluation::{EvaluationRequest, PlanRequest};
 use crate::jobs::spec;
 use crate::jobs::sweep::{self, SweepRequest};
 use crate::jobs::webhooks::WebhookRequest;
@@ -311,6 +311,23 @@ pub(super) struct Evaluation {
     /// Standard deviation of the error of each observed coordinate, in units of the square's side; default: 0.
     #[schema(minimum = 0.0, maximum = 1.0)]
     position_noise: Option<f64>,
+    /// How many UAVs the only policy needs, as `qedgix plan` does: fleets of 1, 2, 3, ... UAVs until one surely meets the target.
+    plan: Option<Plan>,
+}
+
+/// The AoI that a fleet must keep, and the fleets to try.
+#[derive(Debug, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields, remote = "Self")]
+struct Plan {
+    /// 95th percentile of AoI over users and slots that the fleet must keep, in slots.
+    #[schema(exclusive_minimum = 0.0, example = 10.0)]
+    target_p95: f64,
+    /// Largest fleet to try; default: 12.
+    #[serde(default, deserialize_with = "json::optional_integer")]
+    #[schema(minimum = 1, maximum = 256)]
+    max_uavs: Option<usize>,
+    /// Also loses a UAV at each of several times, of the fleet that meets the target and of the next larger one; default: false.
+    failures: Option<bool>,
 }
 
 /// A UAV that from a slot on does not move, collect or detect, and is not detected. Both are counted from 0.
@@ -323,12 +340,13 @@ struct LostUav {
     slot: usize,
 }
 
-json::objects_only!(Evaluation, LostUav);
+json::objects_only!(Evaluation, LostUav, Plan);
 
 impl From<Evaluation> for EvaluationRequest {
-    fn from(Evaluation { policies, layouts, episodes, lose, position_noise }: Evaluation) -> Self {
+    fn from(Evaluation { policies, layouts, episodes, lose, position_noise, plan }: Evaluation) -> Self {
         let lose = lose.map(|LostUav { uav, slot }| learner::LostUav { uav, slot });
-        Self { policies, layouts, episodes, lose, position_noise }
+        let plan = plan.map(|Plan { target_p95, max_uavs, failures }| PlanRequest { target_p95, max_uavs, failures });
+        Self { policies, layouts, episodes, lose, position_noise, plan }
     }
 }
 
