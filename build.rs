@@ -11,7 +11,14 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         }
     }
     files.sort();
-    let descriptors = protox::compile(files, ["proto"])?;
+    files.extend(
+        ["v1/dm_env_rpc.proto", "v1/extensions/properties.proto"]
+            .map(|file| Path::new("proto/third_party/dm_env_rpc").join(file)),
+    );
+    // Messages of files, not of a service: reflection does not list them.
+    let third_party = protox::compile(["proto/third_party/onnx/onnx.proto"], ["proto/third_party"])?;
+    tonic_prost_build::configure().compile_fds(third_party)?;
+    let descriptors = protox::compile(files, ["proto/third_party", "proto"])?;
     let out = std::env::var("OUT_DIR")?;
     std::fs::write(Path::new(&out).join("descriptors.bin"), prost::Message::encode_to_vec(&descriptors))?;
     tonic_prost_build::configure().bytes(".").compile_fds(descriptors)?;

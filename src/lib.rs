@@ -12,6 +12,7 @@
 //! | [`store`] | the database; the only SQL |
 //! | [`experiment`] | plans of many runs, and their combined results |
 //! | [`learner`] | replay, rollout, update, training, evaluation |
+//! | [`onnx`] | learned policies as ONNX models |
 //! | [`checkpoint`] | parameters to and from safetensors |
 //! | [`train_config`] | what a training run is made of: algorithm, preset, resolved configuration |
 //! | [`policy`] | observations, agents, mixers, baselines |
@@ -37,6 +38,7 @@ pub mod invalid;
 pub mod jobs;
 pub mod learner;
 pub mod nn;
+pub mod onnx;
 pub mod plot;
 pub mod policy;
 pub mod rng;

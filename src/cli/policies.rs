@@ -11,7 +11,8 @@ use super::files::write_atomic;
 use super::output::outln;
 use super::rest::{self, items, query, text};
 use super::table;
-use crate::checkpoint::digest;
+use crate::checkpoint::{Checkpoint, digest};
+use crate::onnx;
 
 /// Flags of `policies`.
 #[derive(Args, Debug)]
@@ -24,6 +25,7 @@ use crate::checkpoint::digest;
   qedgix policies versions my-policy
   qedgix policies delete my-policy:1
   qedgix policies export my-policy@live --out live.safetensors
+  qedgix policies export my-policy@live --onnx live.onnx         # flies without a server
   qedgix policies list --server 192.0.2.7:8080 --json")]
 pub struct PoliciesArgs {
     #[command(subcommand)]
@@ -63,8 +65,11 @@ enum Command {
         /// NAME, NAME@ALIAS or NAME:VERSION
         policy: String,
         /// Output file [default: NAME-VERSION.safetensors]
-        #[arg(long)]
+        #[arg(long, conflicts_with = "onnx")]
         out: Option<PathBuf>,
+        /// Write an ONNX model instead, which flies without a server (docs/onboard.md)
+        #[arg(long, value_name = "FILE")]
+        onnx: Option<PathBuf>,
     },
     /// List the versions of a policy, newest first
     Versions {
@@ -155,7 +160,7 @@ pub async fn run(args: PoliciesArgs) -> anyhow::Result<()> {
                 None => client.post(&url, &json!({"checkpoint_id": checkpoint})).await?,
             })
         }
-        Command::Export { policy, out } => export(&client, &policy, out).await?,
+        Command::Export { policy, out, onnx } => export(&client, &policy, out, onnx).await?,
         Command::Versions { name, limit } => versions(&client, &name, limit).await?,
         Command::Delete { policy, all_versions } => delete(&client, &policy, all_versions).await?,
         Command::Alias(Alias::List { name }) => {
@@ -264,7 +269,7 @@ fn details(policy: Value) -> (Value, String) {
     (policy, table)
 }
 
-async fn export(client: &Client, policy: &str, out: Option<PathBuf>) -> anyhow::Result<(Value, String)> {
+async fn export(client: &Client, policy: &str, out: Option<PathBuf>, onnx: Option<PathBuf>) -> anyhow::Result<(Value, String)> {
     // Resolves the version first, so that an alias that moves meanwhile does not change what is downloaded.
     let details = client.get(&path(&[policy])).await?;
     let (name, version) = (text(&details["ref"]["name"]), text(&details["ref"]["version"]));
@@ -274,7 +279,14 @@ async fn export(client: &Client, policy: &str, out: Option<PathBuf>) -> anyhow::
         details["ref"]["digest"] == sha256.as_str(),
         "{policy}: the downloaded bytes do not have the digest of {name}:{version}"
     );
-    let out = out.unwrap_or_else(|| format!("{name}-{version}.safetensors").into());
+    let (out, bytes) = match onnx {
+        None => (out.unwrap_or_else(|| format!("{name}-{version}.safetensors").into()), bytes),
+        Some(file) => {
+            let checkpoint = Checkpoint::from_bytes(&bytes).with_context(|| format!("{name}:{version}"))?;
+            let model = onnx::export(&checkpoint, &format!("{name}:{version}"));
+            (file, model.with_context(|| format!("{name}:{version} has no ONNX form"))?)
+        }
+    };
     write_atomic(&out, &bytes)?;
     let text = format!("wrote {name}:{version} ({} bytes) to {}", bytes.len(), out.display());
     Ok((json!({"policy": format!("{name}:{version}"), "digest": sha256, "file": out, "size": bytes.len()}), text))

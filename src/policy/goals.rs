@@ -35,6 +35,11 @@ pub struct Goals {
 }
 
 impl Goals {
+    /// Number of features of a goal.
+    pub const FEATURES: usize = FEATURES;
+    /// Blocks of ground along each side of the square.
+    pub const BLOCKS: usize = BLOCKS;
+
     /// Removes all rows.
     pub fn clear(&mut self) {
         self.offsets.clear();
