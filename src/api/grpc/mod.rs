@@ -2,9 +2,11 @@
 
 mod call;
 mod deadline;
+mod dm_env;
 mod environment;
 mod health;
 mod inference;
+mod inflated_body;
 mod job;
 mod metrics;
 mod middleware;
@@ -27,7 +29,7 @@ use middleware::Middleware;
 use super::auth::Authorized;
 use crate::service::App;
 use crate::wire::v1::worker_service_server::{WorkerService, WorkerServiceServer};
-use crate::wire::{DESCRIPTORS, oip, v1};
+use crate::wire::{DESCRIPTORS, dm, oip, v1};
 
 /// Names of the services with a health status.
 pub const SERVICES: &[&str] = &[
@@ -36,6 +38,7 @@ pub const SERVICES: &[&str] = &[
     v1::job_service_server::SERVICE_NAME,
     v1::worker_service_server::SERVICE_NAME,
     oip::grpc_inference_service_server::SERVICE_NAME,
+    dm::dm_env_rpc::v1::environment_server::SERVICE_NAME,
 ];
 
 /// The result of a unary method.
@@ -60,6 +63,7 @@ pub fn services(app: &Arc<App>, health: &Health, max_message: usize, closing: Ca
         .add_service(policy::service(app.clone()).max_decoding_message_size(max_message))
         .add_service(inference::service(app.clone()).max_decoding_message_size(max_message))
         .add_service(environment::service(app.clone()).max_decoding_message_size(max_message))
+        .add_service(dm_env::service(app.clone()).max_decoding_message_size(max_message))
         .add_service(job::service(app.clone()).max_decoding_message_size(max_message))
         .add_service(workers(app, max_message))
         .add_service(health.server())
