@@ -1,8 +1,10 @@
 //! Learned policies as ONNX models, which fly without a server (docs/onboard.md): one slot of one fleet, with what UAVs remember as inputs
 //! and outputs.
 //!
-//! `network` has the networks, `memory` what UAVs remember and their goals, `places` tables, `graph` the operators.
+//! `network` has the networks, `memory` what UAVs remember, `goals` their goals, `places` tables, `graph` and `expressions` the operators.
 
+mod expressions;
+mod goals;
 mod graph;
 mod memory;
 mod network;

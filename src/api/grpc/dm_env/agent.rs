@@ -30,6 +30,14 @@ impl Joined {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Adds a world, unless an agent has joined it.
+    fn add(&self, world: &(Owner, String)) -> bool {
+        let mut all = self.lock();
+        let is_new = !all.contains_key(world);
+        all.entry(world.clone()).or_default();
+        is_new
+    }
+
     fn has(&self, world: &(Owner, String)) -> bool {
         self.lock().contains_key(world)
     }
@@ -156,7 +164,7 @@ impl Agent {
         }
         let config = info.spec.config;
         fleet::check_size(&config)?;
-        if self.joined.lock().try_insert_new(key.clone()).is_err() {
+        if !self.joined.add(&key) {
             return Err(wrong_state(format!("another stream has joined world {:?}; its agent flies all UAVs", key.1)));
         }
         let specs = fleet::specs(&config);
@@ -235,24 +243,6 @@ impl World {
         match sent {
             None => Ok(self.headings.clone()),
             Some(action) => headings(action, self.config.uavs, self.config.actions()),
-        }
-    }
-}
-
-/// Adds what is not there.
-trait InsertNew<K> {
-    fn try_insert_new(&mut self, key: K) -> Result<(), ()>;
-}
-
-impl<K: std::hash::Hash + Eq> InsertNew<K> for HashMap<K, u64> {
-    fn try_insert_new(&mut self, key: K) -> Result<(), ()> {
-        use std::collections::hash_map::Entry;
-        match self.entry(key) {
-            Entry::Vacant(entry) => {
-                entry.insert(0);
-                Ok(())
-            }
-            Entry::Occupied(_) => Err(()),
         }
     }
 }
