@@ -72,7 +72,7 @@ pub(super) struct Agent {
     world: Option<World>,
 }
 
-pub(super) fn wrong_state(message: impl Into<String>) -> Error {
+fn wrong_state(message: impl Into<String>) -> Error {
     Error::Precondition { code: ErrorCode::WrongState, message: message.into() }
 }
 

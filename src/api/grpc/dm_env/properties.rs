@@ -4,6 +4,7 @@ use prost::Message;
 
 use super::tensors::{double, integer, spec, text};
 use crate::env::{EnvConfig, EpisodeMetrics};
+use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::service::Error;
 use crate::wire::dm::dm_env_rpc::v1 as wire;
@@ -59,6 +60,10 @@ pub(super) fn answer(request: &prost_types::Any, world: Option<World<'_>>) -> Re
     Ok(prost_types::Any { type_url: RESPONSE.to_owned(), value })
 }
 
+fn wrong_state(message: &str) -> Error {
+    Error::Precondition { code: ErrorCode::WrongState, message: message.to_owned() }
+}
+
 fn described((name, dtype, description): (&str, DataType, &str)) -> ext::PropertySpec {
     ext::PropertySpec {
         spec: Some(spec(name, dtype, &[])),
@@ -78,12 +83,12 @@ fn read(key: &str, world: Option<World<'_>>) -> Result<wire::Tensor, Error> {
     if !PROPERTIES.iter().any(|(name, ..)| *name == key) {
         return Err(unknown(key).into());
     }
-    let Some((config, finished)) = world else { return Err(super::agent::wrong_state("this stream has joined no world")) };
+    let Some((config, finished)) = world else { return Err(wrong_state("this stream has joined no world")) };
     if key == "configuration" {
         return Ok(text(serde_json::to_string(config).map_err(Error::internal)?));
     }
     let Some((metrics, seed)) = finished else {
-        return Err(super::agent::wrong_state("no episode has ended since the world was joined"));
+        return Err(wrong_state("no episode has ended since the world was joined"));
     };
     let EpisodeMetrics { mean_aoi, peak_aoi, p95_aoi, coverage, fairness } = *metrics;
     Ok(match key {
