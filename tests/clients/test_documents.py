@@ -217,6 +217,9 @@ def test_commands(page, desk):
 
 @pytest.mark.parametrize("page", [page for page in PAGES if of(page, "python")])
 def test_python(page, desk):
+    before = [desk.here_addresses(command) for block in of(page, "python") for command in block.before]
+    done = desk.run("\n".join(["set -eE", f"cd '{desk.here}'", *before]))
+    assert done.returncode == 0, done.stdout
     program = "\n".join(desk.here_addresses(block.text) for block in of(page, "python"))
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=desk.here, text=True, capture_output=True, env=dict(desk.environment, PYTHONDONTWRITEBYTECODE="1")
