@@ -8,7 +8,7 @@ use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
-use super::scheduler::{StartError, failed, new_token};
+use super::starting::{StartError, failed, new_token};
 use super::{Launch, Resources, RunningAttempt, Scheduler, token_digest};
 use crate::learner::MemoryEstimate;
 use crate::store::{Job, LaunchRecord, Lease, WorkerResult};

@@ -14,6 +14,7 @@ pub mod memory;
 mod scheduler;
 mod slurm;
 pub mod spec;
+mod starting;
 pub mod sweep;
 pub mod sweep_jobs;
 pub mod webhooks;

@@ -15,6 +15,7 @@ use tracing::Instrument;
 
 use super::backfill::backfill_limit;
 use super::launched::{new_launch, resources};
+use super::starting::{StartError, failed, new_token};
 use super::{Launch, LogTail, RunningAttempt, Scheduler, WorkerExit, WorkerStatus, token_digest};
 use crate::store::{EndedAttempt, Job, JobState, Lease, PendingAction, WorkerResult};
 
@@ -40,20 +41,6 @@ const CLUSTER_GRACE: Duration = Duration::from_secs(10);
 const LOG_DELAY: Duration = Duration::from_millis(100);
 /// Time between two writes of a worker's output, and that time when the worker floods its output.
 const LOG_INTERVAL: [Duration; 2] = [Duration::from_millis(400), Duration::from_secs(10)];
-
-/// Why no attempt could begin: the database, or the system's source of random numbers.
-pub(super) type StartError = Box<dyn std::error::Error + Send + Sync>;
-
-/// A secret for a worker.
-pub(super) fn new_token() -> Result<String, StartError> {
-    let mut secret = [0; 32];
-    getrandom::fill(&mut secret)?;
-    Ok(hex::encode(secret))
-}
-
-pub(super) fn failed(reason: String) -> WorkerResult {
-    WorkerResult::Failed { reason, permanent: false }
-}
 
 pub(super) fn threads_used(all: &HashMap<i64, RunningAttempt>) -> usize {
     all.values().map(|running| running.threads).sum()
