@@ -56,10 +56,10 @@ class Replica:
         assert self.process.wait(60) == 0
 
 
-def documented(name):
-    """The block of docs/scaling.md that begins with this comment."""
+def documented():
+    """The configuration of haproxy in docs/scaling.md: its first block that is not executed."""
     with open(os.path.join(ROOT, "docs", "scaling.md")) as file:
-        return file.read().split(f"```{name}\n", 1)[1].split("```", 1)[0]
+        return file.read().split("\n```\n", 1)[1].split("```", 1)[0]
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def replicas(tmp_path):
         servers.append(Replica(tmp_path / name))
     address = f"127.0.0.1:{free_port()}"
     # The addresses of the document, replaced by free ones.
-    config = documented("haproxy").replace(":443 ssl crt /etc/haproxy/qedgix.pem alpn h2", f"{address} proto h2")
+    config = documented().replace(":443 ssl crt /etc/haproxy/qedgix.pem alpn h2", f"{address} proto h2")
     for replica, old in zip(servers, ["10.0.0.1:50051", "10.0.0.2:50051"]):
         assert old in config
         config = config.replace(old, replica.grpc)
