@@ -155,6 +155,11 @@ fn training() -> Map<String, Value> {
             string_enum::<Advice>(),
             "What a rule tells a UAV in every slot, from its memory; sweep: the heading that the rule `sweep` would fly.",
         ),
+        (
+            "advice_margin",
+            number(0.0, 1e3),
+            "How much higher the Q-value of another heading than the advised one must be, per remembered user and UAV, at least once.",
+        ),
         ("mixer", string_enum::<MixerKind>(), "Mixer of the UAVs' values."),
         ("hyper_init", number(0.0, 10.0), "Factor of the initial weights of the hypernetworks' last layers."),
         ("steps", integer(1, STEPS), "Environment steps (slots) to train for."),

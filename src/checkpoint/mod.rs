@@ -97,9 +97,8 @@ impl Checkpoint {
     /// # Panics
     /// Never: the parameters were checked when the checkpoint was created or read.
     pub fn policy(&self) -> LearnedPolicy {
-        let (agent, dims) = (self.config.agent(), self.config.dims());
-        let len = Agent::new(agent, dims).layout().len();
-        LearnedPolicy::new(agent, dims, self.parameters[..len].to_vec()).expect("checked when the checkpoint was created or read")
+        let len = Agent::new(self.config.agent(), self.config.dims()).layout().len();
+        self.config.policy(self.parameters[..len].to_vec()).expect("checked when the checkpoint was created or read")
     }
 
     /// The bytes of the file.

@@ -23,7 +23,6 @@ use super::{Disturbance, Episodes, Evaluation, Event, Iteration, Learner, TrainC
 use crate::checkpoint::{self, Checkpoint};
 use crate::env::EpisodeMetrics;
 use crate::invalid::Invalid;
-use crate::policy::LearnedPolicy;
 use crate::rng;
 
 /// A training run.
@@ -187,7 +186,8 @@ impl Trainer {
         let rest = &seeds[run.layouts.len().min(seeds.len())..];
         let part = &rest[..rest.len().min(layouts_per_part(&config.environment, 8))];
         let agent_parameters = parameters[..self.learner.agent().layout().len()].to_vec();
-        let policy = LearnedPolicy::new(config.agent(), config.dims(), agent_parameters)
+        let policy = config
+            .policy(agent_parameters)
             .expect("the parameters have the length of the agent's layout");
         let metrics = evaluate_until(&policy, &config.environment, part, self.threads, &Disturbance::default(), &self.stop);
         run.layouts.extend(metrics.expect("an agent fits its environment")?);

@@ -29,6 +29,8 @@ pub struct Goals {
     headings: Vec<u8>,
     /// (goals, [`FEATURES`]).
     features: Vec<f32>,
+    /// How many users the UAV of each row remembers, divided by M.
+    load: Vec<f32>,
     /// The advised heading of each row; empty without advice.
     advice: Vec<u8>,
     users: Vec<RememberedUser>,
@@ -46,6 +48,7 @@ impl Goals {
         self.offsets.push(0);
         self.headings.clear();
         self.features.clear();
+        self.load.clear();
         self.advice.clear();
     }
 
@@ -77,6 +80,11 @@ impl Goals {
     /// The features of all goals, (goals, [`FEATURES`]).
     pub fn features(&self) -> &[f32] {
         &self.features
+    }
+
+    /// How many users the UAV of each row remembers, divided by M.
+    pub fn load(&self) -> &[f32] {
+        &self.load
     }
 
     /// The advised heading of each row; empty without advice.
@@ -125,6 +133,7 @@ impl Goals {
             ground.unsearched as f64 * CELL_SHARE,
             ln1(users.len() as f64 / view.uavs as f64),
         ];
+        self.load.push(users.len() as f32 / view.uavs as f32);
         view.keep_best(&mut users);
         for (j, user) in users.iter().enumerate() {
             let goal = view.user(user, &users, j);

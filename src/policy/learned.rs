@@ -30,6 +30,7 @@ pub struct LearnedPolicy {
     agent: Agent,
     params: Vec<f32>,
     prepared: Vec<f32>,
+    advice_margin: f32,
     /// Buffers of finished calls, for the next calls.
     buffers: Mutex<Vec<Buffers>>,
 }
@@ -61,7 +62,14 @@ impl LearnedPolicy {
         }
         let mut prepared = vec![0.0; len];
         agent.prepare(&params, &mut prepared);
-        Ok(Self { agent, params, prepared, buffers: Mutex::default() })
+        Ok(Self { agent, params, prepared, advice_margin: 0.0, buffers: Mutex::default() })
+    }
+
+    /// The policy that leaves the advised heading only for one whose Q-value is higher by `margin` times the users per UAV that it
+    /// remembers, at least by `margin` (docs/model.md, "Advice"). Without advice it stays as it is.
+    #[must_use]
+    pub fn with_advice_margin(self, margin: f32) -> Self {
+        Self { advice_margin: margin, ..self }
     }
 
     /// The architecture.
@@ -233,6 +241,10 @@ impl LearnedPolicy {
         };
         let weights = Weights { params: &self.params, prepared: &self.prepared };
         self.agent.forward(weights, &inputs, 1, &mut b.cache);
+        let advice = b.goals.advice().iter().zip(b.goals.load());
+        for (q, (&heading, &load)) in b.cache.q.as_mut_slice().chunks_exact_mut(self.actions()).zip(advice) {
+            q[usize::from(heading)] += self.advice_margin * load.max(1.0);
+        }
         let mut after = b.cache.last_hidden(rows).chunks_exact(HIDDEN).zip(b.cache.q.as_slice().chunks_exact(self.actions()));
         for fleet in fleets {
             let hidden = &mut fleet.memory[..fleet.graph.uavs() * stride];

@@ -12,7 +12,7 @@ use crate::env::EnvConfig;
 use crate::invalid::{Invalid, expectation, in_range};
 use crate::policy::baselines;
 use crate::policy::mixer::MixerKind;
-use crate::policy::{Advice, AgentConfig, Aggregation, Dims, Gnn, Identity, Memory, ObservationKind};
+use crate::policy::{Advice, AgentConfig, Aggregation, Dims, Gnn, Identity, LearnedPolicy, Memory, ObservationKind};
 
 /// The algorithms of the paper, and common baselines.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -78,6 +78,10 @@ pub struct Training {
     /// that of `sweep-shared`.
     #[serde(default)]
     pub advice: Advice,
+    /// With advice: how much higher the Q-value of another heading must be before the policy leaves the advised one, per remembered user
+    /// and UAV of the fleet, at least once. Exploration and updates do not know it.
+    #[serde(default)]
+    pub advice_margin: f64,
     /// Mixer.
     pub mixer: MixerKind,
     /// Factor of the initial weights of the hypernetworks' last layers.
@@ -191,6 +195,7 @@ impl TrainConfig {
             normalise: false,
             memory: Memory::None,
             advice: Advice::None,
+            advice_margin: 0.0,
             mixer: MixerKind::Invariant,
             hyper_init: 1.0,
             steps: 2_050_000,
@@ -227,6 +232,8 @@ impl TrainConfig {
                 training.observation = ObservationKind::Set;
                 training.identity = Identity::Phase;
                 training.memory = Memory::Shared;
+                training.advice = Advice::Sweep;
+                training.advice_margin = 0.03;
                 training.teacher = Some("sweep-shared".to_owned());
                 training.self_position = true;
                 training.learning_rate = 1e-3;
@@ -263,6 +270,13 @@ impl TrainConfig {
         let mut config = Self { seed, ..Self::preset(algorithm, preset).with_fields(environment, training)? };
         if config.training.teacher.as_deref() == Some(NO_TEACHER) {
             config.training.teacher = None;
+        }
+        // The advice of a preset needs the memory of the preset.
+        if config.training.memory.is_none() && !training.contains_key("advice") {
+            config.training.advice = Advice::None;
+        }
+        if config.training.advice.is_none() && !training.contains_key("advice_margin") {
+            config.training.advice_margin = 0.0;
         }
         if config.environment.reward_scale.is_none() {
             let env = &config.environment;
@@ -303,6 +317,15 @@ impl TrainConfig {
         }
     }
 
+    /// The policy of agents with these parameters.
+    ///
+    /// # Errors
+    /// [`Invalid`] if the number of parameters does not fit the architecture, or one is not finite.
+    pub fn policy(&self, parameters: Vec<f32>) -> Result<LearnedPolicy, Invalid> {
+        let policy = LearnedPolicy::new(self.agent(), self.dims(), parameters)?;
+        Ok(policy.with_advice_margin(self.training.advice_margin as f32))
+    }
+
     /// The sizes of the agents.
     pub fn dims(&self) -> Dims {
         let env = &self.environment;
@@ -341,6 +364,9 @@ impl TrainConfig {
         }
         if !t.advice.is_none() && t.memory.is_none() {
             return Err(Invalid::new("training.advice", "sweep", "none, because the rule needs training.memory"));
+        }
+        if t.advice_margin > 0.0 && t.advice.is_none() {
+            return Err(Invalid::new("training.advice_margin", t.advice_margin, "0, because training.advice is none"));
         }
         if !t.vary.is_none() {
             self.validate_vary()?;
@@ -423,6 +449,7 @@ impl Training {
     fn validate(&self) -> Result<(), Invalid> {
         in_range("layers", self.layers, 1..=8)?;
         in_range("hops", self.hops, 1..=9)?;
+        in_range("advice_margin", self.advice_margin, 0.0..=1e3)?;
         in_range("hyper_init", self.hyper_init, 0.0..=10.0)?;
         in_range("steps", self.steps, 1..=TrainConfig::MAX_STEPS)?;
         in_range("learning_rate", self.learning_rate, 1e-12..=1.0)?;
