@@ -143,7 +143,7 @@ impl Config {
             worker_addr: None,
             session_ttl: Duration::from_secs(600),
             max_sessions: 100_000,
-            session_memory: 512 << 20,
+            session_memory: 256 << 20,
             absent_after: 100,
             environment_ttl: Duration::from_secs(600),
             max_environments: 1024,

@@ -307,7 +307,7 @@ pub async fn run(
         life: LifeLimits { idle: Duration::MAX / 4, age: Duration::MAX / 4, ..connections.life },
         ..connections.clone()
     };
-    let services = grpc::services(&app, &health, config.max_message_size, stop.clone());
+    let services = grpc::services(&app, &health, config.max_message_size, background.handle(), stop.clone());
     let hosts = AllowedHosts::new(endpoints.http.ip(), &config.allow_hosts);
     let router = rest::router(app.clone(), telemetry::render_metrics, config.max_message_size, hosts, background.handle());
     let router = router.map_request(|mut request: Request<IncomingBody>| {
@@ -318,7 +318,7 @@ pub async fn run(
     let serve_workers = worker_connections.serve(
         listeners.workers,
         Protocol::Grpc,
-        grpc::worker_services(&app, config.max_message_size, stop.clone()),
+        grpc::worker_services(&app, config.max_message_size, background.handle(), stop.clone()),
     );
     let budget = connections.places.budget().clone();
     let serve_grpc = connections.clone().serve(listeners.grpc, Protocol::Grpc, services);

@@ -65,7 +65,7 @@ pub struct ServeArgs {
     #[arg(long, env = "QEDGIX_MAX_SESSIONS", default_value_t = 100_000, value_name = "SESSIONS")]
     max_sessions: usize,
     /// Maximum memory of all sessions together, in bytes
-    #[arg(long, env = "QEDGIX_SESSION_MEMORY", default_value_t = 512 << 20, value_name = "BYTES")]
+    #[arg(long, env = "QEDGIX_SESSION_MEMORY", default_value_t = 256 << 20, value_name = "BYTES")]
     session_memory: usize,
     /// Slots after which a UAV or user that is missing from the requests of its fleet is forgotten; until then it keeps its memory
     #[arg(long, env = "QEDGIX_ABSENT_AFTER", default_value_t = 100, value_name = "SLOTS")]

@@ -3,7 +3,7 @@
 //! The metric handles of a method are created at its first call and kept, so that counting neither allocates nor locks.
 //! Unknown paths share one set of handles, because clients choose them and labels must be bounded.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::OnceLock;
 
 use metrics::{Counter, Histogram};
@@ -139,6 +139,12 @@ impl Methods {
     /// The number of the method at `path` (`/package.Service/Method`), 0 if there is none.
     pub(super) fn find(&self, path: &str) -> usize {
         self.by_path.get(path).copied().unwrap_or(0)
+    }
+
+    /// The paths of the methods whose client streams.
+    pub(super) fn client_streams(&self) -> HashSet<String> {
+        let streams = self.by_path.iter().filter(|&(_, &number)| self.methods[number].streams.client);
+        streams.map(|(path, _)| path.clone()).collect()
     }
 
     pub(super) fn get(&self, number: usize) -> &Method {

@@ -8,6 +8,7 @@ mod health;
 mod inference;
 mod inflated_body;
 mod job;
+mod large_messages;
 mod metrics;
 mod middleware;
 mod policy;
@@ -18,11 +19,13 @@ mod worker;
 
 use std::sync::Arc;
 
+use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
 
 use deadline::deadline;
 pub use health::Health;
+use large_messages::LargeMessages;
 use metrics::Methods;
 use middleware::Middleware;
 
@@ -47,13 +50,20 @@ type GrpcResult<T> = Result<tonic::Response<T>, tonic::Status>;
 const BUILT_IN: &str = "the descriptors are built into the program";
 
 /// The services with authorization and the middleware for all calls.
-pub type Services = Middleware<Authorized<Routes>>;
+pub type Services = Middleware<Authorized<LargeMessages<Routes>>>;
 
-/// All services. Messages larger than `max_message` bytes are refused. Streams end when `closing` is cancelled.
+/// All services. Messages larger than `max_message` bytes are refused; `background` handles large ones. Streams end when `closing` is
+/// cancelled.
 ///
 /// # Panics
 /// If a descriptor set built into the program does not decode.
-pub fn services(app: &Arc<App>, health: &Health, max_message: usize, closing: CancellationToken) -> Services {
+pub fn services(
+    app: &Arc<App>,
+    health: &Health,
+    max_message: usize,
+    background: Handle,
+    closing: CancellationToken,
+) -> Services {
     let reflection = || {
         let builder = tonic_reflection::server::Builder::configure().register_encoded_file_descriptor_set(DESCRIPTORS);
         builder.register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
@@ -69,23 +79,25 @@ pub fn services(app: &Arc<App>, health: &Health, max_message: usize, closing: Ca
         .add_service(health.server())
         .add_service(reflection().build_v1().expect(BUILT_IN))
         .add_service(reflection().build_v1alpha().expect(BUILT_IN));
-    wrap(app, routes.routes(), max_message, closing)
+    wrap(app, routes.routes(), max_message, background, closing)
 }
 
 /// Only the service for workers, for an address of its own.
 ///
 /// # Panics
 /// As [`services`].
-pub fn worker_services(app: &Arc<App>, max_message: usize, closing: CancellationToken) -> Services {
-    wrap(app, Routes::new(workers(app, max_message)), max_message, closing)
+pub fn worker_services(app: &Arc<App>, max_message: usize, background: Handle, closing: CancellationToken) -> Services {
+    wrap(app, Routes::new(workers(app, max_message)), max_message, background, closing)
 }
 
 fn workers(app: &Arc<App>, max_message: usize) -> WorkerServiceServer<impl WorkerService> {
     worker::service(app.clone()).max_decoding_message_size(max_message.max(worker::MAX_WORKER_MESSAGE))
 }
 
-fn wrap(app: &Arc<App>, routes: Routes, max_message: usize, closing: CancellationToken) -> Services {
+fn wrap(app: &Arc<App>, routes: Routes, max_message: usize, background: Handle, closing: CancellationToken) -> Services {
     use tonic_reflection::pb::{v1, v1alpha};
     let known = [DESCRIPTORS, tonic_health::pb::FILE_DESCRIPTOR_SET, v1::FILE_DESCRIPTOR_SET, v1alpha::FILE_DESCRIPTOR_SET];
-    Middleware::new(Authorized::new(routes.prepare(), app.clone()), Methods::new(&known, max_message), closing)
+    let methods = Methods::new(&known, max_message);
+    let inner = LargeMessages::new(routes.prepare(), methods.client_streams(), background);
+    Middleware::new(Authorized::new(inner, app.clone()), methods, closing)
 }
