@@ -7,6 +7,7 @@ use qedgix::env::Point;
 use qedgix::learner::loss::{Loss, TdLambda, Trace};
 use qedgix::learner::{Algorithm, Learner, Preset, TrainConfig};
 use qedgix::nn::{Batch, Graph, GraphLayer, HIDDEN, LayerCache, ParameterLayout, Rows, Weights};
+use qedgix::policy::baselines;
 use qedgix::policy::mixer::{Mixer, MixerCache, MixerKind};
 use qedgix::policy::{
     Advice, Agent, AgentConfig, BatchedAgent, Dims, EnvParams, FleetGraph, FleetStep, Geometry, GeometryConfig, Gnn, HopSearch,
@@ -55,7 +56,7 @@ struct Fleet {
 }
 
 impl Fleet {
-    fn new(policy: &LearnedPolicy, uavs: usize, users: usize, seed: u64) -> Self {
+    fn new(policy: &dyn Policy, uavs: usize, users: usize, seed: u64) -> Self {
         let mut memory = vec![0.0; policy.memory_len(uavs, users)];
         policy.start(uavs, users, seed, &mut memory);
         let (headings, q) = (vec![0; uavs], vec![0.0; uavs * policy.actions()]);
@@ -102,6 +103,35 @@ fn batching_does_not_change_a_bit_of_the_result() {
             assert_eq!(a.bits(), c.bits(), "{config:?}");
         }
     }
+}
+
+#[test]
+fn a_policy_follows_advice_unless_another_heading_is_better_by_the_margin() {
+    let config = AgentConfig { memory: Memory::Shared, advice: Advice::Sweep, ..SET };
+    let rule = baselines::by_name("sweep-shared", ENV).expect("a baseline");
+    let fly = |policy: &dyn Policy, seed: u64| {
+        let mut fleet = Fleet::new(policy, 3, 5, seed);
+        policy.act(&mut [fleet.turn()]);
+        (fleet.headings, fleet.q)
+    };
+    let mut differ = 0;
+    for seed in 0..20 {
+        let (free, q) = fly(&learned(config), seed);
+        let (advised, _) = fly(&*rule, seed);
+        let (bound, _) = fly(&learned(config).with_advice_margin(1e3), seed);
+        assert_eq!(bound, advised);
+        let (_, shifted) = fly(&learned(config).with_advice_margin(0.5), seed);
+        let actions = q.len() / advised.len();
+        for (i, &heading) in advised.iter().enumerate() {
+            for (action, (q, shifted)) in q.iter().zip(&shifted).skip(i * actions).take(actions).enumerate() {
+                // No UAV knows more than 5 of the users, so there are at most 5/3 per UAV.
+                let (low, high) = if action == usize::from(heading) { (0.5, 0.5 * 5.0 / 3.0) } else { (0.0, 0.0) };
+                assert!((low - 1e-5..=high + 1e-5).contains(&(shifted - q)), "{shifted} {q}");
+            }
+        }
+        differ += usize::from(free != advised);
+    }
+    assert!(differ > 10, "random weights follow the advice by chance only: {differ}");
 }
 
 #[test]

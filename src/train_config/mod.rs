@@ -570,6 +570,8 @@ fn overridden<T: Serialize + DeserializeOwned>(section: &str, base: &T, patch: &
 
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
 
     #[test]
@@ -599,7 +601,26 @@ mod tests {
             }
             checked += 1;
         }
-        assert_eq!(checked, 20, "rows of the table with the name of a field");
+        assert_eq!(checked, 22, "rows of the table with the name of a field");
+    }
+
+    #[test]
+    fn advice_needs_a_memory_and_its_margin_needs_advice() {
+        let resolve = |preset, training: Value| {
+            let Value::Object(training) = training else { unreachable!("an object") };
+            TrainConfig::resolve(Algorithm::Qmix, preset, &Map::new(), &training, 1)
+        };
+        let field = |preset, training| resolve(preset, training).unwrap_err().field;
+        assert_eq!(field(Preset::Practical, json!({"memory": "none", "advice": "sweep"})), "training.advice");
+        assert_eq!(field(Preset::Paper, json!({"advice": "sweep"})), "training.advice");
+        assert_eq!(field(Preset::Paper, json!({"advice_margin": 0.1})), "training.advice_margin");
+        assert_eq!(field(Preset::Practical, json!({"advice": "none", "advice_margin": 0.1})), "training.advice_margin");
+        assert_eq!(field(Preset::Practical, json!({"advice_margin": -0.1})), "training.advice_margin");
+        // What a preset brings goes with what it needs.
+        for without in [json!({"memory": "none"}), json!({"advice": "none"})] {
+            let training = resolve(Preset::Practical, without).unwrap().training;
+            assert_eq!((training.advice, training.advice_margin), (Advice::None, 0.0));
+        }
     }
 
     #[test]
