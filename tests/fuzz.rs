@@ -316,7 +316,8 @@ impl Subject {
                 let data = DataDir::lock(dir).unwrap();
                 let app = server::open(&config, &data, Clock::system()).await.unwrap();
                 let health = grpc::Health::new(app.draining.clone(), CancellationToken::new());
-                let services = grpc::services(&app, &health, LARGEST, tokio::runtime::Handle::current(), CancellationToken::new());
+                let services =
+                    grpc::services(&app, &health, LARGEST, tokio::runtime::Handle::current(), CancellationToken::new());
                 let purse = Purse::new(Budget::new(1 << 30));
                 let incoming = move |body| IncomingBody::http1(body, Exchange::http1(purse.clone(), false), LONGEST);
                 let grpc = ServiceBuilder::new()

@@ -186,9 +186,7 @@ impl Trainer {
         let rest = &seeds[run.layouts.len().min(seeds.len())..];
         let part = &rest[..rest.len().min(layouts_per_part(&config.environment, 8))];
         let agent_parameters = parameters[..self.learner.agent().layout().len()].to_vec();
-        let policy = config
-            .policy(agent_parameters)
-            .expect("the parameters have the length of the agent's layout");
+        let policy = config.policy(agent_parameters).expect("the parameters have the length of the agent's layout");
         let metrics = evaluate_until(&policy, &config.environment, part, self.threads, &Disturbance::default(), &self.stop);
         run.layouts.extend(metrics.expect("an agent fits its environment")?);
         let env_steps = run.counters.env_steps;

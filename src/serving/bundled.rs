@@ -12,6 +12,7 @@ use super::PolicyRef;
 /// Name and bytes (safetensors) of each bundled policy; `policies/README.md` has the commands that created them.
 pub const BUNDLED: &[(&str, &[u8])] = &[
     ("qedgix", include_bytes!("../../policies/qedgix.safetensors")),
+    ("qedgix-onboard", include_bytes!("../../policies/qedgix-onboard.safetensors")),
     ("qedgix-paper", include_bytes!("../../policies/qedgix-paper.safetensors")),
     ("qmix", include_bytes!("../../policies/qmix.safetensors")),
 ];

@@ -233,7 +233,7 @@ impl TrainConfig {
                 training.identity = Identity::Phase;
                 training.memory = Memory::Shared;
                 training.advice = Advice::Sweep;
-                training.advice_margin = 0.025;
+                training.advice_margin = 0.03;
                 training.teacher = Some("sweep-shared".to_owned());
                 training.self_position = true;
                 training.learning_rate = 1e-3;

@@ -126,7 +126,7 @@ def client():
         yield opened
 
 
-@pytest.mark.parametrize("policy", ["qedgix", "qedgix-paper", "qmix"])
+@pytest.mark.parametrize("policy", ["qedgix-onboard", "qedgix-paper", "qmix"])
 def test_the_model_decides_as_act_does(client, policy, tmp_path):
     model = exported(policy, tmp_path)
     worst = [fly(client, model, policy, seed, SIZES[seed % len(SIZES)]) for seed in range(LAYOUTS)]
@@ -136,7 +136,7 @@ def test_the_model_decides_as_act_does(client, policy, tmp_path):
 @pytest.mark.parametrize("name", TRAINED)
 def test_every_architecture_has_a_model(client, name, tmp_path):
     file = tmp_path / "policy.safetensors"
-    size = [("training.batch", 4), ("training.envs", 4), ("training.buffer", 64), ("training.eval_episodes", 4)]
+    size = [("training.advice", "none"), ("training.batch", 4), ("training.envs", 4), ("training.buffer", 64), ("training.eval_episodes", 4)]
     settings = [argument for field, value in size for argument in ("--set", f"{field}={value}")]
     told = command("train", *TRAINED[name], "--steps", 640, *settings, "--threads", 1, "--out", file, "--seed", 5)
     assert told.returncode == 0, told.stderr

@@ -27,7 +27,7 @@ fn bundled(name: &str) -> impl Policy {
 fn alone_uavs_decide_with_the_bits_of_the_joint_policy_on_256_layouts() {
     let env = EnvConfig { slots: 24, ..EnvConfig::default() };
     let seeds = layout_list("valid-v1").unwrap().seeds(256);
-    for (name, links) in [("qmix", 1), ("qedgix", 3), ("qedgix-paper", 3)] {
+    for (name, links) in [("qmix", 1), ("qedgix", 3), ("qedgix-onboard", 3), ("qedgix-paper", 3)] {
         let result = audit(&bundled(name), &env, &seeds, 2).unwrap();
         assert!(result.passed(), "{name}: {result:?}");
         assert_eq!((result.reach, result.decisions), (Reach::Links(links), 256 * 24 * 3));

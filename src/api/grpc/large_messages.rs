@@ -83,7 +83,9 @@ where
                 Project::Here { work } => return work.poll(context),
                 Project::Background { work } => {
                     let done = ready!(Pin::new(work).poll(context));
-                    return Poll::Ready(done.unwrap_or_else(|_| Ok(Status::from(Error::internal("a handler panicked")).into_http())));
+                    return Poll::Ready(
+                        done.unwrap_or_else(|_| Ok(Status::from(Error::internal("a handler panicked")).into_http())),
+                    );
                 }
                 Project::Message { call, background } => {
                     let (_, _, body) = call.as_mut().expect("taken only when the state changes");

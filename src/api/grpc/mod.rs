@@ -57,13 +57,7 @@ pub type Services = Middleware<Authorized<LargeMessages<Routes>>>;
 ///
 /// # Panics
 /// If a descriptor set built into the program does not decode.
-pub fn services(
-    app: &Arc<App>,
-    health: &Health,
-    max_message: usize,
-    background: Handle,
-    closing: CancellationToken,
-) -> Services {
+pub fn services(app: &Arc<App>, health: &Health, max_message: usize, background: Handle, closing: CancellationToken) -> Services {
     let reflection = || {
         let builder = tonic_reflection::server::Builder::configure().register_encoded_file_descriptor_set(DESCRIPTORS);
         builder.register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
