@@ -244,9 +244,6 @@ impl Config {
             let expected = "host and port at which the nodes of the cluster reach this machine, such as login1:50052";
             return Err(Invalid::new("--worker-addr", value, expected));
         }
-        if let Some(time) = slurm.time {
-            in_seconds("--slurm-time", time, 60.0..=365.0 * 86_400.0)?;
-        }
         slurm.validate()
     }
 

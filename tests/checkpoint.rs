@@ -4,13 +4,14 @@ use proptest::prelude::*;
 use qedgix::checkpoint::{self, Checkpoint, Error};
 use qedgix::env::EpisodeMetrics;
 use qedgix::learner::{Algorithm, MixerKind, Preset, TrainConfig, evaluate, layout_list};
-use qedgix::policy::{FleetGraph, FleetStep, Policy};
+use qedgix::policy::{Advice, FleetGraph, FleetStep, Policy};
 use rand::RngExt;
 use serde_json::{Value, json};
 
 fn config() -> TrainConfig {
     let mut config = TrainConfig::preset(Algorithm::Qedgix, Preset::Practical);
     config.training.steps = 1000;
+    (config.training.advice, config.training.advice_margin) = (Advice::None, 0.0);
     config
 }
 

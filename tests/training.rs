@@ -48,6 +48,7 @@ fn opposite_config(algorithm: Algorithm) -> TrainConfig {
     config.environment.user_speed = 0.02;
     t.memory = if algorithm.gnn() == Gnn::None { Memory::Own } else { Memory::Shared };
     t.advice = if algorithm == Algorithm::Vdn { Advice::None } else { Advice::Sweep };
+    t.advice_margin = if t.advice.is_none() { 0.0 } else { 0.05 };
     t.teacher = Some("sweep-shared".into());
     config.environment.communication_range = Some(0.5);
     config

@@ -57,6 +57,9 @@ struct OverriddenFields {
 /// The first field that is not accepted, with the prefix `experiment`.
 pub fn experiment(mut document: Map<String, Value>) -> Result<Experiment, Invalid> {
     let overrides = document.remove("overrides").unwrap_or_else(|| Map::new().into());
+    if !overrides.is_object() {
+        return Err(Invalid::schema("experiment.overrides", &overrides, "an object"));
+    }
     let read = serde_path_to_error::deserialize(&overrides).map_err(|e| {
         let field = format!("experiment.overrides.{}", e.path());
         Invalid::from_parser(field.trim_end_matches('.'), e.inner())

@@ -14,6 +14,7 @@ const SCANS: &[(&str, &str)] = &[
     ("SELECT id, COALESCE(owner, id) AS owner, name,", "only after a key has changed; keys are few"),
     ("DELETE FROM snapshots WHERE sha256 IS NULL", "the index has only incomplete snapshots, which are all deleted"),
     ("SELECT j.id, l.job, l.attempt, l.name", "once at the start; as many as workers run"),
+    ("DELETE FROM launches", "once at the start, of all rows"),
     ("WITH ended AS (", "every minute, if old jobs are deleted; reads only the index of jobs that have ended"),
     ("SELECT version FROM _sqlx_migrations", "one row per migration"),
     ("SELECT version FROM written_by", "one row"),

@@ -84,7 +84,7 @@ async fn weights_that_do_not_fit_are_refused_with_the_field_that_differs() {
     };
     for (fields, field) in [
         (json!({"algorithm": "qedgix"}), "algorithm"),
-        (json!({"training": {"memory": "none"}}), "training.memory"),
+        (json!({"training": {"memory": "own"}}), "training.memory"),
         (json!({"environment": {"hover": true}}), "environment.hover"),
         (json!({"init": {"policy": "absent"}}), "init.policy"),
         (json!({"init": {"policy": "sweep"}}), "init.policy"),

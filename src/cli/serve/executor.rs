@@ -31,7 +31,7 @@ pub(super) struct ExecutorArgs {
     slurm_account: Option<String>,
     /// Time limit of each attempt in Slurm, 1 min to 365 days, rounded up to minutes; a job continues from its last snapshot in the next attempt [default: that of the
     /// partition]
-    #[arg(long, help_heading = JOBS, env = "QEDGIX_SLURM_TIME", value_parser = duration, value_name = "TIME")]
+    #[arg(long, help_heading = JOBS, env = "QEDGIX_SLURM_TIME", value_parser = slurm_time, value_name = "TIME")]
     slurm_time: Option<Duration>,
     /// Further flag of sbatch in one word, such as --slurm-extra=--qos=long; repeatable, or several separated by spaces
     #[arg(long, help_heading = JOBS, env = "QEDGIX_SLURM_EXTRA", value_delimiter = ' ', allow_hyphen_values = true, value_name = "FLAG")]
@@ -63,6 +63,13 @@ impl ExecutorArgs {
         };
         (executor, self.worker_addr.clone())
     }
+}
+
+/// Checked here, so that a wrong time is refused whatever the executor is.
+fn slurm_time(text: &str) -> Result<Duration, String> {
+    let time = duration(text)?;
+    let range = Duration::from_secs(60)..=Duration::from_secs(365 * 86_400);
+    if range.contains(&time) { Ok(time) } else { Err("expected 1 min to 365 days".to_owned()) }
 }
 
 fn worker_addr(text: &str) -> Result<WorkerAddr, String> {
