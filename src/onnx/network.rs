@@ -235,15 +235,14 @@ impl Network<'_> {
 
     /// Number of edges of each node, at least 1, (M + N, 1); only of those in `mask` (E, 1), if given.
     fn degrees(&mut self, edges: &Edges, mask: Option<&Tensor>) -> Tensor {
-        let ones = match mask {
-            Some(mask) => self.g.cast(mask, DataType::Float),
-            None => {
-                let one = self.g.list(&[1]);
-                let count = self.g.size(&edges.from, 0);
-                let shape = self.g.concat(&[&count, &one], 0);
-                let one = self.g.float(1.0);
-                self.g.expand(&one, &shape)
-            }
+        let ones = if let Some(mask) = mask {
+            self.g.cast(mask, DataType::Float)
+        } else {
+            let one = self.g.list(&[1]);
+            let count = self.g.size(&edges.from, 0);
+            let shape = self.g.concat(&[&count, &one], 0);
+            let one = self.g.float(1.0);
+            self.g.expand(&one, &shape)
         };
         let degrees = self.sum_by_node(edges, &ones, 1);
         let one = self.g.float(1.0);

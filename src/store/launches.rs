@@ -32,7 +32,7 @@ impl Store {
     /// [`Error`](super::Error) when the database fails.
     pub async fn record_launch(&self, lease: Lease, token: [u8; 32], name: &str, now: Timestamp) -> Result<bool> {
         let mut tx = self.begin().await?;
-        if find(&mut tx, lease.job_id).await?.filter(|job| is_next(job, lease.attempt)).is_none() {
+        if find(&mut tx, lease.job_id).await?.is_none_or(|job| !is_next(&job, lease.attempt)) {
             tx.abandon().await?;
             return Ok(false);
         }

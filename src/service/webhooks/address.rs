@@ -94,7 +94,7 @@ fn is_public_v6(address: Ipv6Addr) -> bool {
         (0x64, 0xff9b) => [c, d, e, f] == [0; 4] && embedded(g, h),
         (0x2002, _) => embedded(b, c),
         // Assignments of protocols (Teredo among them), and documentation.
-        (0x2001, 0..0x200) | (0x2001, 0xdb8) | (0x3fff, 0..0x1000) => false,
+        (0x2001, 0..0x200 | 0xdb8) | (0x3fff, 0..0x1000) => false,
         // All other addresses outside of 2000::/3 are for special purposes.
         _ => (0x2000..0x4000).contains(&a),
     }

@@ -146,13 +146,11 @@ async fn set_logs(Raw(body): Raw) -> Result<Json<Value>, Error> {
             }
             _ => None,
         };
-        match wanted {
-            Some(wanted) => Ok((name, wanted)),
-            None => {
-                let expected = "true, false, a whole number, a string, or null";
-                Err(Error::from(Invalid::schema(format!("settings.{name}"), value, expected)))
-            }
-        }
+        let Some(wanted) = wanted else {
+            let expected = "true, false, a whole number, a string, or null";
+            return Err(Error::from(Invalid::schema(format!("settings.{name}"), value, expected)));
+        };
+        Ok((name, wanted))
     };
     let wanted: Vec<_> = parse_or_default::<Map<String, Value>>(&body)?.into_iter().map(setting).collect::<Result<_, _>>()?;
     oip::check_log_settings(&wanted)?;
