@@ -163,7 +163,7 @@ def test_what_has_no_model_is_refused(tmp_path):
     assert told.returncode == 1 and not list(tmp_path.iterdir())
     for field, value in (("training.hops", "2"), ("training.advice", "sweep")):
         file = tmp_path / "policy.safetensors"
-        more = ["--set", "training.memory=shared"] if field == "training.advice" else []
+        more = ["--set", "training.memory=shared" if field == "training.advice" else "training.advice=none"]
         told = command("train", "--algorithm", "qmix", "--set", f"{field}={value}", *more, "--steps", 320, "--threads", 1, "--out", file)
         assert told.returncode == 0, told.stderr
         told = command("policies", "upload", "onnx-refused", file, "--server", HTTP)
