@@ -18,7 +18,7 @@ use std::future::Future;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use axum::http::Request;
 use tokio::net::TcpListener;
@@ -147,6 +147,20 @@ impl Listeners {
     }
 }
 
+/// Time to wait for the lock of a data directory.
+const LOCK_PATIENCE: Duration = Duration::from_secs(1);
+
+/// Locks the file, and waits up to [`LOCK_PATIENCE`] for another process to release it.
+fn lock_patiently(file: &File) -> Result<(), TryLockError> {
+    let began = Instant::now();
+    loop {
+        match file.try_lock() {
+            Err(TryLockError::WouldBlock) if began.elapsed() < LOCK_PATIENCE => std::thread::sleep(LOCK_PATIENCE / 50),
+            result => return result,
+        }
+    }
+}
+
 /// A data directory, locked by this process until the value is dropped.
 #[derive(Debug)]
 pub struct DataDir {
@@ -157,7 +171,8 @@ pub struct DataDir {
 }
 
 impl DataDir {
-    /// Locks the directory and creates it if missing.
+    /// Locks the directory and creates it if missing. Waits up to [`LOCK_PATIENCE`] for another process to release it: a server that was
+    /// killed while it started a worker leaves its locks for a moment to the process that becomes that worker.
     ///
     /// # Errors
     /// [`Error::InUse`] when another server holds the lock, [`Error::File`] when the directory cannot be written.
@@ -168,7 +183,7 @@ impl DataDir {
         };
         files::create_private_dir(path).map_err(failed(path))?;
         let directory = File::open(path).map_err(failed(path))?;
-        match directory.try_lock() {
+        match lock_patiently(&directory) {
             Err(TryLockError::WouldBlock) => return Err(Error::InUse(path.to_owned())),
             // Some file systems lock only files.
             Err(TryLockError::Error(error)) => tracing::debug!(%error, "the data directory cannot be locked, only a file in it"),
@@ -176,7 +191,7 @@ impl DataDir {
         }
         let file = path.join("lock");
         let lock = files::private_file().truncate(false).open(&file).map_err(failed(&file))?;
-        match lock.try_lock() {
+        match lock_patiently(&lock) {
             Ok(()) => Ok(Self { path: path.to_owned(), _locks: [directory, lock] }),
             Err(TryLockError::WouldBlock) => Err(Error::InUse(path.to_owned())),
             Err(TryLockError::Error(cause)) => Err(failed(&file)(cause)),

@@ -9,6 +9,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use futures::future::BoxFuture;
+use jiff::Timestamp;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
@@ -54,6 +55,7 @@ impl Scheduler {
         }
         while !self.0.draining.begun() {
             let wake = self.0.wake.notified();
+            let looked_at = self.0.clock.now();
             let started = self.start_all(&server).await;
             self.0.queue_readable.send_replace(started.is_ok());
             if let Err(e) = started {
@@ -63,15 +65,16 @@ impl Scheduler {
             }
             tokio::select! {
                 () = wake => {}
-                () = self.delayed() => {}
+                () = self.delayed(looked_at) => {}
                 () = self.0.draining.wait() => {}
             }
         }
     }
 
-    /// Returns when a job may start that waits for a time. If that cannot be found out, the next wake-up looks again.
-    async fn delayed(&self) {
-        match self.0.store.next_delayed(self.0.clock.now()).await {
+    /// Returns when a job may start that could not start at `looked_at`, because it waits for a time. If that cannot be found out, the
+    /// next wake-up looks again.
+    async fn delayed(&self, looked_at: Timestamp) {
+        match self.0.store.next_delayed(looked_at).await {
             Ok(Some(time)) => {
                 let wait = Duration::try_from(time.duration_since(self.0.clock.now())).unwrap_or_default();
                 self.0.clock.sleep_until(self.0.clock.monotonic().saturating_add(wait)).await;
