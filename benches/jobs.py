@@ -4,7 +4,8 @@
     benches/jobs.py --qedgix target/release/qedgix
 
 Prints one line per measurement: the figure, and the bar that it has to meet. Starts servers with a data directory of their own. The
-worker of the only job that starts is stopped (SIGSTOP), so that nothing but the server computes."""
+worker of the only job that starts is stopped (SIGSTOP), so that nothing but the server computes. Rows of metrics are reported in the
+name of that worker, which needs the package grpcio."""
 
 import argparse
 import contextlib
@@ -14,8 +15,10 @@ import os
 import signal
 import sqlite3
 import statistics
+import struct
 import subprocess
 import tempfile
+import threading
 import time
 from pathlib import Path
 
@@ -36,7 +39,9 @@ class Server:
             assert self.process.poll() is None, "the server ended"
             time.sleep(0.002)
         self.start_seconds = time.perf_counter() - begin
-        host, port = json.loads(endpoints.read_text())["http"].rsplit(":", 1)
+        addresses = json.loads(endpoints.read_text())
+        self.grpc = addresses["grpc"]
+        host, port = addresses["http"].rsplit(":", 1)
         self.connection = http.client.HTTPConnection(host, int(port))
 
     def request(self, method: str, path: str, body: object = None) -> bytes:
@@ -56,8 +61,8 @@ class Server:
         status = Path(f"/proc/{self.process.pid}/status").read_text()
         return int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1]) / 1024
 
-    def stop_workers(self) -> None:
-        """Stops the worker of the first job. It lives until its server ends."""
+    def stop_workers(self) -> int:
+        """Stops the worker of the first job, which lives until its server ends. Returns its process id."""
         while True:
             children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
             tasks = Path(f"/proc/{self.process.pid}/task").iterdir()
@@ -65,7 +70,7 @@ class Server:
             if children:
                 for pid in set(children):
                     os.kill(int(pid), signal.SIGSTOP)
-                return
+                return int(children[0])
             time.sleep(0.01)
 
     def kill(self) -> None:
@@ -93,12 +98,92 @@ def add_metrics(data: Path, rows: int) -> str:
     return job
 
 
+class Reporter:
+    """Reports rows of metrics of the first job, as its worker does, at a fixed rate until it is stopped."""
+
+    CALLS = 10  # per second
+
+    def __init__(self, server: Server, worker: int, rate: int) -> None:
+        import grpc
+
+        self.environment = dict(
+            entry.split("=", 1) for entry in Path(f"/proc/{worker}/environ").read_text().split("\0") if "=" in entry
+        )
+        self.metadata = [
+            ("qedgix-job", self.environment["QEDGIX_JOB"]),
+            ("qedgix-attempt", self.environment["QEDGIX_ATTEMPT"]),
+            ("authorization", f"Bearer {self.environment['QEDGIX_TOKEN']}"),
+        ]
+        self.report = grpc.insecure_channel(server.grpc).unary_unary("/qedgix.v1.WorkerService/Report")
+        self.rows, self.times, self.stopped = rate // self.CALLS, [], threading.Event()
+        self.begin = time.perf_counter()
+        self.thread = threading.Thread(target=self.run)
+        self.thread.start()
+
+    def run(self) -> None:
+        step = 0
+        while not self.stopped.wait(max(0.0, self.begin + len(self.times) / self.CALLS - time.perf_counter())):
+            rows = []
+            for _ in range(self.rows // NAMES):
+                step += 1
+                rows += [field(1, field(1, f"metric-{i:02}".encode()) + b"\x10" + varint(step) + b"\x19" + struct.pack("<d", i)) for i in range(NAMES)]
+            begin = time.perf_counter()
+            self.report(b"".join(rows) + b"\x10" + varint(step), metadata=self.metadata, timeout=30)
+            self.times.append((time.perf_counter() - begin) * 1000)
+
+    def stop(self) -> float:
+        """Returns how many rows per second were stored."""
+        self.stopped.set()
+        self.thread.join()
+        return len(self.times) * self.rows / (time.perf_counter() - self.begin)
+
+
+def varint(number: int) -> bytes:
+    """A number in the encoding of protocol buffers."""
+    low, rest = number & 127, number >> 7
+    return bytes([low | 128]) + varint(rest) if rest else bytes([low])
+
+
+def field(number: int, content: bytes) -> bytes:
+    """A field with a length, in the encoding of protocol buffers."""
+    return bytes([number << 3 | 2]) + varint(len(content)) + content
+
+
+def act_p99(program: str, server: Server) -> float:
+    """p99 of `Act` in ms, 200 per second for five seconds."""
+    command = [program, "bench", "act", "--server", server.grpc, "--rate", "200", "--duration", "5s", "--rounds", "1", "--json"]
+    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)["act"]["p99_us"] / 1000
+
+
+def rows_beside_act(program: str, rate: int) -> None:
+    """Measures `Act` alternately without and with rows of metrics that arrive at this rate."""
+    with tempfile.TemporaryDirectory() as directory:
+        server = Server(program, Path(directory))
+        server.request("POST", "/v1/jobs", {"name": "first"})
+        worker = server.stop_workers()
+        p99, stored, calls = ([], []), [], []
+        for _ in range(5):
+            p99[0].append(act_p99(program, server))
+            reporter = Reporter(server, worker, rate)
+            p99[1].append(act_p99(program, server))
+            stored.append(reporter.stop())
+            calls += reporter.times
+        alone, beside = (statistics.median(values) for values in p99)
+        verdict = "ok" if beside < 2 * alone and min(stored) > 0.98 * rate else "MISSED"
+        print(f"Act at 200 per second: p99 {alone:.2f} ms alone, {beside:.2f} ms beside {min(stored):.0f} rows of metrics per second, "
+              f"ratio {beside / alone:.2f}   bar 2   {verdict} (medians of five rounds)")
+        line(f"report of {rate // Reporter.CALLS} rows", calls, 1000 / Reporter.CALLS)
+        server.kill()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--qedgix", default="target/release/qedgix", help="the program [default: target/release/qedgix]")
     parser.add_argument("--jobs", type=int, default=10_000, help="queued jobs [default: 10000]")
     parser.add_argument("--rows", type=int, default=1_000_000, help="metric rows of one job [default: 1000000]")
+    parser.add_argument("--rate", type=int, default=5_000, help="metric rows per second beside Act [default: 5000]")
     args = parser.parse_args()
+    rows_beside_act(args.qedgix, args.rate)
     with tempfile.TemporaryDirectory() as directory:
         data = Path(directory)
         server = Server(args.qedgix, data)

@@ -91,13 +91,15 @@ class Model:
         return observed, state, seen * (1 - x.eye(V))
 
     def edge_conv(self, p, layer, v, links, outputs):
+        # LayerNorm subtracts the mean of every edge; it is subtracted from the weights instead.
+        centred = lambda v: v - v.mean(-1, keepdims=True)
         w = p[f"edge{layer}.w"]
-        own = v[:, :, :outputs] @ (w[:H] - w[H:]) + p[f"edge{layer}.b"]
-        other = v @ w[H:]
-        hidden = self.norm_relu(p, f"edge{layer}", own[:, :, :, None] + other[:, :, None])
+        own = v[:, :, :outputs] @ centred(w[:H] - w[H:]) + centred(p[f"edge{layer}.b"])
+        other = v @ centred(w[H:])
         links = links[:, :, :outputs]
         degree = links.sum(-1, keepdims=True)
-        total = (hidden * links[..., None]).sum(3) / self.x.at_least_one(degree)
+        shares = links / self.x.at_least_one(degree)
+        total = self.x.edges(own, other, shares, p[f"edge{layer}.scale"], p[f"edge{layer}.shift"])
         return self.linear(p, f"out{layer}", total) * self.x.number(degree > 0)
 
     def values(self, p, scene, last):

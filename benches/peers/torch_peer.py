@@ -17,6 +17,12 @@ class Ops:
     argmax = staticmethod(lambda v: v.argmax(-1))
 
     @staticmethod
+    def edges(own, other, shares, scale, shift):
+        z = own[:, :, :, None] + other[:, :, None]
+        rstd = torch.rsqrt((z * z).mean(-1, keepdim=True) + 1e-5)
+        return (F.relu(z * rstd * scale + shift) * shares[..., None]).sum(3)
+
+    @staticmethod
     def walk(inputs, w, b):
         H = model.H
         h, out = torch.zeros(inputs.shape[0], model.M, H), []
