@@ -103,11 +103,11 @@ async fn wait(seconds: u64) {
     tokio::time::sleep(Duration::from_secs(seconds)).await;
 }
 
-/// Runs the hostile clients in a process of their own, with a lower priority: they stand for other machines, which would not
-/// take processor time away from the server.
+/// Runs the hostile clients in a process of their own, which runs only when no other process wants the processor: they stand for other
+/// machines, which would not take processor time away from the server.
 fn hostile_process(target: &Target, seconds: u64) -> std::process::Child {
-    let mut command = Command::new("nice");
-    command.args(["-n", "10"]).arg(std::env::current_exe().unwrap());
+    let mut command = Command::new("chrt");
+    command.args(["--idle", "0"]).arg(std::env::current_exe().unwrap());
     command.args(["--exact", "hostile_clients", "--ignored", "--nocapture"]);
     command.env(TARGET, serde_json::to_string(target).unwrap()).env(SECONDS, seconds.to_string());
     command.stdin(Stdio::null()).spawn().unwrap()
