@@ -82,6 +82,14 @@ impl Graph {
         self.cast(condition, DataType::Double)
     }
 
+    /// Each index as a row of `width` numbers, f32: 1 at the index, else 0.
+    pub(super) fn one_hot(&mut self, index: &Tensor, width: usize) -> Tensor {
+        let all: Vec<i64> = (0..width as i64).collect();
+        let (all, index) = (self.ints(&[1, width as i64], &all), self.unsqueeze(index, &[1]));
+        let equal = self.with("Equal", &index, &all);
+        self.cast(&equal, DataType::Float)
+    }
+
     /// Columns as the last axis.
     pub(super) fn stack(&mut self, columns: &[Tensor]) -> Tensor {
         let columns: Vec<Tensor> = columns.iter().map(|column| self.unsqueeze(column, &[-1])).collect();

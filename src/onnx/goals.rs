@@ -22,17 +22,18 @@ const HUGE: f64 = 1e300;
 pub(super) struct GoalTable {
     valid: Tensor,
     headings: Tensor,
-    /// (M, G, 16), f32.
+    /// (M, G, 16), f32; with advice (M, G, 17).
     features: Tensor,
 }
 
 impl Network<'_> {
-    /// The goals. `sectors` (M, 6) are the bounds of the UAVs' sectors, `last` (M) their last headings.
+    /// The goals. `sectors` (M, 6) are the bounds of the UAVs' sectors, `last` (M) their last headings, `advised` (M) the advised ones.
     pub(super) fn goals(
         &mut self,
         memory: &Memory,
         sight: &Sight,
-        (positions, slot, last, sectors): (&Tensor, &Tensor, &Tensor, &Tensor),
+        (positions, slot, sectors): (&Tensor, &Tensor, &Tensor),
+        (last, advised): (&Tensor, Option<&Tensor>),
     ) -> GoalTable {
         let env = self.agent.dims().env;
         let state = self.g.column(&memory.users, 0);
@@ -60,6 +61,7 @@ impl Network<'_> {
         // The same for all goals of a UAV.
         columns.extend(common.iter().map(|column| g.with("Add", column, &zeros)));
         columns.extend(shared);
+        columns.extend(advised.map(|advised| towards(g, &headings, advised)));
         let features = g.stack(&columns);
         GoalTable { valid, headings, features: g.cast(&features, DataType::Float) }
     }
@@ -67,7 +69,7 @@ impl Network<'_> {
     /// Adds the best score per heading to the Q-values.
     pub(super) fn score_goals(&mut self, goals: &GoalTable, context: &[&Tensor], q: &Tensor) -> Tensor {
         let name = "agent.goals.0";
-        let features = Goals::FEATURES;
+        let features = Goals::FEATURES + usize::from(!self.agent.config().advice.is_none());
         let weight = self.columns(&format!("{name}.weight"), 0..features);
         let weight = self.g.transpose(&weight);
         let mut hidden = self.g.with("MatMul", &goals.features, &weight);
@@ -281,34 +283,13 @@ fn headings_and_shared(
     sight: &Sight,
     (positions, targets, last): (&Tensor, &Tensor, &Tensor),
 ) -> (Tensor, Vec<Tensor>) {
-    let compass = EnvConfig::COMPASS as i64;
-    let direction = |axis: usize| DIRECTIONS[..EnvConfig::COMPASS].iter().map(|d| d[axis]).collect::<Vec<f64>>();
-    let [right, up] = [0, 1].map(|axis| g.doubles(&[compass], &direction(axis)));
-    let [dx, dy] = g.difference((targets, &[]), (positions, &[1]));
-    let offsets = [g.unsqueeze(&dx, &[2]), g.unsqueeze(&dy, &[2])];
-    let (a, b) = (g.with("Mul", &offsets[0], &right), g.with("Mul", &offsets[1], &up));
-    let progress = g.with("Add", &a, &b);
-    let inside = stays_inside(g, env, positions, [&right, &up]);
-    let lowest = g.double(-HUGE);
-    let progress = g.choose(&inside, &progress, &lowest);
-    let headings = g.arg_max(&progress, 2);
-
-    let distance = g.squares(&[dx, dy]);
-    let mine = g.map("Sqrt", &distance);
-    let others = g.difference((&sight.uavs, &[2]), (targets, &[1]));
-    let others = g.squares(&others);
-    let others = g.map("Sqrt", &others);
-    let sees = g.unsqueeze(&sight.sees_uav, &[2]);
-    let far = g.double(HUGE);
-    let others = g.choose(&sees, &others, &far);
-    let nearest = g.min(&others, 1);
+    let headings = headings_toward(g, env, positions, targets);
+    let [mine, nearest] = distances(g, sight, positions, targets);
     let lead = g.with("Sub", &nearest, &mine);
     let lead = g.over(&lead, env.detection_range);
     let contested = g.with("Less", &nearest, &mine);
     let contested = g.indicator(&contested);
-    let last = g.unsqueeze(last, &[1]);
-    let onward = g.with("Equal", &headings, &last);
-    let onward = g.indicator(&onward);
+    let onward = towards(g, &headings, last);
     let away = g.over(&mine, env.detection_range);
     let away = g.add_to(&away, -1.0);
     let (low, high) = (g.double(-1.0), g.double(1.0));
@@ -320,6 +301,42 @@ fn headings_and_shared(
     let zeros = g.times(&mine, 0.0);
     let ones = g.add_to(&zeros, 1.0);
     (headings, vec![lead, contested, onward, away, ones])
+}
+
+/// Whether each of `headings` (M, G) is the one of its UAV in `of_uavs` (M).
+fn towards(g: &mut Graph, headings: &Tensor, of_uavs: &Tensor) -> Tensor {
+    let of_uavs = g.unsqueeze(of_uavs, &[1]);
+    let equal = g.with("Equal", headings, &of_uavs);
+    g.indicator(&equal)
+}
+
+/// The heading from each position (M, 2) towards each of its `targets` (M, G, 2): (M, G).
+pub(super) fn headings_toward(g: &mut Graph, env: &EnvParams, positions: &Tensor, targets: &Tensor) -> Tensor {
+    let compass = EnvConfig::COMPASS as i64;
+    let direction = |axis: usize| DIRECTIONS[..EnvConfig::COMPASS].iter().map(|d| d[axis]).collect::<Vec<f64>>();
+    let [right, up] = [0, 1].map(|axis| g.doubles(&[compass], &direction(axis)));
+    let [dx, dy] = g.difference((targets, &[]), (positions, &[1]));
+    let (dx, dy) = (g.unsqueeze(&dx, &[2]), g.unsqueeze(&dy, &[2]));
+    let (a, b) = (g.with("Mul", &dx, &right), g.with("Mul", &dy, &up));
+    let progress = g.with("Add", &a, &b);
+    let inside = stays_inside(g, env, positions, [&right, &up]);
+    let lowest = g.double(-HUGE);
+    let progress = g.choose(&inside, &progress, &lowest);
+    g.arg_max(&progress, 2)
+}
+
+/// The distances of each UAV, and of the nearest other one that it detects, from its `targets` (M, G, 2): (M, G) each.
+pub(super) fn distances(g: &mut Graph, sight: &Sight, positions: &Tensor, targets: &Tensor) -> [Tensor; 2] {
+    let mine = g.difference((targets, &[]), (positions, &[1]));
+    let others = g.difference((&sight.uavs, &[2]), (targets, &[1]));
+    let [mine, others] = [mine, others].map(|offsets| {
+        let squares = g.squares(&offsets);
+        g.map("Sqrt", &squares)
+    });
+    let sees = g.unsqueeze(&sight.sees_uav, &[2]);
+    let far = g.double(HUGE);
+    let others = g.choose(&sees, &others, &far);
+    [mine, g.min(&others, 1)]
 }
 
 /// Whether each heading stays in the area, (M, 1, 8); all do if none does.

@@ -127,6 +127,11 @@ impl Graph {
         self.constant(DataType::Int64, dims, values.iter().flat_map(|x| x.to_le_bytes()).collect())
     }
 
+    /// A constant of truth values.
+    pub(super) fn bools(&mut self, dims: &[i64], values: &[bool]) -> Tensor {
+        self.constant(DataType::Bool, dims, values.iter().map(|&x| u8::from(x)).collect())
+    }
+
     /// A vector of integers, such as a shape.
     pub(super) fn list(&mut self, values: &[i64]) -> Tensor {
         self.ints(&[values.len() as i64], values)
@@ -265,6 +270,12 @@ impl Graph {
     pub(super) fn sum(&mut self, x: &Tensor, axes: &[i64], keep: bool) -> Tensor {
         let axes = self.list(axes);
         self.op("ReduceSum", &[x, &axes], vec![int("keepdims", i64::from(keep))])
+    }
+
+    /// The sums of the first 1, 2, ... elements along an axis, each added to the sum before it.
+    pub(super) fn running_sum(&mut self, x: &Tensor, axis: i64) -> Tensor {
+        let axis = self.integer(axis);
+        self.op("CumSum", &[x, &axis], vec![])
     }
 
     /// Maxima over one axis, which is not empty.

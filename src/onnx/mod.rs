@@ -1,8 +1,10 @@
 //! Learned policies as ONNX models, which fly without a server (docs/onboard.md): one slot of one fleet, with what UAVs remember as inputs
 //! and outputs.
 //!
-//! `network` has the networks, `memory` what UAVs remember, `goals` their goals, `places` tables, `graph` and `expressions` the operators.
+//! `network` has the networks, `memory` what UAVs remember, `goals` their goals, `advice` what they are advised, `places` tables, `graph` and
+//! `expressions` the operators.
 
+mod advice;
 mod expressions;
 mod goals;
 mod graph;
@@ -12,6 +14,8 @@ mod places;
 
 use prost::Message;
 
+use self::advice::Advice;
+use self::goals::GoalTable;
 use self::graph::{Dim, Graph, Tensor};
 use self::memory::Memory;
 use self::network::{Edges, Network};
@@ -29,20 +33,17 @@ const EDGES: Dim = Dim::Symbol("edges");
 /// The policy of a checkpoint as an ONNX model. `name` is for people.
 ///
 /// # Errors
-/// [`Invalid`] for architectures that have no ONNX form: those with `advice`, and those that observe over several links.
+/// [`Invalid`] for architectures that have no ONNX form: those that observe over several links.
 pub fn export(checkpoint: &Checkpoint, name: &str) -> Result<Vec<u8>, Invalid> {
     let policy: LearnedPolicy = checkpoint.policy();
     let (agent, env) = (policy.agent(), policy.agent().dims().env);
     let config = *agent.config();
-    if !config.advice.is_none() {
-        let expected = "none: the plan that `sweep` advises is not part of the network";
-        return Err(Invalid::new("training.advice", "sweep", expected));
-    }
     if config.hops > 1 {
         let expected = "1: what a UAV observes over several links is not part of the network";
         return Err(Invalid::new("training.hops", config.hops, expected));
     }
-    let mut network = Network { g: Graph::default(), agent, params: policy.parameters() };
+    let (params, advice_margin) = (policy.parameters(), policy.advice_margin());
+    let mut network = Network { g: Graph::default(), agent, params, advice_margin };
     slot(&mut network, &config);
     let metadata = vec![
         ("policy", name.to_owned()),
@@ -70,6 +71,13 @@ struct Optional {
     memory: Option<(Tensor, Memory)>,
 }
 
+/// What UAVs with a memory know before their networks run.
+struct Knowledge {
+    memory: Memory,
+    advice: Option<Advice>,
+    goals: GoalTable,
+}
+
 /// Builds one slot.
 fn slot(n: &mut Network<'_>, config: &AgentConfig) {
     let hidden = [UAVS, Dim::Fixed(HIDDEN as i64)];
@@ -91,7 +99,9 @@ fn slot(n: &mut Network<'_>, config: &AgentConfig) {
     let slots = n.g.float(n.agent.dims().env.slots as f32);
     let scaled = n.g.with("Div", &aoi, &slots);
     let observations = n.observations(&edges, &scaled);
-    let x = uav_inputs(n, config, (&edges, &observations, &last), &optional);
+    let knowledge = knowledge(n, config, (&edges, &aoi, &last), &optional);
+    let advice = knowledge.as_ref().and_then(|knowledge| knowledge.advice.as_ref());
+    let x = uav_inputs(n, config, (&edges, &observations, &last), (&optional, advice));
     let x = n.embed(&x, "agent.fc");
     let after = n.gru(&x, &h);
     let (mut q, y) = if config.gnn == Gnn::None {
@@ -101,14 +111,12 @@ fn slot(n: &mut Network<'_>, config: &AgentConfig) {
         let both = n.g.concat(&[&after, &y], 1);
         (n.mlp(&both, "agent.head"), Some(y))
     };
-    if let (Some((slot, before)), Some(position), Some(place)) = (&optional.memory, &optional.position, &optional.place) {
-        let slot = n.g.cast(slot, DataType::Double);
-        let sight = n.sight(&edges, position);
-        let memory = n.remember(before, &sight, (position, &aoi, &slot));
-        let sectors = places::sectors(&mut n.g, place);
-        let goals = n.goals(&memory, &sight, (position, &slot, &last, &sectors));
+    if let Some(Knowledge { memory, advice, goals }) = &knowledge {
         let context: Vec<&Tensor> = [Some(&after), y.as_ref()].into_iter().flatten().collect();
-        q = n.score_goals(&goals, &context, &q);
+        q = n.score_goals(goals, &context, &q);
+        if let Some(advice) = advice {
+            q = n.trust(&q, advice);
+        }
         n.g.output(&memory.ground, "ground_out", floats(&ground_shape()), "`ground` of the next slot");
         n.g.output(&memory.users, "users_out", floats(&users_shape()), "`users` of the next slot");
     }
@@ -158,25 +166,38 @@ fn optional_inputs(n: &mut Network<'_>, config: &AgentConfig) -> Optional {
     optional
 }
 
+/// What the UAVs remember after they have detected, and what follows from it.
+fn knowledge(
+    n: &mut Network<'_>,
+    config: &AgentConfig,
+    (edges, aoi, last): (&Edges, &Tensor, &Tensor),
+    optional: &Optional,
+) -> Option<Knowledge> {
+    let ((slot, before), position, place) = (optional.memory.as_ref()?, optional.position.as_ref()?, optional.place.as_ref()?);
+    let slot = n.g.cast(slot, DataType::Double);
+    let sight = n.sight(edges, position);
+    let memory = n.remember(before, &sight, (position, aoi, &slot));
+    let advice = (!config.advice.is_none()).then(|| n.advice(&memory, &sight, (position, &slot, place)));
+    let sectors = places::sectors(&mut n.g, place);
+    let advised = advice.as_ref().map(|advice| &advice.headings);
+    let goals = n.goals(&memory, &sight, (position, &slot, &sectors), (last, advised));
+    Some(Knowledge { memory, advice, goals })
+}
+
 /// The inputs of the UAVs' networks (docs/model.md, "UAV input").
 fn uav_inputs(
     n: &mut Network<'_>,
     config: &AgentConfig,
     (edges, observations, last): (&Edges, &Tensor, &Tensor),
-    optional: &Optional,
+    (optional, advice): (&Optional, Option<&Advice>),
 ) -> Tensor {
-    let one_hot = |g: &mut Graph, index: &Tensor, width: usize| {
-        let all: Vec<i64> = (0..width as i64).collect();
-        let (all, index) = (g.ints(&[1, width as i64], &all), g.unsqueeze(index, &[1]));
-        let equal = g.with("Equal", &index, &all);
-        g.cast(&equal, DataType::Float)
-    };
+    let actions = n.agent.dims().env.actions;
     let zero = n.g.list(&[0]);
     let mut parts = vec![n.g.slice_at(observations, 0, &zero, &edges.uavs)];
-    parts.push(one_hot(&mut n.g, last, n.agent.dims().env.actions));
+    parts.push(n.g.one_hot(last, actions));
     match (config.identity, &optional.place, &optional.number) {
         (Identity::Phase, Some(place), _) => parts.push(places::phases(&mut n.g, place)),
-        (Identity::Onehot, _, Some(number)) => parts.push(one_hot(&mut n.g, number, n.agent.dims().uavs)),
+        (Identity::Onehot, _, Some(number)) => parts.push(n.g.one_hot(number, n.agent.dims().uavs)),
         _ => parts.extend(optional.token.clone()),
     }
     if let Some(position) = optional.position.as_ref().filter(|_| config.self_position) {
@@ -185,6 +206,9 @@ fn uav_inputs(
         let position = n.g.with("Sub", &position, &middle);
         let scale = n.g.float(if config.normalise { 2.0 } else { 1.0 });
         parts.push(n.g.with("Mul", &position, &scale));
+    }
+    if let Some(advice) = advice {
+        parts.push(n.g.one_hot(&advice.headings, actions));
     }
     n.g.concat(&parts.iter().collect::<Vec<_>>(), 1)
 }

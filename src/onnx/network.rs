@@ -10,6 +10,7 @@ pub(super) struct Network<'a> {
     pub(super) g: Graph,
     pub(super) agent: &'a Agent,
     pub(super) params: &'a [f32],
+    pub(super) advice_margin: f32,
 }
 
 /// Detections as lists of edges, and what follows from the sizes of the fleet.

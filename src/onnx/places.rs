@@ -3,6 +3,7 @@
 use std::f64::consts::{FRAC_PI_4, PI};
 
 use super::graph::{Graph, Tensor};
+use crate::env::Point;
 use crate::policy::Place;
 
 /// Maximum size of a fleet in the tables.
@@ -39,6 +40,18 @@ pub(super) fn phases(g: &mut Graph, index: &Tensor) -> Tensor {
 pub(super) fn sectors(g: &mut Graph, index: &Tensor) -> Tensor {
     let values: Vec<f64> = rows().flat_map(|(i, uavs)| sector(i, uavs)).collect();
     let table = g.doubles(&[values.len() as i64 / 6, 6], &values);
+    g.gather(&table, index)
+}
+
+/// Whether each of `points` is in the sector of each place, (M, points).
+pub(super) fn owners(g: &mut Graph, index: &Tensor, points: &[Point]) -> Tensor {
+    let owns = |(i, uavs)| {
+        let place = Place::of(i, uavs);
+        points.iter().map(move |&p| place.owns(p))
+    };
+    let values: Vec<bool> = rows().flat_map(owns).collect();
+    let width = points.len() as i64;
+    let table = g.bools(&[values.len() as i64 / width, width], &values);
     g.gather(&table, index)
 }
 

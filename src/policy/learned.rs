@@ -77,6 +77,11 @@ impl LearnedPolicy {
         &self.agent
     }
 
+    /// The margin of [`LearnedPolicy::with_advice_margin`].
+    pub fn advice_margin(&self) -> f32 {
+        self.advice_margin
+    }
+
     /// The parameters, in the order of the agent's layout.
     pub fn parameters(&self) -> &[f32] {
         &self.params

@@ -19,7 +19,7 @@ pub mod memory;
 pub mod mixer;
 mod neighbor_search;
 mod sight;
-mod sweep_plan;
+pub(crate) mod sweep_plan;
 
 pub use agent::{Agent, AgentCache, Dims};
 pub use batched_agent::{BatchedAgent, StepInput};

@@ -10,24 +10,24 @@ use super::{EnvParams, FleetProfile, Place, Sight};
 use crate::env::Point;
 
 /// Blocks of cells along each side of the square.
-const BLOCKS: usize = 10;
+pub(crate) const BLOCKS: usize = 10;
 /// Cells along each side of a block.
 const SIDE: usize = GRID / BLOCKS;
 
 /// Weights of the rule, chosen on `valid-v1`.
-struct Weights {
+pub(crate) struct Weights {
     /// Weight of cells in the sectors of other UAVs; in the UAV's own sector it is 1.
-    foreign_sector: f64,
+    pub(crate) foreign_sector: f64,
     /// Weight of the AoI expected in cells that were not searched relative to known AoI: a user that is found can be served many
     /// times.
-    search: f64,
+    pub(crate) search: f64,
     /// Weight of a user to whom a detected UAV is nearer.
-    contested: f64,
+    pub(crate) contested: f64,
     /// AoI is divided by the flight time to this power. Above 1, near users are preferred.
-    time_power: f64,
+    pub(crate) time_power: f64,
 }
 
-const WEIGHTS: Weights = Weights { foreign_sector: 0.02, search: 2.0, contested: 0.3, time_power: 1.25 };
+pub(crate) const WEIGHTS: Weights = Weights { foreign_sector: 0.02, search: 2.0, contested: 0.3, time_power: 1.25 };
 
 /// Calls `advise` with the index of each UAV of a fleet and the heading that it would fly in slot `slot`. `memories` are those of this
 /// slot.
