@@ -7,6 +7,7 @@ use anyhow::{Context, ensure};
 use clap::Args;
 
 use super::connect::ConnectArgs;
+use super::figures::FigureArgs;
 use super::files::read_if_exists;
 use super::output::{errln, outln};
 use super::{act_client, explain, ports, progress, report, run_args::all_cores, table};
@@ -25,6 +26,7 @@ use crate::serving::bundled;
 #[command(after_help = "Examples:
   qedgix evaluate --policy sweep --policy nearest
   qedgix evaluate --policy qedgix --policy sweep --report report      # then open report/index.html
+  qedgix evaluate --policy qedgix --policy sweep --report report --figures svg,pdf   # PDF for a paper
   qedgix evaluate --policy sweep --policy my-job:1 --server 127.0.0.1:50051 --episodes 16
 
 Conditions that differ from training:
@@ -83,7 +85,7 @@ pub struct EvaluateArgs {
     server: Option<String>,
     #[command(flatten)]
     connect: ConnectArgs,
-    /// Write a report with tables and plots into this directory: index.html, report.md, report.json, *.svg
+    /// Write a report with tables and plots into this directory: index.html, report.md, report.json, and the plots as files
     #[arg(long, env = "QEDGIX_REPORT", value_name = "DIR")]
     report: Option<PathBuf>,
     /// Index of the layout (from 0) whose trajectories the report shows
@@ -93,6 +95,8 @@ pub struct EvaluateArgs {
     /// (--report-layout): explain-N-POLICY.svg and .json
     #[arg(long, env = "QEDGIX_EXPLAIN", value_name = "DIR")]
     explain: Option<PathBuf>,
+    #[command(flatten)]
+    figures: FigureArgs,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -152,13 +156,13 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
     }
     bar.finish_and_clear();
     if let Some(directory) = &args.explain {
-        explain::write(directory, (&args.policy, &|name| open(name, &env)), &env, seeds[args.report_layout])
+        explain::write((directory, &args.figures), (&args.policy, &|name| open(name, &env)), &env, seeds[args.report_layout])
             .with_context(|| format!("writing explanations to {}", directory.display()))?;
     }
 
     let comparison = Comparison { layouts: list, episodes: seeds.len(), env, disturbance, policies: evaluations };
     if let Some(directory) = &args.report {
-        report::write(directory, &comparison, &args.command_line())
+        report::write((directory, &args.figures), &comparison, &args.command_line())
             .with_context(|| format!("writing the report to {}", directory.display()))?;
     }
     if args.json {
@@ -264,6 +268,9 @@ impl EvaluateArgs {
         }
         if let Some(directory) = &self.report {
             add("report", directory.display().to_string());
+        }
+        if let Some(figures) = self.figures.value() {
+            add("figures", figures);
         }
         words.join(" ")
     }

@@ -5,8 +5,9 @@ use std::sync::Arc;
 
 use serde_json::{Value, json};
 
+use super::figures::FigureArgs;
+use super::files::write_atomic;
 use crate::env::{EnvConfig, Point};
-use crate::files;
 use crate::learner::{ExplainedSlot, explained_flight};
 use crate::plot::{self, Pull, Trajectories};
 use crate::policy::Policy;
@@ -21,7 +22,7 @@ const STRONGEST: usize = 2;
 /// # Errors
 /// A policy that does not fit the environment, files that cannot be written.
 pub fn write(
-    directory: &Path,
+    (directory, figures): (&Path, &FigureArgs),
     (policies, open): (&[String], &dyn Fn(&str) -> anyhow::Result<Arc<dyn Policy>>),
     env: &EnvConfig,
     seed: u64,
@@ -34,8 +35,8 @@ pub fn write(
         let last = name.rsplit(['/', '\\']).next().unwrap_or(name);
         let last: String = last.chars().take(40).map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect();
         let file = directory.join(format!("explain-{}-{last}", i + 1));
-        files::write_atomic(&file.with_extension("svg"), figure(name, &slots, &env).as_bytes())?;
-        files::write_atomic(&file.with_extension("json"), format!("{:#}\n", document(name, seed, &slots)).as_bytes())?;
+        figures.write(&file.with_extension("svg"), &figure(name, &slots, &env))?;
+        write_atomic(&file.with_extension("json"), format!("{:#}\n", document(name, seed, &slots)).as_bytes())?;
     }
     Ok(())
 }

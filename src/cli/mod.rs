@@ -10,6 +10,7 @@ mod demo;
 mod evaluate;
 mod experiment;
 mod explain;
+mod figures;
 mod files;
 mod in_process_server;
 mod jobs;

@@ -6,12 +6,13 @@ use anyhow::{Context, ensure};
 use clap::Args;
 use serde_json::{Value, json};
 
+use super::figures::FigureArgs;
+use super::files::write_atomic;
 use super::output::{Exit, outln};
 use super::run_args::all_cores;
 use super::table::text_table;
 use super::{evaluate, progress};
 use crate::env::{EnvConfig, EpisodeMetrics, LostUav};
-use crate::files;
 use crate::learner::{Disturbance, Failure, FleetSize, Interval, Sizing, SizingTarget, evaluate_traced, layout_list};
 use crate::plot::{self, Chart, Series};
 
@@ -23,7 +24,8 @@ use crate::plot::{self, Chart, Series};
 
 Examples:
   qedgix plan --policy qedgix --users 12 --target-p95 10
-  qedgix plan --policy sweep-shared --users 12 --target-p95 20 --failures --report plan   # plan/plan.svg, failures.svg, plan.json"
+  qedgix plan --policy sweep-shared --users 12 --target-p95 20 --failures --report plan   # plan/plan.svg, failures.svg, plan.json
+  qedgix plan --policy qedgix --users 12 --target-p95 10 --report plan --figures pdf      # plan/plan.pdf, plan.json"
 )]
 pub struct PlanArgs {
     /// A checkpoint file, a bundled policy or a baseline, for any number of UAVs
@@ -65,6 +67,8 @@ pub struct PlanArgs {
     /// Write plan.svg, plan.json and, with --failures, failures.svg into this directory
     #[arg(long, env = "QEDGIX_REPORT", value_name = "DIR")]
     report: Option<PathBuf>,
+    #[command(flatten)]
+    figures: FigureArgs,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -82,12 +86,12 @@ pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     let plan = args.plan(&list.seeds(args.episodes))?;
     let document = args.document(&plan);
     if let Some(directory) = &args.report {
-        let write = |name: &str, text: &str| files::write_atomic(&directory.join(name), text.as_bytes());
-        std::fs::create_dir_all(directory)
-            .and_then(|()| write("plan.svg", &args.figure(&plan)))
-            .and_then(|()| write("plan.json", &format!("{document:#}\n")))
-            .and_then(|()| if args.failures { write("failures.svg", &args.failure_figure(&plan)) } else { Ok(()) })
-            .with_context(|| format!("writing to {}", directory.display()))?;
+        std::fs::create_dir_all(directory).with_context(|| format!("cannot create {}", directory.display()))?;
+        args.figures.write(&directory.join("plan.svg"), &args.figure(&plan))?;
+        write_atomic(&directory.join("plan.json"), format!("{document:#}\n").as_bytes())?;
+        if args.failures {
+            args.figures.write(&directory.join("failures.svg"), &args.failure_figure(&plan))?;
+        }
     }
     if args.json {
         outln!("{document:#}")?;

@@ -19,4 +19,4 @@ pub use plots::plots;
 pub use run_result::{EvaluatedWeights, RunResult};
 pub use settings::Overrides;
 pub use summary::{BaselineSummary, ExperimentSummary, PairedDifference, SeriesSummary};
-pub use tables::{difference_cells, metric_cells, readme};
+pub use tables::{difference_cells, figure_link, metric_cells, readme};

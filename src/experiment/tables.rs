@@ -6,7 +6,13 @@ use super::{Experiment, ExperimentSummary};
 use crate::env::EpisodeMetrics;
 use crate::learner::Interval;
 
-/// The page. `plots` are the names of the SVG files beside it.
+/// A figure in Markdown: the picture, or, as Markdown shows no PDF, a link to it.
+pub fn figure_link(caption: &str, file: &str) -> String {
+    let picture = if file.ends_with(".pdf") { "" } else { "!" };
+    format!("{picture}[{caption}]({file})")
+}
+
+/// The page. `plots` are the names of the figures beside it.
 pub fn readme(experiment: &Experiment, summary: &ExperimentSummary, command: &str, plots: &[String]) -> String {
     let mut page = Page(format!("# {}\n", summary.title));
     page.line(&format!(
@@ -21,7 +27,7 @@ pub fn readme(experiment: &Experiment, summary: &ExperimentSummary, command: &st
     page.line("This command repeats the experiment, and resumes it after an interruption:");
     page.line(&format!("```sh\n{command}\n```"));
     for plot in plots {
-        page.line(&format!("![{plot}]({plot})"));
+        page.line(&figure_link(plot, plot));
     }
     // Without names, the column of points is left out.
     let points = experiment.points.iter().any(|point| !point.name.is_empty());

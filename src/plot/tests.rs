@@ -142,3 +142,47 @@ fn ticks_are_round_and_few() {
         assert!(ticks.len() <= 8 && !ticks.is_empty() && ticks.iter().all(|tick| tick.is_finite()), "{range:?}: {ticks:?}");
     }
 }
+
+#[test]
+fn a_figure_has_the_same_text_as_pdf_and_png_without_fonts_of_the_machine() {
+    let points = vec![[0.0, 1.0], [1.0, 3.0], [2.0, 2.0]];
+    let svg = lines(&chart(points.clone(), Some(points), true));
+    let pdf = pdf(&svg).unwrap();
+    assert!(pdf.starts_with(b"%PDF-") && pdf.trim_ascii_end().ends_with(b"%%EOF"));
+    let text = String::from_utf8_lossy(&pdf);
+    // Both weights are embedded, as fonts whose glyphs have letters.
+    for part in ["OpenSans", "OpenSans-Bold", "/FontFile", "/ToUnicode", "/MediaBox [0 0 252 "] {
+        assert!(text.contains(part), "{part}");
+    }
+    assert_eq!(pdf, super::pdf(&svg).unwrap());
+    let png = png(&svg).unwrap();
+    assert_eq!(size(&png), [2 * canvas::WIDTH, 2 * height(&svg)]);
+    assert_eq!(png, super::png(&svg).unwrap());
+    // Text is drawn: without it, the picture is another one.
+    let without: String = svg.split("<text").map(|part| part.split_once("</text>").map_or(part, |(_, rest)| rest)).collect();
+    assert_ne!(png, super::png(&without).unwrap());
+}
+
+/// Width and height of a PNG.
+fn size(png: &[u8]) -> [u32; 2] {
+    assert!(png.starts_with(b"\x89PNG\r\n\x1a\n"));
+    [16, 20].map(|at| u32::from_be_bytes(png[at..at + 4].try_into().unwrap()))
+}
+
+fn height(svg: &str) -> u32 {
+    let (_, rest) = svg.split_once("height=\"").unwrap();
+    rest.split_once('"').unwrap().0.parse().unwrap()
+}
+
+#[test]
+fn names_of_any_letters_are_converted_and_what_is_no_figure_is_refused() {
+    for name in ["Größe, Ελλάδα, Москва", "漢字 \u{1f681} \u{202e}", "\u{fffe}\u{ffff}\u{7f}", "&#0;<>&\"'", ""] {
+        let svg = distribution(name, name, &[(name.into(), vec![1.0, 2.0])]);
+        assert!(pdf(&svg).unwrap().starts_with(b"%PDF-"), "{name:?}");
+        size(&png(&svg).unwrap());
+    }
+    for wrong in ["", "no", "<svg>", "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"1e9\" height=\"1e9\"/>"] {
+        assert!(png(wrong).is_err(), "{wrong}");
+    }
+    assert!(pdf("no").is_err());
+}

@@ -120,6 +120,9 @@ async fn jobs_are_submitted_followed_compared_and_exported() {
     let best: Vec<f64> = compared["jobs"].as_array().unwrap().iter().map(|job| job["best"][1].as_f64().unwrap()).collect();
     assert!((low + high - best[0] - best[1]).abs() < 1e-9, "{compared}");
     assert!(String::from_utf8(bed.file("curves.svg")).unwrap().contains("2 seeds"));
+    let compared = bed.json(&["jobs", "compare", &ids[0], "--svg", "one.svg", "--figures", "pdf,png"]).await;
+    assert_eq!(compared["figures"], json!(["one.pdf", "one.png"]));
+    assert!(bed.file("one.pdf").starts_with(b"%PDF") && bed.file("one.png").starts_with(b"\x89PNG"));
 
     bed.ok(&["jobs", "export", &ids[0], "--out", "exported"]).await;
     let digests = bed.rest.digests(&ids[0]).await;

@@ -16,6 +16,7 @@ use serde_json::{Value, json};
 
 use self::folder::RunFolder;
 use self::runner::Runner;
+use super::figures::FigureArgs;
 use super::files::write_atomic;
 use super::run_args::{self, all_cores, count};
 use crate::cli::output::outln;
@@ -62,6 +63,8 @@ pub struct ExperimentArgs {
     /// Lists the runs and their progress without running them
     #[arg(long)]
     dry_run: bool,
+    #[command(flatten)]
+    figures: FigureArgs,
 }
 
 /// Runs the command.
@@ -94,7 +97,7 @@ pub async fn run(args: ExperimentArgs) -> anyhow::Result<()> {
         if !Runner::new(&experiment, &out, threads, &stop).run()? {
             bail!("stopped; the same command resumes the experiment");
         }
-        write_results(&experiment, &out, threads, &command(&args))
+        write_results(&experiment, (&out, &args.figures), threads, &command(&args))
     })
     .await?
 }
@@ -134,6 +137,7 @@ fn command(args: &ExperimentArgs) -> String {
     words.extend(args.series.iter().map(|name| format!("--series '{name}'")));
     words.extend(args.point.iter().map(|name| format!("--point '{name}'")));
     words.extend(args.set.iter().map(|item| format!("--set '{item}'")));
+    words.extend(args.figures.value().map(|figures| format!("--figures {figures}")));
     words.join(" ")
 }
 
@@ -155,7 +159,12 @@ fn list(experiment: &Experiment, out: &Path) -> anyhow::Result<()> {
 }
 
 /// Writes and prints the results: results.json, README.md and plots; and timing.json, which differs between repetitions.
-fn write_results(experiment: &Experiment, out: &Path, threads: usize, command: &str) -> anyhow::Result<()> {
+fn write_results(
+    experiment: &Experiment,
+    (out, figures): (&Path, &FigureArgs),
+    threads: usize,
+    command: &str,
+) -> anyhow::Result<()> {
     let mut results: Vec<RunResult> = Vec::new();
     let mut curves: Vec<TrainingCurve> = Vec::new();
     for run in &experiment.runs {
@@ -165,9 +174,9 @@ fn write_results(experiment: &Experiment, out: &Path, threads: usize, command: &
     }
     let summary = ExperimentSummary::new(experiment, &results, &evaluate_baselines(experiment, threads)?);
     let files = plots(experiment, &summary, &curves, &trajectories(experiment, out)?);
-    let names: Vec<String> = files.iter().map(|(name, _)| name.clone()).collect();
+    let names: Vec<String> = files.iter().map(|(name, _)| figures.shown(name)).collect();
     for (name, svg) in &files {
-        write_atomic(&out.join(name), svg.as_bytes())?;
+        figures.write(&out.join(name), svg)?;
     }
     let seconds: Vec<Value> = (experiment.runs.iter().zip(&results))
         .map(|(run, result)| json!({"folder": run.folder, "training_seconds": result.seconds}))

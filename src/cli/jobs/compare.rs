@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use super::list::{Filter, list};
 use super::reference::{resolve_all, short};
 use crate::cli::client::Client;
-use crate::cli::files::{check_writable, write_atomic};
+use crate::cli::figures::FigureArgs;
 use crate::cli::output::{errln, outln};
 use crate::cli::rest::{items, query, text};
 use crate::cli::table::text_table;
@@ -36,9 +36,11 @@ pub struct CompareArgs {
     /// Metric to compare
     #[arg(long, default_value = "eval/mean_aoi")]
     metric: String,
-    /// File for the curves
+    /// File for the curves; in another format it has another extension
     #[arg(long, value_name = "FILE", default_value = "compare.svg")]
     svg: PathBuf,
+    #[command(flatten)]
+    figures: FigureArgs,
 }
 
 /// A job of the comparison.
@@ -82,7 +84,7 @@ struct Mean {
 
 /// Runs the command.
 pub(super) async fn run(client: &Client, args: CompareArgs, print_json: bool) -> anyhow::Result<()> {
-    check_writable(&args.svg)?;
+    args.figures.check_writable(&args.svg)?;
     let mut ids = resolve_all(client, &args.jobs).await?;
     if !args.filter.is_empty() {
         let found = list(client, &args.filter, None, &[], MAX_JOBS).await?;
@@ -99,16 +101,19 @@ pub(super) async fn run(client: &Client, args: CompareArgs, print_json: bool) ->
     }
     let fields = mark_differences(&mut jobs);
     let groups = group(&jobs);
-    write_atomic(&args.svg, lines(&chart(&args.metric, &groups)).as_bytes())?;
+    args.figures.write(&args.svg, &lines(&chart(&args.metric, &groups)))?;
+    let figures = args.figures.files(&args.svg);
     if print_json {
-        outln!("{:#}", json!({"metric": args.metric, "jobs": jobs, "groups": groups, "svg": args.svg}))?;
+        outln!("{:#}", json!({"metric": args.metric, "jobs": jobs, "groups": groups, "figures": figures}))?;
         return Ok(());
     }
     outln!("{}", job_table(&args.metric, &fields, &jobs))?;
     if groups.len() < jobs.len() {
         outln!("Over seeds: mean and 95 % interval\n{}", group_table(&args.metric, &fields, &groups))?;
     }
-    errln!("curves: {}", args.svg.display());
+    for figure in figures {
+        errln!("curves: {}", figure.display());
+    }
     Ok(())
 }
 

@@ -7,6 +7,7 @@ mod render;
 use std::fs;
 use std::path::Path;
 
+use super::figures::FigureArgs;
 use crate::experiment::{difference_cells, metric_cells};
 use crate::learner::{Comparison, Pair, PolicyEvaluation};
 use crate::learner::{Difference, Interval};
@@ -17,11 +18,16 @@ use render::{ReportPage, ReportPlot, ReportSection, ReportTable};
 ///
 /// # Errors
 /// The directory or a file cannot be written.
-pub fn write(directory: &Path, comparison: &Comparison, command: &str) -> anyhow::Result<()> {
-    let page = page(comparison, command)?;
+pub fn write(
+    (directory, figures): (&Path, &FigureArgs),
+    comparison: &Comparison,
+    command: &str,
+) -> anyhow::Result<()> {
+    let mut page = page(comparison, command)?;
     fs::create_dir_all(directory)?;
-    for plot in page.sections.iter().flat_map(|s| &s.plots) {
-        fs::write(directory.join(&plot.file), &plot.svg)?;
+    for plot in page.sections.iter_mut().flat_map(|s| &mut s.plots) {
+        figures.write(&directory.join(&plot.file), &plot.svg)?;
+        plot.file = figures.shown(&plot.file);
     }
     fs::write(directory.join("index.html"), render::html(&page))?;
     fs::write(directory.join("report.md"), render::markdown(&page))?;

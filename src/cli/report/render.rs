@@ -2,6 +2,8 @@
 
 use std::fmt::Write;
 
+use crate::experiment::figure_link;
+
 /// A report.
 pub(super) struct ReportPage {
     pub(super) title: String,
@@ -103,7 +105,7 @@ pub(super) fn markdown(document: &ReportPage) -> String {
             text.extend(table.rows.iter().map(|row| line(row.iter().map(|c| escaped_markdown(c)).collect())));
         }
         for plot in &section.plots {
-            let _ = write!(text, "\n![{}]({})\n", escaped_markdown(&plot.caption), plot.file);
+            let _ = writeln!(text, "\n{}", figure_link(&escaped_markdown(&plot.caption), &plot.file));
         }
     }
     text
