@@ -8,6 +8,7 @@ use super::evaluate;
 use super::output::{Exit, outln};
 use super::run_args::all_cores;
 use super::table::text_table;
+use super::world_args::WorldArgs;
 use crate::env::EnvConfig;
 use crate::learner::layout_list;
 use crate::policy::{EnvParams, Policy, Reach, RequiredInput};
@@ -36,18 +37,8 @@ pub struct AuditArgs {
     /// Number of UAVs
     #[arg(long, env = "QEDGIX_UAVS", default_value_t = 3)]
     uavs: usize,
-    /// Number of users
-    #[arg(long, env = "QEDGIX_USERS", default_value_t = 5)]
-    users: usize,
-    /// Slots per episode
-    #[arg(long, env = "QEDGIX_SLOTS", default_value_t = 80)]
-    slots: usize,
-    /// Detection range, in units of the square's side
-    #[arg(long, env = "QEDGIX_DETECTION_RANGE", default_value_t = 0.28)]
-    detection_range: f64,
-    /// Range within which UAVs detect each other, in units of the square's side [default: the detection range]
-    #[arg(long, env = "QEDGIX_COMMUNICATION_RANGE")]
-    communication_range: Option<f64>,
+    #[command(flatten)]
+    world: WorldArgs,
     /// Threads [default: all cores]
     #[arg(long, env = "QEDGIX_THREADS")]
     threads: Option<usize>,
@@ -61,14 +52,7 @@ pub struct AuditArgs {
 /// # Errors
 /// An unknown policy or list, a policy that does not fit the environment; exit status 1 if the policy does not pass.
 pub fn run(args: &AuditArgs) -> anyhow::Result<()> {
-    let env = EnvConfig {
-        uavs: args.uavs,
-        users: args.users,
-        slots: args.slots,
-        detection_range: args.detection_range,
-        communication_range: args.communication_range,
-        ..EnvConfig::default()
-    };
+    let env = args.world.environment(args.uavs);
     env.validate()?;
     let list = layout_list(&args.layouts)?;
     ensure!(!list.mixed, "--layouts {}: it draws the environments itself; choose a list that is not mixed", list.name);

@@ -10,6 +10,7 @@ use super::connect::ConnectArgs;
 use super::figures::FigureArgs;
 use super::files::read_if_exists;
 use super::output::{errln, outln};
+use super::world_args::WorldArgs;
 use super::{act_client, explain, ports, progress, report, run_args::all_cores, table};
 use crate::checkpoint::Checkpoint;
 use crate::env::{EnvConfig, LostUav, UserSlots};
@@ -50,21 +51,8 @@ pub struct EvaluateArgs {
     /// Number of UAVs
     #[arg(long, env = "QEDGIX_UAVS", default_value_t = 3)]
     uavs: usize,
-    /// Number of users
-    #[arg(long, env = "QEDGIX_USERS", default_value_t = 5)]
-    users: usize,
-    /// Slots per episode
-    #[arg(long, env = "QEDGIX_SLOTS", default_value_t = 80)]
-    slots: usize,
-    /// Detection range, in units of the square's side
-    #[arg(long, env = "QEDGIX_DETECTION_RANGE", default_value_t = 0.28)]
-    detection_range: f64,
-    /// Range within which UAVs exchange messages, in units of the square's side [default: the detection range]
-    #[arg(long, env = "QEDGIX_COMMUNICATION_RANGE")]
-    communication_range: Option<f64>,
-    /// Transmission range, in units of the square's side
-    #[arg(long, env = "QEDGIX_TRANSMISSION_RANGE", default_value_t = 0.12)]
-    transmission_range: f64,
+    #[command(flatten)]
+    world: WorldArgs,
     /// Distance that users move per slot, in units of the square's side; 0: users stay
     #[arg(long, env = "QEDGIX_USER_SPEED", default_value_t = 0.0)]
     user_speed: f64,
@@ -181,17 +169,11 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
 /// The list of layouts, the seeds and the environment of the flags, checked.
 fn check(args: &EvaluateArgs) -> anyhow::Result<(LayoutList, Vec<u64>, EnvConfig)> {
     let env = EnvConfig {
-        uavs: args.uavs,
-        users: args.users,
-        slots: args.slots,
-        detection_range: args.detection_range,
-        communication_range: args.communication_range,
-        transmission_range: args.transmission_range,
         user_speed: args.user_speed,
         // A server is not told who is lost; it sees who is listed.
         lose_uav: args.lose_uav.filter(|_| args.server.is_some()),
         user_slots: args.user_slots.clone(),
-        ..EnvConfig::default()
+        ..args.world.environment(args.uavs)
     };
     env.validate()?;
     args.disturbance().validate(&env)?;
@@ -228,7 +210,7 @@ impl EvaluateArgs {
 
     /// The command that repeats this evaluation, including values from environment variables.
     fn command_line(&self) -> String {
-        let default = EnvConfig::default();
+        let (default, world) = (EnvConfig::default(), &self.world);
         let mut words = vec!["qedgix evaluate".to_owned()];
         let mut add = |flag: &str, value: String| words.push(format!("--{flag} {}", quoted(&value)));
         for policy in &self.policy {
@@ -237,15 +219,15 @@ impl EvaluateArgs {
         add("layouts", self.layouts.clone());
         add("episodes", self.episodes.to_string());
         for (flag, value, default) in
-            [("uavs", self.uavs, default.uavs), ("users", self.users, default.users), ("slots", self.slots, default.slots)]
+            [("uavs", self.uavs, default.uavs), ("users", world.users, default.users), ("slots", world.slots, default.slots)]
         {
             if value != default {
                 add(flag, value.to_string());
             }
         }
         for (flag, value, default) in [
-            ("detection-range", self.detection_range, default.detection_range),
-            ("transmission-range", self.transmission_range, default.transmission_range),
+            ("detection-range", world.detection_range, default.detection_range),
+            ("transmission-range", world.transmission_range, default.transmission_range),
             ("user-speed", self.user_speed, default.user_speed),
             ("position-noise", self.position_noise, 0.0),
         ] {
@@ -253,7 +235,7 @@ impl EvaluateArgs {
                 add(flag, value.to_string());
             }
         }
-        if let Some(range) = self.communication_range {
+        if let Some(range) = world.communication_range {
             add("communication-range", range.to_string());
         }
         if let Some(LostUav { uav, slot }) = self.lose_uav {

@@ -31,6 +31,7 @@ mod table;
 mod train;
 mod variables;
 mod worker;
+mod world_args;
 
 use std::process::ExitCode;
 

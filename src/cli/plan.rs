@@ -11,6 +11,7 @@ use super::files::write_atomic;
 use super::output::{Exit, outln};
 use super::run_args::all_cores;
 use super::table::text_table;
+use super::world_args::WorldArgs;
 use super::{evaluate, progress};
 use crate::env::{EnvConfig, EpisodeMetrics, LostUav};
 use crate::learner::{Disturbance, Failure, FleetSize, Interval, Sizing, SizingTarget, evaluate_traced, layout_list};
@@ -31,9 +32,6 @@ pub struct PlanArgs {
     /// A checkpoint file, a bundled policy or a baseline, for any number of UAVs
     #[arg(long, env = "QEDGIX_POLICY")]
     policy: String,
-    /// Number of users
-    #[arg(long, env = "QEDGIX_USERS", default_value_t = 5)]
-    users: usize,
     /// 95th percentile of AoI over users and slots that the fleet must keep, in slots
     #[arg(long, env = "QEDGIX_TARGET_P95", value_name = "SLOTS")]
     target_p95: f64,
@@ -49,18 +47,8 @@ pub struct PlanArgs {
     /// Number of layouts, from the first of the list; all if the list has fewer
     #[arg(long, env = "QEDGIX_EPISODES", default_value_t = 128)]
     episodes: usize,
-    /// Slots per episode
-    #[arg(long, env = "QEDGIX_SLOTS", default_value_t = 80)]
-    slots: usize,
-    /// Detection range, in units of the square's side
-    #[arg(long, env = "QEDGIX_DETECTION_RANGE", default_value_t = 0.28)]
-    detection_range: f64,
-    /// Range within which UAVs exchange messages, in units of the square's side [default: the detection range]
-    #[arg(long, env = "QEDGIX_COMMUNICATION_RANGE")]
-    communication_range: Option<f64>,
-    /// Transmission range, in units of the square's side
-    #[arg(long, env = "QEDGIX_TRANSMISSION_RANGE", default_value_t = 0.12)]
-    transmission_range: f64,
+    #[command(flatten)]
+    world: WorldArgs,
     /// Threads [default: all cores]
     #[arg(long, env = "QEDGIX_THREADS")]
     threads: Option<usize>,
@@ -113,8 +101,8 @@ impl PlanArgs {
     }
 
     fn plan(&self, seeds: &[u64]) -> anyhow::Result<Sizing> {
-        let bar = progress::bar(self.target().evaluations(self.slots) as u64, "fleets");
-        let sizing = self.target().run(self.slots, |uavs, lose| {
+        let bar = progress::bar(self.target().evaluations(self.world.slots) as u64, "fleets");
+        let sizing = self.target().run(self.world.slots, |uavs, lose| {
             let episodes = self.evaluate(uavs, lose, seeds)?;
             bar.inc(1);
             Ok::<_, anyhow::Error>(Some(episodes))
@@ -124,15 +112,7 @@ impl PlanArgs {
     }
 
     fn evaluate(&self, uavs: usize, lose: Option<LostUav>, seeds: &[u64]) -> anyhow::Result<Vec<EpisodeMetrics>> {
-        let env = EnvConfig {
-            uavs,
-            users: self.users,
-            slots: self.slots,
-            detection_range: self.detection_range,
-            communication_range: self.communication_range,
-            transmission_range: self.transmission_range,
-            ..EnvConfig::default()
-        };
+        let env = self.world.environment(uavs);
         env.validate()?;
         let policy = evaluate::open(&self.policy, &env)?;
         let env = EnvConfig { hover: policy.actions() > EnvConfig::COMPASS, ..env };
@@ -149,7 +129,7 @@ impl PlanArgs {
                 before.replace(size.p95.mean).map_or_else(String::new, |before: f64| format!("{:.2}", before - size.p95.mean));
             [size.uavs.to_string(), cell(&size.p95), gain, cell(&size.mean_aoi)]
         });
-        outln!("{} users, {}, AoI in slots, mean and 95 % interval over layouts", self.users, self.policy)?;
+        outln!("{} users, {}, AoI in slots, mean and 95 % interval over layouts", self.world.users, self.policy)?;
         outln!("{}", text_table(["UAVs", "p95 AoI", "gain by the last UAV", "mean AoI"], rows))?;
         if let Some(uavs) = plan.uavs {
             let [low, high] =
@@ -175,7 +155,7 @@ impl PlanArgs {
         };
         let (p95, mean) = (points(|size| size.p95), points(|size| size.mean_aoi));
         plot::lines(&Chart {
-            title: format!("{}: fleets for {} users", self.policy, self.users),
+            title: format!("{}: fleets for {} users", self.policy, self.world.users),
             x: "UAVs".into(),
             y: "AoI (slots)".into(),
             series: vec![
@@ -211,7 +191,7 @@ impl PlanArgs {
     fn document(&self, plan: &Sizing) -> Value {
         let mut document = json!({
             "policy": self.policy,
-            "users": self.users,
+            "users": self.world.users,
             "target_p95": self.target_p95,
             "layouts": self.layouts,
             "episodes": self.episodes,

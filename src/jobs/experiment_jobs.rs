@@ -123,7 +123,7 @@ pub fn resolve(mut request: JobRequest, cpu_budget: usize) -> Result<Sweep, Inva
             config: Some(run.config.clone()),
             report: Some(serde_json::to_value(report).expect("a report is plain data")),
             point: Some(i as u64),
-            // They are told of the experiment.
+            // They get the message of the experiment.
             webhooks: Vec::new(),
             ..template.clone()
         }

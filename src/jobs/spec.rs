@@ -49,7 +49,7 @@ pub struct JobRequest {
     /// Most memory of the worker in bytes; default: several times the estimate of a training run.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub memory: Option<u64>,
-    /// Addresses that are told when the job ends; default: none.
+    /// URLs to which the server sends a message when the job ends; default: none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub webhooks: Option<Vec<WebhookRequest>>,
     /// Ids of the jobs that must succeed before this one starts.

@@ -21,7 +21,7 @@ const MAX_SECRET: usize = 255;
 pub struct WebhookRequest {
     /// The address.
     pub url: String,
-    /// The ends that are told; default: all.
+    /// The ends after which a message is sent; default: all.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub events: Option<Vec<JobEnd>>,
     /// Key of the signatures; default: messages are not signed.

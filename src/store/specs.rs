@@ -84,7 +84,7 @@ pub struct JobSpec {
     /// Jobs that must succeed before this one starts.
     #[serde(default)]
     pub after: Vec<JobId>,
-    /// Addresses that are told when the job ends.
+    /// URLs to which the server sends a message when the job ends.
     #[serde(default)]
     pub webhooks: Vec<Webhook>,
     /// When training ends before all steps are done; `None`: never.

@@ -1,4 +1,4 @@
-//! Webhooks: addresses that are told when a job ends. The message is written in the transaction that ends the job, and stays until
+//! Webhooks: URLs to which the server sends a message when a job ends. The message is written in the transaction that ends the job, and stays until
 //! its receiver has accepted it, so neither a crash nor the deletion of the job loses it.
 
 use jiff::Timestamp;
@@ -39,13 +39,13 @@ impl std::fmt::Debug for Secret {
     }
 }
 
-/// An address that is told when a job ends.
+/// A URL to which the server sends a message when a job ends.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Webhook {
     /// The address.
     pub url: String,
-    /// The ends that are told.
+    /// The ends after which a message is sent.
     pub events: Vec<JobEnd>,
     /// Whether messages are signed.
     pub signed: bool,

@@ -2,6 +2,7 @@
 //! unknown paths and methods; under `/v2` errors have the form of that protocol.
 
 mod act;
+mod aliases;
 mod dashboard;
 mod decentral;
 mod environments;
@@ -45,6 +46,7 @@ pub fn router(app: Arc<App>, metrics: fn() -> String, max_body: usize, hosts: Al
         .merge(decentral::router())
         .merge(sessions::router())
         .merge(policies::router())
+        .merge(aliases::router())
         .merge(environments::router())
         .merge(jobs::router())
         .merge(events::router())

@@ -95,7 +95,7 @@ pub struct JobArgs {
     /// Job that must succeed before this one starts: its id, the beginning of it, or a name; may be repeated
     #[arg(long, value_name = "JOB")]
     after: Vec<String>,
-    /// URL that is told when the job ends, by a POST request; may be repeated
+    /// URL to which the server sends a message when the job ends, a POST request; may be repeated
     #[arg(long, value_name = "URL")]
     webhook: Vec<String>,
     /// Key of the signatures of the messages to --webhook; prefer the environment variable [default: messages are not signed]

@@ -62,7 +62,7 @@ pub(super) struct JobRequest {
     #[serde(default, deserialize_with = "json::optional_integer")]
     #[schema(minimum = 1_048_576, maximum = 1_125_899_906_842_624_u64)]
     memory: Option<u64>,
-    /// Addresses that are told when the job ends. Default: none.
+    /// URLs to which the server sends a message when the job ends. Default: none.
     #[schema(max_items = 8)]
     webhooks: Option<Vec<Webhook>>,
     /// Ids of the jobs that must succeed before this one starts. When one of them is cancelled or deleted, this job is cancelled.
@@ -152,15 +152,15 @@ impl From<JobRequest> for spec::JobRequest {
     }
 }
 
-/// An address that is told when a job ends: it receives a POST request with a JSON object. The host must have a public address, or be
-/// one of `--webhook-allow` of the server.
+/// A URL to which the server sends a message when a job ends: a POST request with a JSON object. The host must have a public address, or
+/// be one of `--webhook-allow` of the server.
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields, remote = "Self")]
 pub(super) struct Webhook {
     /// An `http` or `https` URL without user and password.
     #[schema(max_length = 2000, pattern = "^https?://", example = "https://hooks.example/qedgix")]
     url: String,
-    /// The ends that are told; default: all three.
+    /// The ends after which a message is sent; default: all three.
     #[schema(schema_with = optional_ends)]
     events: Option<Vec<JobEnd>>,
     /// Key of the signatures (HMAC-SHA256): Base64 after `whsec_`, or any text. It is never returned. Default: messages are not signed.

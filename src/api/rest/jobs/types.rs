@@ -162,7 +162,7 @@ pub(super) struct Job {
     /// Most memory of the worker in bytes; null: no limit.
     #[schema(required = true)]
     memory: Option<u64>,
-    /// Addresses that are told when the job ends.
+    /// URLs to which the server sends a message when the job ends.
     webhooks: Vec<Webhook>,
     /// Jobs that must succeed before this one starts.
     #[schema(value_type = Vec<Uuid>)]
@@ -195,12 +195,12 @@ pub(super) struct Job {
     point: Option<u64>,
 }
 
-/// An address that is told when the job ends.
+/// A URL to which the server sends a message when the job ends.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = StoredWebhook)]
 pub(super) struct Webhook {
     url: String,
-    /// The ends that are told.
+    /// The ends after which a message is sent.
     #[schema(schema_with = ends)]
     events: Vec<JobEnd>,
     /// Whether messages are signed. The secret is never returned.
