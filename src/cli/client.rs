@@ -6,12 +6,14 @@ use std::time::Duration;
 use anyhow::Context;
 use axum::http::{HeaderMap, Method, Uri, header};
 use clap::Args;
+use indicatif::ProgressBar;
 use reqwest::Response;
 use reqwest::redirect::Policy;
 use serde_json::Value;
 
 use super::connect::ConnectArgs;
 use super::ports;
+use super::upload::Upload;
 
 /// Timeout of a request.
 const TIMEOUT: Duration = Duration::from_secs(60);
@@ -97,7 +99,7 @@ impl ClientError {
 struct Request<'a> {
     method: Method,
     path: &'a str,
-    body: Option<(&'a str, Vec<u8>)>,
+    body: Option<(&'a str, reqwest::Body)>,
     idempotency_key: Option<&'a str>,
     /// None: the response may take for ever.
     timeout: Option<Duration>,
@@ -109,7 +111,7 @@ impl<'a> Request<'a> {
     }
 
     fn json(method: Method, path: &'a str, body: &Value) -> Self {
-        Self { body: Some(("application/json", body.to_string().into_bytes())), ..Self::new(method, path) }
+        Self { body: Some(("application/json", body.to_string().into())), ..Self::new(method, path) }
     }
 }
 
@@ -177,12 +179,13 @@ impl Client {
         self.value(Request::new(Method::DELETE, path)).await
     }
 
-    /// `POST path` with a binary body. The timeout is 10 minutes.
+    /// `POST path` with a binary body, which moves the bar. The timeout is 10 minutes.
     ///
     /// # Errors
     /// As [`Client::get`].
-    pub async fn upload(&self, path: &str, bytes: Vec<u8>) -> Result<Value, ClientError> {
-        let body = Some(("application/octet-stream", bytes));
+    pub async fn upload(&self, path: &str, bytes: Vec<u8>, bar: &ProgressBar) -> Result<Value, ClientError> {
+        let body = reqwest::Body::wrap(Upload { bytes: bytes.into(), bar: bar.clone() });
+        let body = Some(("application/octet-stream", body));
         self.value(Request { body, timeout: Some(TRANSFER_TIMEOUT), ..Request::new(Method::POST, path) }).await
     }
 
@@ -228,8 +231,8 @@ impl Client {
         if let Some(timeout) = timeout {
             sent = sent.timeout(timeout);
         }
-        if let Some((media_type, bytes)) = body {
-            sent = sent.header(header::CONTENT_TYPE, media_type).body(bytes);
+        if let Some((media_type, body)) = body {
+            sent = sent.header(header::CONTENT_TYPE, media_type).body(body);
         }
         if let Some(key) = idempotency_key {
             sent = sent.header("idempotency-key", key);

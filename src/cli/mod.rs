@@ -29,6 +29,7 @@ mod server;
 mod signals;
 mod table;
 mod train;
+mod upload;
 mod variables;
 mod worker;
 mod world_args;

@@ -4,15 +4,19 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
 use clap::{Args, Subcommand};
+use indicatif::{HumanBytes, ProgressBar};
 use serde_json::{Value, json};
 
 use super::client::{Client, RestArgs};
 use super::files::write_atomic;
-use super::output::outln;
+use super::output::{errln, outln};
 use super::rest::{self, items, query, text};
-use super::table;
+use super::{progress, table};
 use crate::checkpoint::{Checkpoint, digest};
 use crate::onnx;
+
+/// Uploads of so many bytes show their progress.
+const LARGE: u64 = 4 << 20;
 
 /// Flags of `policies`.
 #[derive(Args, Debug)]
@@ -156,7 +160,7 @@ pub async fn run(args: PoliciesArgs) -> anyhow::Result<()> {
         Command::Upload { name, file, checkpoint, alias } => {
             let url = path(&[&name, "versions"]) + &query(&[("alias", alias)]);
             details(match file {
-                Some(file) => client.upload(&url, read(&file)?).await?,
+                Some(file) => upload(&client, &url, &file).await?,
                 None => client.post(&url, &json!({"checkpoint_id": checkpoint})).await?,
             })
         }
@@ -292,8 +296,17 @@ async fn export(client: &Client, policy: &str, out: Option<PathBuf>, onnx: Optio
     Ok((json!({"policy": format!("{name}:{version}"), "digest": sha256, "file": out, "size": bytes.len()}), text))
 }
 
-fn read(file: &Path) -> anyhow::Result<Vec<u8>> {
-    std::fs::read(file).with_context(|| format!("cannot read {}", file.display()))
+/// Uploads a file. A large one has a progress bar, or, without a terminal, a line.
+async fn upload(client: &Client, url: &str, file: &Path) -> anyhow::Result<Value> {
+    let bytes = std::fs::read(file).with_context(|| format!("cannot read {}", file.display()))?;
+    let size = bytes.len() as u64;
+    let bar = if size < LARGE { ProgressBar::hidden() } else { progress::bytes_bar(size) };
+    if size >= LARGE && bar.is_hidden() {
+        errln!("uploading {} ({})", file.display(), HumanBytes(size));
+    }
+    let response = client.upload(url, bytes, &bar).await;
+    bar.finish_and_clear();
+    Ok(response?)
 }
 
 /// The path of a policy and resources below it.

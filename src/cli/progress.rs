@@ -15,6 +15,12 @@ pub fn bar_among(bars: &MultiProgress, length: u64, unit: &'static str) -> Progr
     bars.add(ProgressBar::new(length)).with_style(style(unit))
 }
 
+/// A bar of `length` bytes.
+pub fn bytes_bar(length: u64) -> ProgressBar {
+    let template = "{bar:20} {percent:>3} %  {bytes} of {total_bytes}, {bytes_per_sec}, {eta} left  {wide_msg}";
+    ProgressBar::new(length).with_style(ProgressStyle::with_template(template).expect("the template is valid"))
+}
+
 /// One line that fits the terminal, whatever its width: the message is cut.
 fn style(unit: &str) -> ProgressStyle {
     let template =

@@ -204,11 +204,14 @@ def test_files_appear_complete_or_not_at_all(tmp_path):
 
 
 def test_a_progress_bar_needs_no_tqdm(monkeypatch):
-    from qedgix._progress import Bar
+    from qedgix._progress import JobBar, UploadBar
 
     monkeypatch.setitem(sys.modules, "tqdm.auto", None)
-    with Bar("job", 10, enabled=True) as bar:
+    with JobBar("job", 10, enabled=True) as bar:
         bar.show(qedgix.JobEvent(1, "running", 1, None, qedgix.Metrics(())))
+    with UploadBar("policy", 10, enabled=True) as sent:
+        sent.restart()
+        sent.add(10)
 
 
 def test_times_and_values_that_are_missing():

@@ -64,6 +64,19 @@ def test_a_stream_opens_again_and_sends_what_has_no_answer(clients, lossy):
     assert lossy[0].lost == SLOTS
 
 
+def test_an_upload_whose_answer_is_lost_is_sent_again_from_its_beginning(clients, lossy, tmp_path, capsys):
+    unlucky, lucky = clients
+    # The two clients of a test are of one kind; each kind has a policy of its own.
+    name = f"uploaded-{type(unlucky).__name__.lower()}"
+    file = lucky.policies.export("qmix", tmp_path / "qmix.safetensors")
+    lossy[1].lose(2)
+    uploaded = unlucky.policies.upload(name, file, progress=True)
+    assert uploaded.ref == lucky.policies.get(name).ref and uploaded.ref.version == 1
+    assert uploaded.ref.digest == lucky.policies.get("qmix").ref.digest
+    assert lossy[1].lost == 2 and "100%" in capsys.readouterr().err
+    lucky.policies.delete(name)
+
+
 def test_an_environment_advances_once_per_step(clients, lossy):
     unlucky, lucky = clients
     config = {"uavs": 2, "users": 4, "slots": 5}

@@ -1,20 +1,16 @@
-"""What a client knows of its server: addresses, certificates, API key, deadline and retries."""
+"""What a client knows of its server: addresses, certificates, API key, deadline and retries. `_client` makes it of arguments."""
 
 from __future__ import annotations
 
-import ipaddress
-import os
 import random
 import ssl
-import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import grpc
 
-from .errors import DeadlineExceeded, QedgixError, ResourceExhausted, Unavailable, invalid
+from .errors import DeadlineExceeded, QedgixError, ResourceExhausted, Unavailable
 
 
 @dataclass(frozen=True)
@@ -63,47 +59,6 @@ class Settings:
     timeout: float
     retry: Retry
 
-    @staticmethod
-    def resolve(
-        grpc: str,
-        http: str,
-        *,
-        api_key: str | None,
-        ca_cert: str | os.PathLike[str] | None,
-        client_cert: str | os.PathLike[str] | None,
-        client_key: str | os.PathLike[str] | None,
-        timeout: float,
-        retry: Retry,
-        environ: Mapping[str, str] | None = None,
-    ) -> Settings:
-        """Adds what the environment has, and checks the addresses."""
-        environ = os.environ if environ is None else environ
-
-        def path(given: str | os.PathLike[str] | None, name: str) -> Path | None:
-            found = given if given is not None else environ.get(name)
-            return Path(found) if found else None
-
-        ca = path(ca_cert, "QEDGIX_CA_CERT")
-        certificate = path(client_cert, "QEDGIX_CLIENT_CERT")
-        key = path(client_key, "QEDGIX_CLIENT_KEY")
-        if (certificate is None) != (key is None):
-            raise invalid("client_cert", certificate, "both client_cert and client_key, or neither")
-        scheme = "https" if ca or certificate else "http"
-        secret = api_key if api_key is not None else environ.get("QEDGIX_API_KEY")
-        settings = Settings(
-            grpc_url=_url("grpc", grpc, scheme),
-            http_url=_url("http", http, scheme),
-            api_key=secret.strip() if secret else None,
-            ca_cert=ca,
-            client_cert=certificate,
-            client_key=key,
-            timeout=timeout,
-            retry=retry,
-        )
-        if settings.api_key and any(_readable_by_others(url) for url in (settings.grpc_url, settings.http_url)):
-            warnings.warn("the API key is sent to another machine without encryption; use https://", stacklevel=4)
-        return settings
-
     @property
     def metadata(self) -> tuple[tuple[str, str], ...]:
         """Metadata of every gRPC call; headers of every REST request."""
@@ -143,26 +98,3 @@ CHANNEL_OPTIONS: tuple[tuple[str, int], ...] = (
     ("grpc.initial_reconnect_backoff_ms", 100),
     ("grpc.max_reconnect_backoff_ms", 2_000),
 )
-
-
-def _url(field: str, address: str, scheme: str) -> str:
-    """`http://HOST:PORT` or `https://HOST:PORT`."""
-    text = address if "://" in address else f"{scheme}://{address}"
-    expected = "HOST:PORT, http://HOST:PORT or https://HOST:PORT"
-    try:
-        parts = urlsplit(text)
-        complete = parts.port is not None
-    except ValueError:
-        raise invalid(field, address, expected) from None
-    if parts.scheme not in ("http", "https") or not parts.hostname or not complete or parts.path.strip("/"):
-        raise invalid(field, address, expected)
-    return f"{parts.scheme}://{parts.netloc}"
-
-
-def _readable_by_others(url: str) -> bool:
-    host = urlsplit(url).hostname or ""
-    try:
-        local = ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        local = host == "localhost"
-    return url.startswith("http:") and not local

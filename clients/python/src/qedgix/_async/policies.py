@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import builtins
 import os
+from collections.abc import AsyncIterator
 from pathlib import Path
 from urllib.parse import quote
 
 from .._files import replace_file
+from .._progress import UploadBar
 from ..results import AliasMove, Policy, PolicyRef, PolicyVersion, given_instant
 from .transport import AsyncTransport
+
+
+# Bytes that are sent at once.
+_PART = 64 * 1024
 
 
 class AsyncPolicies:
@@ -41,6 +47,7 @@ class AsyncPolicies:
         checkpoint: bytes | str | os.PathLike[str],
         *,
         alias: str | None = None,
+        progress: bool = False,
         timeout: float | None = None,
     ) -> Policy:
         """Publishes a checkpoint as the next version of a policy; identical bytes return the existing version.
@@ -49,6 +56,7 @@ class AsyncPolicies:
             name: NAME of the policy.
             checkpoint: a safetensors file, or its bytes.
             alias: an alias to point to the version.
+            progress: whether to show a bar with tqdm, if tqdm is installed.
             timeout: seconds for all attempts. Default: that of the client.
 
         Raises:
@@ -56,12 +64,16 @@ class AsyncPolicies:
             TooLarge: it is larger than the server accepts.
         """
         content = checkpoint if isinstance(checkpoint, bytes) else Path(checkpoint).read_bytes()
-        headers = {"content-type": "application/octet-stream"}
-        params = {"alias": alias}
-        path = _path(name, "versions")
-        return Policy.of(
-            await self._transport.json("POST", path, content=content, headers=headers, params=params, timeout=timeout)
-        )
+        with UploadBar(name, len(content), enabled=progress) as bar:
+            document = await self._transport.json(
+                "POST",
+                _path(name, "versions"),
+                content=lambda: _parts(content, bar),
+                headers={"content-type": "application/octet-stream", "content-length": str(len(content))},
+                params={"alias": alias},
+                timeout=timeout,
+            )
+        return Policy.of(document)
 
     async def publish(self, name: str, checkpoint_id: str, *, alias: str | None = None) -> Policy:
         """Publishes a checkpoint of a job as the next version of a policy."""
@@ -131,6 +143,15 @@ class AsyncPolicies:
         """All moves of the aliases of a policy, or of one alias, newest first."""
         rows = await self._transport.pages(_path(name, "history"), "history", alias=alias)
         return [AliasMove(row["alias"], row["version"], row["previous"], given_instant(row["at"]), row["by"]) for row in rows]
+
+
+async def _parts(content: bytes, bar: UploadBar) -> AsyncIterator[bytes]:
+    """The parts of an upload, for one attempt."""
+    bar.restart()
+    for start in range(0, len(content), _PART):
+        part = content[start : start + _PART]
+        yield part
+        bar.add(len(part))
 
 
 def _path(*parts: str) -> str:

@@ -3,15 +3,13 @@
 
 from __future__ import annotations
 
-import json
-import os
 import uuid
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from .._settings import Retry, Settings
+from .._client import BaseClient
+from .._settings import Settings
 from ..errors import QedgixError
 from ..observations import Observation
 from ..results import Decision, SessionInfo
@@ -29,69 +27,20 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-class Client:
+class Client(BaseClient):
     """A client of one server. Connections are opened when they are first used, and kept.
-
-    Args:
-        grpc: address of gRPC, HOST:PORT or a URL: sessions, `act`, environments.
-        http: address of REST, HOST:PORT or a URL: `jobs` and `policies`.
-        api_key: an API key. Default: the environment variable QEDGIX_API_KEY.
-        ca_cert: certificate authorities to trust (PEM), which means TLS. Default: QEDGIX_CA_CERT, or those of the machine for
-            addresses that begin with https://.
-        client_cert: client certificate (PEM). Default: QEDGIX_CLIENT_CERT.
-        client_key: private key of the client certificate (PEM). Default: QEDGIX_CLIENT_KEY.
-        timeout: seconds that a call may take with all its attempts. Every call can set its own.
-        retry: when calls are repeated.
-
-    Raises:
-        InvalidArgument: an address is not one.
 
     Example:
         >>> with Client() as client, client.session("qedgix") as session:
         ...     decision = session.act(Scene(uavs, users, aoi))
     """
 
-    def __init__(
-        self,
-        grpc: str = "127.0.0.1:50051",
-        http: str = "127.0.0.1:8080",
-        *,
-        api_key: str | None = None,
-        ca_cert: str | os.PathLike[str] | None = None,
-        client_cert: str | os.PathLike[str] | None = None,
-        client_key: str | os.PathLike[str] | None = None,
-        timeout: float = 30.0,
-        retry: Retry | None = None,
-    ) -> None:
-        settings = Settings.resolve(
-            grpc,
-            http,
-            api_key=api_key,
-            ca_cert=ca_cert,
-            client_cert=client_cert,
-            client_key=client_key,
-            timeout=timeout,
-            retry=retry or Retry(),
-        )
+    def _begin(self, settings: Settings) -> None:
         self._transport = Transport(settings)
         self.jobs = Jobs(self._transport)
         """Training jobs."""
         self.policies = Policies(self._transport)
         """Policies, versions and aliases."""
-
-    @classmethod
-    def of_data_dir(cls, data_dir: str | os.PathLike[str] = "qedgix-data", **options: Any) -> Self:
-        """A client of the server on this machine that uses a data directory: its addresses are in `endpoints.json`.
-
-        Args:
-            data_dir: `--data-dir` of the server.
-            options: as for the class.
-
-        Raises:
-            FileNotFoundError: no server runs on this directory.
-        """
-        endpoints = json.loads((Path(data_dir) / "endpoints.json").read_text())
-        return cls(endpoints["grpc"], endpoints["http"], **options)
 
     def session(
         self,

@@ -13,7 +13,7 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 from .._files import replace_file
-from .._progress import Bar
+from .._progress import JobBar
 from ..errors import DeadlineExceeded, JobEnded, NotFound, QedgixError, Unavailable, from_http
 from ..results import Attempt, Checkpoint, JobEvent, Metric, Metrics, given_instant, instant
 from ._platform import sleep
@@ -258,7 +258,7 @@ class Job:
             Unavailable: there was no server for `patience` seconds.
         """
         deadline = None if timeout is None else monotonic() + timeout
-        with Bar(self.name or self.id, self.steps, enabled=progress) as bar:
+        with JobBar(self.name or self.id, self.steps, enabled=progress) as bar:
             for event in self._follow(0, patience, deadline):
                 bar.show(event)
         self.refresh()

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Callable, Mapping
 from time import monotonic
 from typing import TYPE_CHECKING, Any, cast
 
@@ -121,10 +121,10 @@ class Transport:
         headers: Mapping[str, str] | None = None,
         params: Mapping[str, Any] | None = None,
         json: Any = None,
-        content: bytes | None = None,
+        content: Callable[[], Iterator[bytes]] | None = None,
     ) -> httpx.Response:
         """Sends a request, and again while `Retry` says so. A request that is not `repeatable` is sent again only if the
-        server cannot have seen it, or says that it has done nothing.
+        server cannot have seen it, or says that it has done nothing. `content` makes the body of an attempt.
 
         Raises:
             QedgixError: the last failure.
@@ -145,7 +145,7 @@ class Transport:
                     params=given,
                     headers=headers,
                     json=json,
-                    content=content,
+                    content=content() if content else None,
                     timeout=max(limit, 0.001),
                 )
             except httpx.TimeoutException as error:
