@@ -23,12 +23,11 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
+from documents import ROOT, Block, blocks
 
-ROOT = Path(__file__).resolve().parents[2]
 BINARY = Path(os.environ.get("QEDGIX_BIN", ROOT / "target" / "release" / "qedgix")).resolve()
 PAGES = sorted(
     str(path.relative_to(ROOT))
@@ -36,55 +35,6 @@ PAGES = sorted(
     for path in ROOT.glob(pattern)
 )
 LANGUAGES = {"sh", "python", "json", "toml", ""}
-
-
-@dataclass
-class Block:
-    """A block of a page, as it is executed."""
-
-    page: str
-    line: int
-    language: str
-    text: str
-    before: list[str] = field(default_factory=list)
-    skipped: str | None = None
-
-
-def blocks(page: str) -> list[Block]:
-    found: list[Block] = []
-    marks: list[str] = []
-    lines = iter(enumerate((ROOT / page).read_text().splitlines(), 1))
-    for number, line in lines:
-        if mark := re.fullmatch(r"\s*<!-- test: (.*) -->", line):
-            marks.append(mark[1])
-        elif fence := re.fullmatch(r"(\s*)```(\S*)", line):
-            text = []
-            for _, line in lines:
-                if line.strip() == "```":
-                    break
-                text.append(line.removeprefix(fence[1]))
-            found.append(marked(Block(page, number, fence[2], "\n".join(text) + "\n"), marks))
-            marks = []
-        elif line.strip():
-            assert not marks, f"{page}:{number}: a mark of the tests is not before a block"
-    return found
-
-
-def marked(block: Block, marks: list[str]) -> Block:
-    for mark in marks:
-        kind, _, rest = mark.partition(" ")
-        if kind == "before":
-            block.before.append(rest)
-        elif kind == "skip":
-            assert rest, f"{block.page}:{block.line}: skipped without a reason"
-            block.skipped = rest
-        elif kind == "replace":
-            old, new = rest.split(" => ")
-            assert old in block.text, f"{block.page}:{block.line}: nothing to replace: {old}"
-            block.text = block.text.replace(old, new)
-        else:
-            raise AssertionError(f"{block.page}:{block.line}: unknown mark {mark}")
-    return block
 
 
 # Programs that the blocks call. They come first on the PATH.
@@ -113,7 +63,7 @@ CARGO = """#!/usr/bin/env bash
 # What cargo would build is here already.
 case "$1 ${2-} ${3-}" in
     'run --release --') shift 3; exec qedgix "$@" ;;
-    'install --path .' | 'build --release '*) ;;
+    'install --locked --path' | 'build --release '*) ;;
     *) echo "cargo $*: not in a document's test" >&2; exit 1 ;;
 esac
 """
