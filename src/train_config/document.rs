@@ -58,7 +58,11 @@ pub fn field_name(key: &str) -> &str {
 }
 
 /// `base` with the fields of `patch` overridden, one at a time, so that an error names the invalid field.
-pub(super) fn overridden<T: Serialize + DeserializeOwned>(section: &str, base: &T, patch: &Map<String, Value>) -> Result<T, Invalid> {
+pub(super) fn overridden<T: Serialize + DeserializeOwned>(
+    section: &str,
+    base: &T,
+    patch: &Map<String, Value>,
+) -> Result<T, Invalid> {
     let mut fields = serde_json::to_value(base).expect("a configuration is plain data");
     let known: Vec<String> = fields.as_object().into_iter().flatten().map(|(name, _)| name.clone()).collect();
     for (key, value) in patch {

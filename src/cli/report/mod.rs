@@ -18,11 +18,7 @@ use render::{ReportPage, ReportPlot, ReportSection, ReportTable};
 ///
 /// # Errors
 /// The directory or a file cannot be written.
-pub fn write(
-    (directory, figures): (&Path, &FigureArgs),
-    comparison: &Comparison,
-    command: &str,
-) -> anyhow::Result<()> {
+pub fn write((directory, figures): (&Path, &FigureArgs), comparison: &Comparison, command: &str) -> anyhow::Result<()> {
     let mut page = page(comparison, command)?;
     fs::create_dir_all(directory)?;
     for plot in page.sections.iter_mut().flat_map(|s| &mut s.plots) {
