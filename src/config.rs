@@ -5,6 +5,9 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use axum::http::HeaderValue;
+use rustls::ClientConfig;
+
 use crate::inflight::Budget;
 use crate::invalid::{Invalid, in_range};
 use crate::jobs::SlurmConfig;
@@ -51,6 +54,8 @@ pub struct Config {
     pub environment_memory: usize,
     /// Memory of all policies together, in bytes.
     pub policy_memory: usize,
+    /// The server whose policies this one takes; `None`: it has its own.
+    pub follow: Option<FollowConfig>,
     /// What the server keeps of old versions and checkpoints.
     pub retention: Retention,
     /// Maximum size of a gRPC message or HTTP body, in bytes.
@@ -106,6 +111,17 @@ pub enum ExecutorConfig {
     Slurm(SlurmConfig),
 }
 
+/// How a replica reaches its primary.
+#[derive(Clone, Debug)]
+pub struct FollowConfig {
+    /// Address of its REST, without a path: `http://primary:8080`.
+    pub url: String,
+    /// The header `authorization` with an API key of the primary.
+    pub authorization: Option<HeaderValue>,
+    /// Whom to trust, and the client certificate, for `https`.
+    pub tls: ClientConfig,
+}
+
 /// An address of this machine as others know it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WorkerAddr {
@@ -149,6 +165,7 @@ impl Config {
             max_environments: 1024,
             environment_memory: 1 << 30,
             policy_memory: DEFAULT_MEMORY,
+            follow: None,
             retention: Retention::default(),
             max_message_size: 16 << 20,
             max_watchers: 256,
@@ -192,6 +209,15 @@ impl Config {
         // Workers send a heartbeat every 0.4 s.
         in_seconds("--heartbeat-timeout", self.heartbeat_timeout, 2.0..=3600.0)?;
         self.validate_executor()?;
+        if self.follow.is_some() {
+            if self.executor != ExecutorConfig::Local {
+                return Err(Invalid::new("--executor", "slurm", "local with --follow: a replica runs no jobs"));
+            }
+            if self.retention.versions > 0 {
+                let expected = "0 with --follow: a replica keeps the versions that its primary keeps";
+                return Err(Invalid::new("--keep-versions", self.retention.versions, expected));
+            }
+        }
         in_seconds("--session-ttl", self.session_ttl, 0.001..=1e9)?;
         in_range("--max-sessions", self.max_sessions, 1..=100_000_000)?;
         in_range("--session-memory", self.session_memory, 1 << 20..=1 << 40)?;

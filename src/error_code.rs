@@ -63,6 +63,8 @@ error_codes! {
     PermissionDenied = "permission_denied",
     /// The policy is not loaded.
     PolicyUnloaded = "policy_unloaded",
+    /// The server is a replica: changes of policies, and jobs, go to its primary.
+    ReadOnly = "read_only",
     /// A limit is reached; the caller may retry later.
     ResourceExhausted = "resource_exhausted",
     /// A later run has taken over the session.

@@ -5,6 +5,7 @@
 
 mod background;
 mod connections;
+mod follow;
 mod housekeeping;
 mod http2;
 mod keys;
@@ -28,6 +29,7 @@ use tower::ServiceExt;
 use self::background::Background;
 use self::connections::{Connections, Protocol};
 pub use self::http2::{CONNECTION_WINDOW, KEEPALIVE_INTERVAL, STREAM_WINDOW};
+use self::follow::Follower;
 use self::lifetime::LifeLimits;
 use self::places::Places;
 pub use self::tls::Tls;
@@ -43,7 +45,7 @@ use crate::jobs::{self, Executor, LocalProcess, Scheduler, SchedulerConfig, Slur
 use crate::service::keys::{Keyring, Rate};
 use crate::service::policies::{Loads, UploadLimit};
 use crate::service::webhooks::Webhooks;
-use crate::service::{App, WatchLimit, operations, policies};
+use crate::service::{App, Replica, WatchLimit, operations, policies};
 use crate::serving::{Engine, Environments, Limits, Registry, Sessions};
 use crate::store::{self, Store};
 use crate::telemetry;
@@ -88,6 +90,9 @@ pub enum Error {
     /// The path of this program is unknown, so workers cannot be started.
     #[error("cannot find the program of workers: {0}")]
     Worker(#[source] std::io::Error),
+    /// The client of the primary cannot be made.
+    #[error("cannot follow a primary: {0}")]
+    Follow(#[source] reqwest::Error),
     /// The threads of the engine cannot be started.
     #[error("cannot start the engine: {0}")]
     Engine(#[source] std::io::Error),
@@ -254,6 +259,10 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         tracing::warn!("this server accepts remote connections without TLS: API keys travel unencrypted (see --tls-cert)");
     }
     let draining = Draining::default();
+    let replica = match &config.follow {
+        Some(follow) => Some(Replica::open(follow.url.clone(), &store, &clock).await?),
+        None => None,
+    };
     let app = App {
         keys,
         uploads: UploadLimit::default(),
@@ -261,6 +270,7 @@ pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         store,
         registry: Arc::new(Registry::new(config.policy_memory)),
         loads: Loads::default(),
+        replica,
         retention: config.retention,
         sessions: Sessions::new(sessions, clock.clone()),
         absent_after: config.absent_after,
@@ -295,7 +305,8 @@ fn executor(config: &Config, data: &DataDir) -> Result<Arc<dyn Executor>, Error>
 /// Serves until `shutdown` resolves, then drains.
 ///
 /// # Errors
-/// [`Error::Listener`] when the address of a listener cannot be read, [`Error::Background`] when a thread cannot be started.
+/// [`Error::Listener`] when the address of a listener cannot be read, [`Error::Background`] when a thread cannot be started,
+/// [`Error::Follow`] when the client of the primary cannot be made.
 pub async fn run(
     config: &Config,
     data: &DataDir,
@@ -313,6 +324,7 @@ pub async fn run(
     let health = grpc::Health::new(app.draining.clone(), stop.clone());
     health.report(operations::server_health(&app).await);
 
+    let follower = config.follow.as_ref().map(Follower::new).transpose().map_err(Error::Follow)?;
     let background = Background::start().map_err(Error::Background)?;
     let connections = connections(config, &listeners, &app, (&stop, &background));
     // Workers share nothing with other callers: no caller can keep them out.
@@ -340,7 +352,11 @@ pub async fn run(
     let serve_rest = connections.serve(listeners.http, Protocol::Http, router);
 
     let upkeep = tokio::spawn(app.store.clone().upkeep());
-    let scheduler = tokio::spawn(app.scheduler.clone().run(format!("http://{workers}")));
+    let jobs = match follower {
+        // A replica starts no jobs.
+        Some(follower) => tokio::spawn(follower.run(app.clone())),
+        None => tokio::spawn(app.scheduler.clone().run(format!("http://{workers}"))),
+    };
     let housekeeper = tokio::spawn(housekeeping::run(app.clone(), config.session_ttl.min(config.environment_ttl), budget));
     let health_reporter = tokio::spawn(health.clone().follow(app.clone()));
     let key_follower = tokio::spawn(keys::follow(app.clone()));
@@ -365,7 +381,7 @@ pub async fn run(
         _ = serve => {}
         () = drain => {}
     }
-    for task in [upkeep, scheduler, housekeeper, health_reporter, key_follower] {
+    for task in [upkeep, jobs, housekeeper, health_reporter, key_follower] {
         task.abort();
     }
     keys::save_last_used(&app).await;

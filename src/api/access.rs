@@ -66,6 +66,7 @@ const REST: &[(&str, &str, Requirement)] = &[
     ("GET", "/v1/environments /v1/environments/{id}", READ),
     ("POST", "/v1/environments /v1/environments/{id}/reset /v1/environments/{id}/step", ACT),
     ("DELETE", "/v1/environments/{id}", ACT),
+    ("GET", "/v1/manifest", READ),
     ("GET", "/v1/policies /v1/policies/{policy} /v1/policies/{policy}/export", READ),
     ("GET", "/v1/policies/{name}/aliases /v1/policies/{name}/history /v1/policies/{name}/versions", READ),
     ("DELETE", "/v1/policies/{policy} /v1/policies/{name}/versions/{version}", ADMIN),

@@ -18,7 +18,7 @@ use tower::Service;
 
 use super::access::{self, Requirement};
 use super::browser::{self, AllowedHosts};
-use crate::service::keys::Caller;
+use crate::service::keys::{Caller, Scope};
 use crate::service::{App, Error};
 
 /// gRPC services that authorize every call.
@@ -76,7 +76,7 @@ pub(super) async fn authorize_rest(
 
 /// Authenticates the caller, counts the request against the rate of the key and checks the scope, in this order: a request
 /// without the required scope counts like any other. Moves the key from the headers to a [`Caller`] in the extensions. On a server
-/// without keys, `check_foreign` refuses what pages of other sites send.
+/// without keys, `check_foreign` refuses what pages of other sites send. A replica refuses changes.
 fn authorize<B>(
     app: &App,
     request: &mut Request<B>,
@@ -84,7 +84,8 @@ fn authorize<B>(
     check_foreign: impl FnOnce(&Request<B>) -> Result<(), Error>,
 ) -> Result<(), Error> {
     if !app.keys.required() {
-        return check_foreign(request);
+        check_foreign(request)?;
+        return refuse_changes(app, || requirement(request));
     }
     let requirement = requirement(request);
     if requirement == Requirement::NoKey {
@@ -96,10 +97,20 @@ fn authorize<B>(
     if let Requirement::Scope(scope) = requirement {
         caller.authorize(scope)?;
     }
+    refuse_changes(app, || requirement)?;
     request.headers_mut().remove(header::AUTHORIZATION);
     request.headers_mut().remove(API_KEY);
     request.extensions_mut().insert::<Caller>(caller);
     Ok(())
+}
+
+/// Refuses what a replica leaves to its primary: changes of policies, and jobs.
+fn refuse_changes(app: &App, requirement: impl FnOnce() -> Requirement) -> Result<(), Error> {
+    let Some(replica) = &app.replica else { return Ok(()) };
+    match requirement() {
+        Requirement::Scope(Scope::Admin | Scope::Jobs) => Err(Error::ReadOnly { primary: replica.primary().to_owned() }),
+        _ => Ok(()),
+    }
 }
 
 /// The caller of a request, as [`authorize`] put it into the extensions.

@@ -29,7 +29,7 @@ fn statuses(error: &Error) -> (Code, StatusCode) {
         Error::Invalid(invalid) if invalid.is_schema() => (Code::InvalidArgument, StatusCode::UNPROCESSABLE_ENTITY),
         Error::Invalid(_) => (Code::InvalidArgument, StatusCode::BAD_REQUEST),
         Error::NotFound { .. } => (Code::NotFound, StatusCode::NOT_FOUND),
-        Error::Precondition { .. } => (Code::FailedPrecondition, StatusCode::CONFLICT),
+        Error::Precondition { .. } | Error::ReadOnly { .. } => (Code::FailedPrecondition, StatusCode::CONFLICT),
         Error::Conflict { .. } => (Code::AlreadyExists, StatusCode::CONFLICT),
         Error::Busy { .. } => (Code::ResourceExhausted, StatusCode::TOO_MANY_REQUESTS),
         Error::TooLarge { .. } => (Code::ResourceExhausted, StatusCode::PAYLOAD_TOO_LARGE),
@@ -66,6 +66,14 @@ fn limit(error: &Error) -> Option<u64> {
 fn required_scope(error: &Error) -> Option<&'static str> {
     match error {
         Error::PermissionDenied { scope, .. } => Some(scope),
+        _ => None,
+    }
+}
+
+/// The address of the primary, if the request belongs there.
+fn primary(error: &Error) -> Option<&str> {
+    match error {
+        Error::ReadOnly { primary } => Some(primary),
         _ => None,
     }
 }
@@ -118,6 +126,7 @@ fn details(error: &Error) -> ErrorDetails {
     }
     metadata.extend(limit(error).map(|limit| ("limit".to_owned(), limit.to_string())));
     metadata.extend(required_scope(error).map(|scope| ("required_scope".to_owned(), scope.to_owned())));
+    metadata.extend(primary(error).map(|primary| ("primary".to_owned(), cut(primary, MAX_VALUE))));
     if let Some(seconds) = retry_after_seconds(error) {
         details.set_retry_info(Some(Duration::from_secs(seconds)));
     }
@@ -197,6 +206,10 @@ pub struct Problem {
     #[schema(example = "act")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub required_scope: Option<&'static str>,
+    /// REST address of the primary, to which the request belongs.
+    #[schema(example = "http://primary:8080")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub primary: Option<String>,
 }
 
 fn code_schema() -> Object {
@@ -228,6 +241,7 @@ impl Problem {
             limit: None,
             retry_after: None,
             required_scope: None,
+            primary: None,
         }
     }
 }
@@ -242,6 +256,7 @@ impl From<&Error> for Problem {
             limit: limit(error),
             retry_after: retry_after_seconds(error),
             required_scope: required_scope(error),
+            primary: primary(error).map(str::to_owned),
             ..Self::new(statuses(error).1, error.code(), error.to_string())
         }
     }

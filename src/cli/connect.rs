@@ -39,6 +39,9 @@ pub struct ConnectArgs {
     /// Whether the warning about a key without encryption was printed.
     #[arg(skip)]
     warned: Arc<AtomicBool>,
+    /// What the names of these flags begin with, for errors: nothing, or `follow-`.
+    #[arg(skip)]
+    prefix: &'static str,
 }
 
 /// Whether a connection to `url` is neither encrypted nor within this machine.
@@ -50,7 +53,7 @@ fn is_readable_by_others(url: &Uri) -> bool {
 
 /// Text that `Debug` hides.
 #[derive(Clone)]
-struct Secret(String);
+pub(super) struct Secret(String);
 
 impl From<String> for Secret {
     fn from(text: String) -> Self {
@@ -68,6 +71,12 @@ impl fmt::Debug for Secret {
 pub type Connector = HttpsConnector<HttpConnector>;
 
 impl ConnectArgs {
+    /// The flags `--follow-...` of a replica, for connections to its primary. `client`: certificate and private key.
+    pub(super) fn of_follow(api_key: Option<Secret>, ca_cert: Option<PathBuf>, client: Option<(PathBuf, PathBuf)>) -> Self {
+        let (client_cert, client_key) = client.unzip();
+        Self { api_key, ca_cert, client_cert, client_key, warned: Arc::default(), prefix: "follow-" }
+    }
+
     /// Parses `HOST:PORT` or a URL. Without a scheme, the scheme is `https` when a certificate flag is given, and `http`
     /// otherwise.
     ///
@@ -97,7 +106,9 @@ impl ConnectArgs {
         }
         // The error of the conversion is dropped, because it could contain the key.
         let value = HeaderValue::try_from(format!("Bearer {}", key.trim()));
-        let Ok(mut value) = value else { bail!("--api-key: not an API key; expected a key that qedgix keys create printed") };
+        let Ok(mut value) = value else {
+            bail!("--{}api-key: not an API key; expected a key that qedgix keys create printed", self.prefix)
+        };
         value.set_sensitive(true);
         Ok(Some(value))
     }
@@ -121,27 +132,30 @@ impl ConnectArgs {
     /// A certificate or private key cannot be read or used.
     pub fn tls(&self, url: &Uri) -> anyhow::Result<ClientConfig> {
         let https = url.scheme_str() == Some("https");
+        let flag = |name: &str| format!("--{}{name}", self.prefix);
         let builder = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()));
         let builder = builder.with_safe_default_protocol_versions()?;
         let builder = match &self.ca_cert {
             Some(path) => {
                 let mut roots = RootCertStore::empty();
-                for cert in certificates("--ca-cert", path)? {
-                    roots.add(cert).with_context(|| format!("--ca-cert {}", path.display()))?;
+                for cert in certificates(&flag("ca-cert"), path)? {
+                    roots.add(cert).with_context(|| format!("{} {}", flag("ca-cert"), path.display()))?;
                 }
                 builder.with_root_certificates(roots)
             }
             None if https => {
-                builder.with_native_roots().context("cannot load the certificate authorities of this machine; use --ca-cert")?
+                let hint = || format!("cannot load the certificate authorities of this machine; use {}", flag("ca-cert"));
+                builder.with_native_roots().with_context(hint)?
             }
             None => builder.with_root_certificates(RootCertStore::empty()),
         };
         let Some((cert, key)) = self.client_cert.as_deref().zip(self.client_key.as_deref()) else {
             return Ok(builder.with_no_client_auth());
         };
-        let certs = certificates("--client-cert", cert)?;
-        let private_key = PrivateKeyDer::from_pem_file(key).with_context(|| format!("--client-key {}", key.display()))?;
-        builder.with_client_auth_cert(certs, private_key).with_context(|| format!("--client-key {}", key.display()))
+        let certs = certificates(&flag("client-cert"), cert)?;
+        let of_key = || format!("{} {}", flag("client-key"), key.display());
+        let private_key = PrivateKeyDer::from_pem_file(key).with_context(of_key)?;
+        builder.with_client_auth_cert(certs, private_key).with_context(of_key)
     }
 }
 

@@ -1,6 +1,7 @@
 //! `qedgix serve`: flags, signals, and the run of one server.
 
 mod executor;
+mod follow;
 
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::path::PathBuf;
@@ -11,6 +12,7 @@ use clap::{Args, ValueEnum};
 use tokio::signal::unix::{SignalKind, signal};
 
 use self::executor::ExecutorArgs;
+use self::follow::FollowArgs;
 use super::output::{OutputError, outln};
 use super::signals::StopSignals;
 use crate::clock::Clock;
@@ -26,6 +28,9 @@ use crate::telemetry::{self, LogConfig, TraceExporter};
   qedgix serve
   qedgix serve --grpc-addr 127.0.0.1:0 --http-addr 127.0.0.1:0 --data-dir /var/lib/qedgix   # free ports, written to endpoints.json
   QEDGIX_CPU_BUDGET=2 QEDGIX_LOG=debug qedgix serve --log-format json
+
+A replica, which takes its policies from another server:
+  QEDGIX_FOLLOW_API_KEY=qdx_... qedgix serve --follow https://primary:8080
 
 Training on a cluster:
   qedgix serve --executor slurm --worker-addr login1.cluster:50052 --slurm-dir /home/lab/qedgix --slurm-partition cpu --slurm-time 8h
@@ -133,6 +138,8 @@ pub struct ServeArgs {
     #[command(flatten)]
     executor: ExecutorArgs,
     #[command(flatten)]
+    follow: FollowArgs,
+    #[command(flatten)]
     security: SecurityArgs,
     /// Format of the logs on standard error
     #[arg(long, env = "QEDGIX_LOG_FORMAT", default_value = "text", value_enum, value_name = "FORMAT")]
@@ -212,7 +219,7 @@ pub async fn run(args: ServeArgs) -> anyhow::Result<()> {
     let logs = LogConfig { json: matches!(args.log_format, LogFormat::Json), access: args.access_log };
     telemetry::init_logs(logs, traces.as_ref());
     refuse_huge_pages();
-    let config = args.config();
+    let config = Config { follow: args.follow.config()?, ..args.config() };
     config.validate()?;
     let data = DataDir::lock(&config.data_dir)?;
     let listeners = Listeners::bind(&config).await?;
@@ -247,6 +254,9 @@ fn print_start(config: &Config, endpoints: Endpoints) -> Result<(), OutputError>
     let scheme = if config.tls.is_some() { "https" } else { "http" };
     outln!("REST       {scheme}://{}", endpoints.http)?;
     outln!("dashboard  {scheme}://{}/", endpoints.http)?;
+    if let Some(follow) = &config.follow {
+        outln!("replica of {}", follow.url)?;
+    }
     outln!("data       {}", config.data_dir.display())
 }
 

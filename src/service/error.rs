@@ -31,6 +31,12 @@ pub enum Error {
         /// The state and what the caller can do.
         message: String,
     },
+    /// This server is a replica, which changes no policies and has no jobs.
+    #[error("this server is a replica of {primary} and changes nothing itself; send the request to {primary}")]
+    ReadOnly {
+        /// REST address of the primary.
+        primary: String,
+    },
     /// The resource exists and differs from the requested one.
     #[error("{message}")]
     Conflict {
@@ -100,6 +106,7 @@ impl Error {
             Self::Invalid(_) => ErrorCode::InvalidArgument,
             Self::NotFound { .. } => ErrorCode::NotFound,
             Self::Precondition { code, .. } | Self::Conflict { code, .. } => *code,
+            Self::ReadOnly { .. } => ErrorCode::ReadOnly,
             Self::Busy { .. } => ErrorCode::ResourceExhausted,
             Self::Overloaded => ErrorCode::Overloaded,
             Self::TooLarge { .. } => ErrorCode::TooLarge,

@@ -13,6 +13,7 @@ pub mod operations;
 mod paging;
 pub mod policies;
 pub mod progress;
+mod replica;
 pub mod sessions;
 mod watch_limit;
 pub mod webhooks;
@@ -22,6 +23,7 @@ use std::sync::Arc;
 
 pub use error::Error;
 pub use paging::{Page, PageRequest};
+pub use replica::Replica;
 pub use watch_limit::WatchLimit;
 
 use crate::clock::Clock;
@@ -49,6 +51,8 @@ pub struct App {
     pub keys: keys::Keyring,
     /// Versions of policies that are being loaded.
     pub loads: policies::Loads,
+    /// What this server is a replica of; `None`: it is none.
+    pub replica: Option<Replica>,
     /// What the server keeps of old versions and checkpoints.
     pub retention: policies::Retention,
     /// The limit of uploads of checkpoints.
@@ -74,6 +78,17 @@ impl App {
     /// [`Error::Draining`] once draining has begun.
     pub fn admit(&self) -> Result<(), Error> {
         if self.draining.begun() { Err(Error::Draining) } else { Ok(()) }
+    }
+
+    /// Checks that this server has policies of its primary, if it is a replica.
+    ///
+    /// # Errors
+    /// [`Error::Unavailable`].
+    pub fn check_copy(&self) -> Result<(), Error> {
+        if self.replica.as_ref().is_some_and(|replica| replica.age(&self.clock).is_none()) {
+            return Err(Error::Unavailable("this replica has not taken policies from its primary yet"));
+        }
+        Ok(())
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::{App, Error};
+use super::{App, Error, Replica};
 use crate::invalid::in_range;
 use crate::store::JobState;
 
@@ -17,9 +17,9 @@ pub struct ServerHealth {
     pub database: bool,
     /// The database can be written.
     pub writes: bool,
-    /// At least one policy version exists, loaded or not.
+    /// At least one policy version exists, loaded or not; a replica has those of its primary.
     pub policies: bool,
-    /// The queue of jobs is readable, so jobs are started.
+    /// The queue of jobs is readable, so jobs are started. Not on a replica.
     pub scheduler: bool,
 }
 
@@ -28,8 +28,9 @@ pub async fn server_health(app: &App) -> ServerHealth {
     ServerHealth {
         database: ping_database(app).await.is_ok(),
         writes: app.store.write_failure().is_none(),
-        policies: !app.registry.is_empty(),
-        scheduler: *app.scheduler.queue_readable().borrow(),
+        policies: !app.registry.is_empty() && app.check_copy().is_ok(),
+        // A replica has no jobs.
+        scheduler: app.replica.is_none() && *app.scheduler.queue_readable().borrow(),
     }
 }
 
@@ -53,7 +54,7 @@ async fn ping_database(app: &App) -> Result<(), String> {
 }
 
 impl App {
-    /// Checks that the server is ready: it is not draining, a policy exists, and the database responds and can be written.
+    /// Checks that the server is ready: it is not draining, a policy exists (on a replica, those of its primary), and the database responds and can be written.
     ///
     /// # Errors
     /// [`Error::Draining`], or [`Error::Unavailable`] with what is missing.
@@ -62,6 +63,7 @@ impl App {
         if self.registry.is_empty() {
             return Err(Error::Unavailable("there is no policy"));
         }
+        self.check_copy()?;
         ping_database(self).await.map_err(|reason| {
             tracing::warn!(reason, "the database does not answer");
             Error::Unavailable("the database does not answer")
@@ -93,6 +95,10 @@ pub struct ServerMetrics {
     pub threads: usize,
     /// Open streams of jobs' events.
     pub watchers: usize,
+    /// Of a replica: time since its policies were last known to be those of the primary; `None`: never.
+    pub replica_age: Option<Duration>,
+    /// Of a replica: versions of the primary that could not be taken over.
+    pub replica_missing: Option<usize>,
     /// Jobs by state; empty if the database does not answer.
     pub jobs: Vec<(JobState, u64)>,
 }
@@ -118,6 +124,8 @@ pub async fn server_metrics(app: &App) -> ServerMetrics {
         threads_busy: app.scheduler.threads_busy(),
         threads: app.scheduler.cpu_budget(),
         watchers: app.watchers.open(),
+        replica_age: app.replica.as_ref().and_then(|replica| replica.age(&app.clock)),
+        replica_missing: app.replica.as_ref().map(Replica::missing),
         jobs,
     }
 }

@@ -22,6 +22,7 @@ mod attempts;
 mod backup;
 mod checkpoints;
 mod events;
+mod followed;
 mod job_changes;
 mod job_id;
 mod job_list;
@@ -51,6 +52,7 @@ pub use attempts::{Attempt, AttemptOutcome, EndedAttempt, Lease, LeaseRecord, Wo
 pub use backup::{BackupError, backup, restore};
 pub use checkpoints::{Checkpoint, CheckpointKind, NewCheckpoint};
 pub use events::{JobEvent, JobEventKind};
+pub use followed::FollowedVersion;
 pub use job_changes::{ActionResult, JobEdit};
 pub use job_id::JobId;
 pub use job_list::{JobCursor, JobFilter, JobList, JobOrder, JobSort, ListedJob, SortKey};
@@ -98,6 +100,7 @@ const MIGRATIONS: &[(&str, &str)] = &migrations![
     "0011_lifecycle.sql",
     "0012_initial_weights.sql",
     "0013_launches.sql",
+    "0014_followed_versions.sql",
     "0015_webhooks.sql",
     "0016_old_jobs.sql",
 ];

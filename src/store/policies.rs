@@ -141,6 +141,8 @@ impl Store {
         for &version in versions {
             let sql = "DELETE FROM policies_unloaded WHERE name = ? AND version = ?";
             sqlx::query(sql).bind(name).bind(version as i64).execute(&mut *tx).await?;
+            let sql = "DELETE FROM followed_versions WHERE name = ? AND version = ?";
+            sqlx::query(sql).bind(name).bind(version as i64).execute(&mut *tx).await?;
             let sql = "DELETE FROM policy_versions WHERE name = ? AND version = ?";
             sqlx::query(sql).bind(name).bind(version as i64).execute(&mut *tx).await?;
         }

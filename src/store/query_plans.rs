@@ -16,6 +16,8 @@ const SCANS: &[(&str, &str)] = &[
     ("SELECT j.id, l.job, l.attempt, l.name", "once at the start; as many as workers run"),
     ("DELETE FROM launches", "once at the start, of all rows"),
     ("WITH ended AS (", "every minute, if old jobs are deleted; reads only the index of jobs that have ended"),
+    ("SELECT name, version FROM followed_versions", "all are compared, when a primary has changed"),
+    ("SELECT at FROM followed_until", "one row"),
     ("SELECT version FROM _sqlx_migrations", "one row per migration"),
     ("SELECT version FROM written_by", "one row"),
 ];

@@ -37,6 +37,9 @@ fn describe() {
     describe_counter!("grpc_server_msg_sent_total", "Messages sent in gRPC calls.");
     describe_counter!("qedgix_jobs_deleted_total", "Ended jobs that the rules of retention deleted.");
     describe_counter!("qedgix_webhook_messages_total", "Tries to tell the receivers of webhooks, by result.");
+    describe_gauge!("qedgix_replica_age_seconds", "Replica: time since its policies were last known to be those of the primary.");
+    describe_gauge!("qedgix_replica_missing_versions", "Replica: versions of the primary that cannot be taken over.");
+    describe_counter!("qedgix_replica_failures_total", "Replica: questions to the primary that failed.");
     describe_counter!("http_requests_total", "REST requests completed.");
     describe_histogram!("http_request_duration_seconds", "Time from a REST request to the header of its response.");
     describe_gauge!("qedgix_connections", "Open connections, including those of local workers.");

@@ -118,6 +118,7 @@ impl Server {
             store,
             registry: Arc::default(),
             loads: Loads::default(),
+            replica: None,
             retention: Retention::default(),
             sessions: Sessions::new(limits, clock.clone()),
             absent_after: config.absent_after,

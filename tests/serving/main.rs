@@ -11,6 +11,7 @@ mod decentral;
 mod environments;
 mod explain;
 mod fleets;
+mod follow;
 mod guard;
 mod harness;
 mod health;

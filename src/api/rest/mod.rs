@@ -9,6 +9,7 @@ mod environments;
 mod events;
 pub mod extract;
 mod jobs;
+mod manifest;
 mod middleware;
 mod openapi;
 mod ops;
@@ -47,6 +48,7 @@ pub fn router(app: Arc<App>, metrics: fn() -> String, max_body: usize, hosts: Al
         .merge(sessions::router())
         .merge(policies::router())
         .merge(aliases::router())
+        .merge(manifest::router())
         .merge(environments::router())
         .merge(jobs::router())
         .merge(events::router())

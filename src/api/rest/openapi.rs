@@ -85,10 +85,12 @@ fn finished(document: &OpenApi, cpu_budget: usize) -> Value {
         InsufficientStorage::responses(),
     ];
     let everywhere: BTreeMap<_, _> = everywhere.into_iter().flatten().collect();
+    // A replica refuses changes.
+    let of_changes: BTreeMap<_, _> = Conflict::responses().into_iter().chain(everywhere.clone()).collect();
     let paths = document["paths"].as_object_mut().into_iter().flatten().filter(|(path, _)| path.starts_with("/v1"));
-    for operation in paths.filter_map(|(_, item)| item.as_object_mut()).flat_map(Map::values_mut) {
+    for (verb, operation) in paths.filter_map(|(_, item)| item.as_object_mut()).flatten() {
         let Some(responses) = operation["responses"].as_object_mut() else { continue };
-        for (status, response) in &everywhere {
+        for (status, response) in if verb == "get" { &everywhere } else { &of_changes } {
             responses.entry(status).or_insert_with(|| json!(response));
         }
     }
@@ -217,7 +219,7 @@ problems! {
     Unauthorized = 401: "The server requires an API key, and the request has none or an invalid one.";
     Forbidden = 403: "The API key lacks the required scope.";
     NotFound = 404: "The resource does not exist.";
-    Conflict = 409: "The state of the resource does not allow the operation, or the resource exists and differs; see `code`.";
+    Conflict = 409: "The state of the resource does not allow the operation, the resource exists and differs, or the server is a replica; see `code`.";
     TooLarge = 413: "The body is larger than the limit.";
     UnsupportedMediaType = 415: "The content type of the body is not supported.";
     Unprocessable = 422: "The JSON does not match the schema; `field` is the path.";

@@ -39,13 +39,19 @@ async fn live() -> &'static str {
 }
 
 /// Whether the server is ready to serve
+///
+/// A replica also says how old its copy of the primary's policies is.
 #[utoipa::path(
     get, path = "/readyz", operation_id = "ready", tag = "operations",
     responses((status = 200, description = "The server is ready.", body = String, content_type = "text/plain"), Fault, Draining)
 )]
-async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Error> {
+async fn ready(State(app): State<Arc<App>>) -> Result<String, Error> {
     app.ready().await?;
-    Ok("ok\n")
+    let mut text = "ok\n".to_owned();
+    if let Some((replica, age)) = app.replica.as_ref().and_then(|replica| Some((replica, replica.age(&app.clock)?))) {
+        text += &format!("replica of {}, whose policies it had {} s ago\n", replica.primary(), age.as_secs());
+    }
+    Ok(text)
 }
 
 /// The CPU budget of training.
@@ -118,6 +124,12 @@ async fn metrics(State(app): State<Arc<App>>, Extension(render): Extension<fn() 
         metrics::gauge!(name).set(value as f64);
     }
     metrics::counter!("qedgix_policy_loads_total").absolute(metrics.policy_loads);
+    if let Some(age) = metrics.replica_age {
+        metrics::gauge!("qedgix_replica_age_seconds").set(age.as_secs_f64());
+    }
+    if let Some(missing) = metrics.replica_missing {
+        metrics::gauge!("qedgix_replica_missing_versions").set(missing as f64);
+    }
     for (state, jobs) in metrics.jobs {
         metrics::gauge!("qedgix_jobs", "state" => state.as_str()).set(jobs as f64);
     }

@@ -54,7 +54,7 @@ pub async fn delete(app: &App, name: &str, version: Option<u64>) -> Result<(), E
 
 /// Removes versions from the registry, so that no request finds them any more, then deletes them from the database. They return
 /// to the registry if that fails.
-async fn remove(PolicyStores { store, registry }: &PolicyStores, name: &str, versions: &[u64]) -> Result<(), Error> {
+pub(super) async fn remove(PolicyStores { store, registry }: &PolicyStores, name: &str, versions: &[u64]) -> Result<(), Error> {
     let removed = registry.remove(name, versions)?;
     let numbers = removed.numbers();
     if let Err(e) = store.delete_policy_versions(name, &numbers).await {

@@ -224,7 +224,7 @@ fn versions(registry: &Registry, spec: &PolicySpec) -> Result<Vec<VersionState>,
     if found.is_empty() { Err(Error::not_found("policy", spec.to_string())) } else { Ok(found) }
 }
 
-/// Fills the registry with baselines, published versions, bundled policies and aliases. Unloaded versions stay unloaded. No
+/// Fills the registry with baselines, published versions, bundled policies (not on a replica) and aliases. Unloaded versions stay unloaded. No
 /// checkpoint is read.
 ///
 /// # Errors
@@ -247,7 +247,8 @@ pub async fn fill_registry(app: &App) -> Result<(), Error> {
             tracing::error!(policy = name, version, digest, "the digest of a version cannot be read");
         }
     }
-    for (name, bytes) in BUNDLED {
+    // A replica has what its primary has.
+    for (name, bytes) in BUNDLED.iter().filter(|_| app.replica.is_none()) {
         if app.registry.version_of_digest(name, &Sha256::digest(bytes).into()).is_none() {
             publish_bytes(app, Publisher::PROGRAM, name, bytes.to_vec()).await?;
         }

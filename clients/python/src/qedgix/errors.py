@@ -44,6 +44,7 @@ class QedgixError(Exception):
         expected: what the field accepts; None if the error is not about a field.
         limit: the limit in bytes that the request exceeds; None if there is none.
         required_scope: the scope that the API key lacks; None if there is none.
+        primary: REST address of the server that takes the request, if this one is its replica (`read_only`); None otherwise.
         retry_after: seconds after which the server suggests to retry; None if it suggests nothing.
         request_id: id of the request in the log of the server; empty if the request did not reach a server.
     """
@@ -58,6 +59,7 @@ class QedgixError(Exception):
         expected: str | None = None,
         limit: int | None = None,
         required_scope: str | None = None,
+        primary: str | None = None,
         retry_after: float | None = None,
         request_id: str = "",
     ) -> None:
@@ -69,6 +71,7 @@ class QedgixError(Exception):
         self.expected = expected
         self.limit = limit
         self.required_scope = required_scope
+        self.primary = primary
         self.retry_after = retry_after
         self.request_id = request_id
 
@@ -230,7 +233,8 @@ def _details(encoded: bytes) -> dict[str, Any]:
             error_details_pb2.RetryInfo(),
         )
         if packed.Unpack(info):
-            found.update({key: info.metadata[key] for key in ("value", "expected", "required_scope") if key in info.metadata})
+            texts = ("value", "expected", "required_scope", "primary")
+            found.update({key: info.metadata[key] for key in texts if key in info.metadata})
             if "limit" in info.metadata:
                 found["limit"] = int(info.metadata["limit"])
         elif packed.Unpack(request) and request.field_violations:
@@ -254,7 +258,7 @@ def from_http(response: httpx.Response) -> QedgixError:
     except (ValueError, LookupError, TypeError):
         kind, code = _GRPC.get(_HTTP.get(response.status_code, 0), (Internal, "internal"))
         return kind(f"HTTP status {response.status_code}", code=code, request_id=request_id)
-    names = ("value", "expected", "limit", "required_scope", "retry_after")
+    names = ("value", "expected", "limit", "required_scope", "primary", "retry_after")
     return family(code, _HTTP.get(response.status_code, 13))(
         message,
         code=code,

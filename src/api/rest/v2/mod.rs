@@ -58,13 +58,18 @@ pub fn is_v2(path: &str) -> bool {
 }
 
 /// Converts a problem response to the error format of the protocol: `error` and `code`, and where known `field`, `value`,
-/// `expected` and `required_scope`. Keeps the status and the headers.
+/// `expected`, `required_scope` and `primary`. Keeps the status and the headers.
 pub fn convert_problem(mut response: Response) -> Response {
     let Some(problem) = response.extensions_mut().remove::<Problem>() else { return response };
     let mut body = json!({"error": problem.detail, "code": problem.code});
     let required_scope = problem.required_scope.map(str::to_owned);
-    let details =
-        [("field", problem.field), ("value", problem.value), ("expected", problem.expected), ("required_scope", required_scope)];
+    let details = [
+        ("field", problem.field),
+        ("value", problem.value),
+        ("expected", problem.expected),
+        ("required_scope", required_scope),
+        ("primary", problem.primary),
+    ];
     for (name, value) in details {
         if let Some(value) = value {
             body[name] = value.into();
