@@ -1,7 +1,8 @@
 //! Metrics as event files of TensorBoard: TFRecords of `tensorflow.Event` messages, with the few fields that scalars need.
 //!
-//! Each attempt of a job has its own file with the rows that it was the last to compute, so that every row is in one file, and the
-//! steps of a metric rise from file to file although a resumed attempt repeats steps.
+//! Each attempt of a job has its own file. A row is in the file of the attempt that computed its value first: where a later attempt
+//! repeats a step, the same value changes nothing, and another one (a speed) replaces the row. So every row is in one file, and the
+//! steps of a metric rise from file to file.
 
 use std::fs::{self, File};
 use std::io::{self, BufRead, BufWriter, Write};
