@@ -31,7 +31,7 @@ use tokio::sync::{Notify, watch};
 
 pub use executor::{Executor, Launch, LogTail, Resources, WorkerExit, WorkerStatus};
 pub use local::LocalProcess;
-pub use slurm::{Slurm, SlurmConfig};
+pub use slurm::{Slurm, SlurmConfig, SlurmTimes};
 
 use crate::clock::Clock;
 use crate::draining::Draining;

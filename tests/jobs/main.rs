@@ -16,6 +16,7 @@ mod protocol;
 mod publishing;
 mod retention;
 mod scheduling;
+mod slurm;
 mod space;
 mod submission;
 mod timing;

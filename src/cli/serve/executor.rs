@@ -58,7 +58,7 @@ impl ExecutorArgs {
                 time: self.slurm_time,
                 extra: self.slurm_extra.iter().filter(|flag| !flag.is_empty()).cloned().collect(),
                 directory: self.slurm_dir.clone(),
-                commands: None,
+                ..SlurmConfig::default()
             }),
         };
         (executor, self.worker_addr.clone())

@@ -28,12 +28,26 @@ use super::executor::{Executor, Launch, LogTail, WorkerExit};
 use super::worker::Assignment;
 use crate::files;
 
-/// Time limit of a command of Slurm. `sbatch` waits for a busy controller.
-const COMMAND_TIMEOUT: Duration = Duration::from_secs(60);
-/// Time between two lists of all jobs, and that time while Slurm does not answer.
-const LIST_INTERVAL: [Duration; 2] = [Duration::from_secs(2), Duration::from_secs(10)];
-/// Time between two questions to the accounting about a job that is not listed.
-const SACCT_INTERVAL: Duration = Duration::from_secs(30);
+/// How often Slurm is asked, and how long it may take to answer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SlurmTimes {
+    /// Time limit of a command of Slurm. `sbatch` waits for a busy controller.
+    pub command: Duration,
+    /// Time between two lists of all jobs.
+    pub list: Duration,
+    /// That time while Slurm does not answer.
+    pub list_after_error: Duration,
+    /// Time between two questions to the accounting about a job that is not listed.
+    pub sacct: Duration,
+}
+
+impl Default for SlurmTimes {
+    fn default() -> Self {
+        let [command, list, list_after_error, sacct] = [60, 2, 10, 30].map(Duration::from_secs);
+        Self { command, list, list_after_error, sacct }
+    }
+}
+
 /// Time between two reads of the output of a worker.
 const OUTPUT_INTERVAL: Duration = Duration::from_millis(500);
 /// Time between two tries to cancel a job: the first, which doubles, and the longest.
@@ -65,7 +79,7 @@ impl Slurm {
     pub fn new(config: SlurmConfig, program: PathBuf, directory: PathBuf) -> io::Result<Self> {
         files::create_private_dir(&directory)?;
         let directory = std::path::absolute(directory)?;
-        let commands = Commands { directory: config.commands.clone(), timeout: COMMAND_TIMEOUT };
+        let commands = Commands { directory: config.commands.clone(), timeout: config.times.command };
         Ok(Self(Arc::new(Inner { config, program, directory, commands, listed: Mutex::default() })))
     }
 
@@ -126,10 +140,11 @@ impl Slurm {
                     break exit;
                 }
             }
-            let next_list = Instant::now() + LIST_INTERVAL[0];
+            let next_list = Instant::now() + self.0.config.times.list;
             while Instant::now() < next_list && !launch.kill.is_cancelled() {
                 output.copy(&launch.log).await;
-                let _ = tokio::time::timeout(OUTPUT_INTERVAL, launch.kill.cancelled()).await;
+                let pause = OUTPUT_INTERVAL.min(self.0.config.times.list);
+                let _ = tokio::time::timeout(pause, launch.kill.cancelled()).await;
             }
         };
         launch.status.set_waiting(None);
@@ -153,7 +168,7 @@ impl Slurm {
 
     /// The job `name` in the accounting, which is asked rarely, and may be missing or broken.
     async fn find_ended(&self, name: &str, accounting: &mut Accounting) -> Option<SlurmJob> {
-        if accounting.asked.is_some_and(|at| at.elapsed() < SACCT_INTERVAL) {
+        if accounting.asked.is_some_and(|at| at.elapsed() < self.0.config.times.sacct) {
             return None;
         }
         accounting.asked = Some(Instant::now());
@@ -161,8 +176,13 @@ impl Slurm {
         let json = [&of_name[..], &["--json".to_owned()]].concat();
         let jobs = match self.0.commands.run("sacct", &json, "").await.map(|output| listing::from_json(&output)) {
             Ok(Some(jobs)) => jobs,
-            Err(error @ (CommandError::Start(..) | CommandError::Timeout { .. })) => {
-                tracing::debug!(%error, "the accounting of Slurm does not answer");
+            // A cluster may have no accounting.
+            Err(error @ CommandError::Start(..)) => {
+                tracing::debug!(%error, "the accounting of Slurm cannot be asked");
+                return None;
+            }
+            Err(error @ CommandError::Timeout { .. }) => {
+                tracing::warn!(name, %error, "the accounting of Slurm does not answer; trying again");
                 return None;
             }
             _ => {
@@ -174,12 +194,12 @@ impl Slurm {
         newest(&jobs, name).cloned()
     }
 
-    /// All jobs of this user, at most as old as [`LIST_INTERVAL`]. Followers share one command.
+    /// All jobs of this user, at most as old as [`SlurmTimes::list`]. Followers share one command.
     async fn list(&self) -> (Instant, Listing) {
         let mut listed = self.0.listed.lock().await;
-        let [fresh, after_error] = LIST_INTERVAL;
+        let SlurmTimes { list, list_after_error, .. } = self.0.config.times;
         if let Some((at, listing)) = &*listed
-            && at.elapsed() < if listing.is_ok() { fresh } else { after_error }
+            && at.elapsed() < if listing.is_ok() { list } else { list_after_error }
         {
             return (*at, listing.clone());
         }

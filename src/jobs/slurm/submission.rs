@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use super::SlurmTimes;
 use crate::invalid::Invalid;
 use crate::jobs::Resources;
 
@@ -21,6 +22,8 @@ pub struct SlurmConfig {
     pub directory: Option<PathBuf>,
     /// Directory of the commands of Slurm; `None`: those of `PATH`.
     pub commands: Option<PathBuf>,
+    /// How often Slurm is asked, and how long it may take.
+    pub times: SlurmTimes,
 }
 
 /// Flags of `sbatch` that the server sets itself, or that would start several workers for one attempt.
