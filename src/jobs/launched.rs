@@ -9,8 +9,7 @@ use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
 use super::starting::{StartError, failed, new_token};
-use super::{Launch, Resources, RunningAttempt, Scheduler, token_digest};
-use crate::learner::MemoryEstimate;
+use super::{Launch, Resources, RunningAttempt, Scheduler, memory, token_digest};
 use crate::store::{Job, LaunchRecord, Lease, WorkerResult};
 
 /// Delays before a worker is launched again: the first, which doubles, and the longest.
@@ -18,17 +17,9 @@ const LAUNCH_DELAY: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs
 /// Time between two tries to use a database that fails.
 const RETRY_DELAY: Duration = Duration::from_secs(1);
 
-/// Memory of a worker besides what the configuration needs: the program, its buffers, and checkpoints that are sent.
-const BASE_MEMORY: u64 = 512 << 20;
-
 /// What a worker of a job needs.
 pub(super) fn resources(job: &Job, threads: usize) -> Resources {
-    let spec = job.spec.decode().ok();
-    let limit = spec.as_ref().and_then(|spec| spec.limits.memory);
-    let needed = spec.and_then(|spec| spec.config).map_or(0, |config| MemoryEstimate::of(&config, threads).total());
-    // The estimate counts the large arrays only. A snapshot is a copy of the replay.
-    let memory = limit.unwrap_or(needed.saturating_mul(2)).saturating_add(BASE_MEMORY);
-    Resources { threads, memory }
+    Resources { threads, memory: memory::request(job.spec.decode().ok().as_ref(), threads) }
 }
 
 /// A launch that is not sent yet.

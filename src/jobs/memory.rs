@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use crate::invalid::Invalid;
 use crate::learner::{MemoryEstimate, TrainConfig};
+use crate::store::JobSpec;
 
 /// Memory in bytes that this process can use at most: that of the machine, or less if a control group limits it. `u64::MAX` if the
 /// system does not say.
@@ -39,12 +40,20 @@ fn limit_files(groups: &str) -> Vec<PathBuf> {
     files
 }
 
+/// Memory in bytes of a worker besides what its configuration needs: the program, its buffers, and checkpoints that are sent.
+const BASE: u64 = 512 << 20;
+
 /// Memory in bytes that a worker may use unless its job says otherwise: several times the estimate, because a snapshot copies the
 /// replay, and allocators keep what they may need again.
 pub fn default_limit(config: &TrainConfig, threads: usize) -> u64 {
-    /// What a worker needs besides its estimate.
-    const BASE: u64 = 512 << 20;
     MemoryEstimate::of(config, threads).total().saturating_mul(3).saturating_add(BASE)
+}
+
+/// Memory in bytes to ask a cluster for: more than the limit of the worker, so that the worker ends by itself, and says why, before the
+/// cluster kills it.
+pub(super) fn request(spec: Option<&JobSpec>, threads: usize) -> u64 {
+    let default = || Some(default_limit(spec?.config.as_ref()?, threads));
+    spec.and_then(|spec| spec.limits.memory).or_else(default).unwrap_or(0).saturating_add(BASE)
 }
 
 /// Returns when this process uses more than `limit` bytes, with what it uses. Never where the system does not say.
@@ -110,6 +119,18 @@ mod tests {
     async fn a_process_knows_what_it_uses() {
         let used = exceeds(0).await;
         assert!((1 << 20..1 << 40).contains(&used), "{used}");
+    }
+
+    #[test]
+    fn a_cluster_is_asked_for_more_than_the_limit() {
+        let config = TrainConfig::preset(Algorithm::Qmix, Preset::Practical);
+        let limit = default_limit(&config, 2);
+        let mut spec = JobSpec::train(config);
+        assert_eq!(request(Some(&spec), 2), limit + BASE);
+        spec.limits.memory = Some(1 << 30);
+        assert_eq!(request(Some(&spec), 2), (1 << 30) + BASE);
+        spec.limits.memory = Some(u64::MAX);
+        assert_eq!((request(Some(&spec), 2), request(None, 2)), (u64::MAX, BASE));
     }
 
     #[test]
