@@ -9,13 +9,11 @@ use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 
 use super::starting::{StartError, failed, new_token};
-use super::{Launch, Resources, RunningAttempt, Scheduler, memory, token_digest};
+use super::{Launch, RETRY_DELAY, Resources, RunningAttempt, Scheduler, memory, token_digest};
 use crate::store::{Job, LaunchRecord, Lease, WorkerResult};
 
 /// Delays before a worker is launched again: the first, which doubles, and the longest.
 const LAUNCH_DELAY: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(60)];
-/// Time between two tries to use a database that fails.
-const RETRY_DELAY: Duration = Duration::from_secs(1);
 
 /// What a worker of a job needs.
 pub(super) fn resources(job: &Job, threads: usize) -> Resources {

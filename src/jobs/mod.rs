@@ -15,6 +15,7 @@ mod scheduler;
 mod slurm;
 pub mod spec;
 mod starting;
+mod supervision;
 pub mod sweep;
 pub mod sweep_jobs;
 pub mod webhooks;
@@ -36,6 +37,9 @@ pub use slurm::{Slurm, SlurmConfig, SlurmTimes};
 use crate::clock::Clock;
 use crate::draining::Draining;
 use crate::store::{self, Lease, PendingAction, Store};
+
+/// Time between two tries to use a database that fails.
+const RETRY_DELAY: Duration = Duration::from_secs(1);
 
 /// Limits and times of the scheduler.
 #[derive(Clone, Debug)]

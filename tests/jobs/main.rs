@@ -15,6 +15,7 @@ mod processes;
 mod protocol;
 mod publishing;
 mod retention;
+mod schedules;
 mod scheduling;
 mod slurm;
 mod space;

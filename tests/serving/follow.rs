@@ -186,7 +186,7 @@ async fn a_replica_refuses_changes_and_names_its_primary() {
         (Method::POST, "/v1/jobs", job.as_str()),
         (Method::PUT, "/v1/server/budget", r#"{"threads": 1}"#),
     ] {
-        let (status, problem) = rest.send(method.clone(), path, body).await;
+        let (status, problem) = rest.send(method.clone(), path, body.to_owned()).await;
         assert_eq!((status.as_u16(), &problem["code"]), (409, &json!("read_only")), "{method} {path}: {problem}");
         assert_eq!(problem["primary"], primary.url(""), "{method} {path}");
     }

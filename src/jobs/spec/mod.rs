@@ -1,18 +1,26 @@
 //! What a caller may request of a job. Both transports and the command line come here, so that they accept the same.
 
+mod checks;
+mod edit;
+
 use std::collections::BTreeMap;
 
 use serde::de::DeserializeOwned;
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 
+pub use self::checks::{MAX_NOTES, check_name};
+use self::checks::{
+    MAX_MEMORY, MIN_MEMORY, check_labels, check_notes, check_priority, check_stop, resolve_dependencies, resolve_limits,
+};
+pub use self::edit::EditRequest;
 use super::evaluation::EvaluationRequest;
 use super::memory;
 use super::sweep::SweepRequest;
 use super::webhooks::{self, WebhookRequest};
 use crate::invalid::{Invalid, in_range};
-use crate::store::{EarlyStop, Job, JobEdit, JobId, JobKind, JobLimits, JobSpec, PublishRule, is_metric_name};
+use crate::store::{EarlyStop, JobKind, JobLimits, JobSpec, PublishRule};
 use crate::train_config::{Algorithm, Preset, TrainConfig, floats_to_integers};
 
 /// A job as it is submitted; what is absent has a default.
@@ -253,68 +261,6 @@ pub struct ContinueRequest {
     pub steps: u64,
 }
 
-/// What a caller changes of a job, as a JSON merge patch (RFC 7396): what is absent stays, and null means the default.
-#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct EditRequest {
-    /// The name; null: no name.
-    #[serde(deserialize_with = "present")]
-    pub name: Option<Option<String>>,
-    /// The labels to add or replace; those that are null are removed. Null: all are removed.
-    #[serde(deserialize_with = "present")]
-    pub labels: Option<Option<BTreeMap<String, Option<String>>>>,
-    /// The priority; null: 0.
-    #[serde(deserialize_with = "present")]
-    pub priority: Option<Option<i64>>,
-    /// The notes; null: none.
-    #[serde(deserialize_with = "present")]
-    pub notes: Option<Option<String>>,
-}
-
-/// For `deserialize_with`: tells null from absent.
-fn present<'de, D: Deserializer<'de>, T: Deserialize<'de>>(deserializer: D) -> Result<Option<Option<T>>, D::Error> {
-    Option::deserialize(deserializer).map(Some)
-}
-
-impl EditRequest {
-    /// Reads a document, as [`JobRequest::from_json`] does.
-    ///
-    /// # Errors
-    /// The first field that is unknown or of the wrong type.
-    pub fn from_json(document: Value) -> Result<Self, Invalid> {
-        from_json(document)
-    }
-
-    /// The edit of `job`.
-    ///
-    /// # Errors
-    /// The first field whose value is not accepted.
-    pub fn resolve(self, job: &Job) -> Result<JobEdit, Invalid> {
-        if let Some(Some(name)) = &self.name {
-            check_name("name", name)?;
-        }
-        let labels = self.labels.map(|changes| {
-            let Some(changes) = changes else { return BTreeMap::new() };
-            let mut labels = job.spec.labels.clone();
-            for (key, value) in changes {
-                match value {
-                    Some(value) => drop(labels.insert(key, value)),
-                    None => drop(labels.remove(&key)),
-                }
-            }
-            labels
-        });
-        if let Some(labels) = &labels {
-            check_labels(labels)?;
-        }
-        let priority = self.priority.map(Option::unwrap_or_default);
-        check_priority(priority.unwrap_or_default())?;
-        let notes = self.notes.map(Option::unwrap_or_default);
-        check_notes(notes.as_deref().unwrap_or_default())?;
-        Ok(JobEdit { name: self.name, labels, priority, notes })
-    }
-}
-
 /// Reads a document with whole numbers as integers.
 fn from_json<T: DeserializeOwned>(mut document: Value) -> Result<T, Invalid> {
     floats_to_integers(&mut document);
@@ -330,94 +276,6 @@ pub fn digest(request: &impl Serialize) -> [u8; 32] {
     floats_to_integers(&mut document);
     // Objects are ordered by key, so this is canonical.
     Sha256::digest(document.to_string()).into()
-}
-
-/// Least and most memory of a job that can be asked for, in bytes: 1 MiB and 1 PiB.
-const MIN_MEMORY: u64 = 1 << 20;
-const MAX_MEMORY: u64 = 1 << 50;
-/// Most jobs that a job comes after.
-const MAX_AFTER: usize = 100;
-/// Most seconds of a timeout or a back-off: a year.
-const MAX_SECONDS: u64 = 366 * 24 * 3600;
-
-fn resolve_limits(max_attempts: Option<u32>, timeout: Option<u64>, backoff: Option<u64>) -> Result<JobLimits, Invalid> {
-    let backoff = backoff.unwrap_or(0);
-    in_range("max_attempts", max_attempts.unwrap_or(1), 1..=1000)?;
-    in_range("timeout", timeout.unwrap_or(1), 1..=MAX_SECONDS)?;
-    in_range("backoff", backoff, 0..=MAX_SECONDS)?;
-    Ok(JobLimits { max_attempts, timeout, backoff, memory: None })
-}
-
-fn resolve_dependencies(ids: Vec<String>) -> Result<Vec<JobId>, Invalid> {
-    in_range("after", ids.len(), 0..=MAX_AFTER)?;
-    let mut jobs = Vec::new();
-    for (i, id) in ids.iter().enumerate() {
-        let job = JobId::parse(id).ok_or_else(|| Invalid::new(format!("after[{i}]"), format!("{id:?}"), "the id of a job"))?;
-        if jobs.contains(&job) {
-            return Err(Invalid::new(format!("after[{i}]"), id, "each job once"));
-        }
-        jobs.push(job);
-    }
-    Ok(jobs)
-}
-
-fn check_stop(stop: &EarlyStop) -> Result<(), Invalid> {
-    let EarlyStop { metric, at_most, at_least, patience } = stop;
-    if !is_metric_name(metric) {
-        return Err(Invalid::new("stop.metric", format!("{metric:?}"), "the name of a metric, such as eval/mean_aoi"));
-    }
-    for (field, limit) in [("stop.at_most", at_most), ("stop.at_least", at_least)] {
-        if let Some(limit) = limit.filter(|limit| !limit.is_finite()) {
-            return Err(Invalid::new(field, limit, "a finite number"));
-        }
-    }
-    in_range("stop.patience", patience.unwrap_or(1), 1..=1_000_000)?;
-    if at_most.is_none() && at_least.is_none() && patience.is_none() {
-        return Err(Invalid::missing("stop.at_most", "at_most, at_least or patience"));
-    }
-    Ok(())
-}
-
-fn check_priority(priority: i64) -> Result<(), Invalid> {
-    in_range("priority", priority, -100..=100)
-}
-
-/// Most characters of the notes of a job.
-pub const MAX_NOTES: usize = 4000;
-
-fn check_notes(notes: &str) -> Result<(), Invalid> {
-    let control = |c: char| c.is_control() && !matches!(c, '\n' | '\t' | '\r');
-    if notes.chars().count() > MAX_NOTES || notes.chars().any(control) {
-        let expected = format!("at most {MAX_NOTES} characters without control characters other than line breaks and tabs");
-        return Err(Invalid::new("notes", format!("{notes:?}"), expected));
-    }
-    Ok(())
-}
-
-/// Checks the name of a job or the key of a label.
-///
-/// # Errors
-/// [`Invalid`] with `field`.
-pub fn check_name(field: &str, name: &str) -> Result<(), Invalid> {
-    let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
-    if (1..=63).contains(&name.len()) && name.chars().all(allowed) && name.starts_with(|c: char| c.is_ascii_alphanumeric()) {
-        return Ok(());
-    }
-    Err(Invalid::new(field, format!("{name:?}"), "1 to 63 letters, digits, '-', '_' or '.', starting with a letter or digit"))
-}
-
-fn check_labels(labels: &BTreeMap<String, String>) -> Result<(), Invalid> {
-    if labels.len() > 32 {
-        return Err(Invalid::new("labels", format!("{} labels", labels.len()), "at most 32"));
-    }
-    for (key, value) in labels {
-        check_name("labels", key)?;
-        if value.chars().count() > 255 || value.chars().any(char::is_control) {
-            let expected = "at most 255 characters without control characters";
-            return Err(Invalid::new(format!("labels.{key}"), format!("{value:?}"), expected));
-        }
-    }
-    Ok(())
 }
 
 #[cfg(test)]
