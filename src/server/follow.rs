@@ -102,22 +102,25 @@ impl Follower {
     /// Follows until it is aborted.
     pub(super) async fn run(mut self, app: Arc<App>) {
         let [interval, longest] = INTERVAL;
-        let (mut delay, mut away) = (interval, false);
+        let mut delay = interval;
+        // Why the last question failed. The same reason is logged once.
+        let mut trouble = None;
         loop {
             match self.follow_once(&app).await {
                 Ok(()) => {
-                    if away {
+                    if trouble.take().is_some() {
                         tracing::info!(primary = self.url, "the primary answers again");
                     }
-                    (delay, away) = (interval, false);
+                    delay = interval;
                 }
                 Err(error) => {
                     metrics::counter!("qedgix_replica_failures_total").increment(1);
-                    if !away {
-                        let reason = error.to_string();
+                    let reason = error.to_string();
+                    if trouble.as_ref() != Some(&reason) {
                         tracing::warn!(primary = self.url, reason, "cannot follow the primary; keeping what is here, trying again");
                     }
-                    (delay, away) = ((delay * 2).min(longest), true);
+                    trouble = Some(reason);
+                    delay = (delay * 2).min(longest);
                 }
             }
             app.clock.sleep_until(app.clock.monotonic().saturating_add(delay)).await;
