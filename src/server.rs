@@ -28,8 +28,8 @@ use tower::ServiceExt;
 
 use self::background::Background;
 use self::connections::{Connections, Protocol};
-pub use self::http2::{CONNECTION_WINDOW, KEEPALIVE_INTERVAL, STREAM_WINDOW};
 use self::follow::Follower;
+pub use self::http2::{CONNECTION_WINDOW, KEEPALIVE_INTERVAL, STREAM_WINDOW};
 use self::lifetime::LifeLimits;
 use self::places::Places;
 pub use self::tls::Tls;

@@ -117,7 +117,11 @@ impl Follower {
                     metrics::counter!("qedgix_replica_failures_total").increment(1);
                     let reason = error.to_string();
                     if trouble.as_ref() != Some(&reason) {
-                        tracing::warn!(primary = self.url, reason, "cannot follow the primary; keeping what is here, trying again");
+                        tracing::warn!(
+                            primary = self.url,
+                            reason,
+                            "cannot follow the primary; keeping what is here, trying again"
+                        );
                     }
                     trouble = Some(reason);
                     delay = (delay * 2).min(longest);

@@ -230,7 +230,8 @@ async fn check(seed: u64, store: Store) -> usize {
             }
             let (before, used) = (state.clone(), state.used());
             let begun = bed.apply(event, jobs).await;
-            let place = |job: usize| before.queue.iter().position(|&other| other == job).expect("a job starts once, from the queue");
+            let place =
+                |job: usize| before.queue.iter().position(|&other| other == job).expect("a job starts once, from the queue");
             // A job that comes before the head, of a higher priority, may take its place.
             if promise.is_some_and(|(head, _)| begun.iter().any(|&(job, _)| place(job) < place(head))) {
                 promise = None;

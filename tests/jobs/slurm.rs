@@ -75,14 +75,19 @@ impl Bed {
         let [data, cluster] = ["data", "cluster"].map(|name| dir.path().join(name));
         fs::create_dir_all(cluster.join("jobs")).unwrap();
         for (name, script) in COMMANDS {
-            let first = format!("#!/bin/sh\ncd '{}'\necho >>called.{name}\n[ -e hang.{name} ] && exec sleep 3600\n", cluster.display());
+            let first =
+                format!("#!/bin/sh\ncd '{}'\necho >>called.{name}\n[ -e hang.{name} ] && exec sleep 3600\n", cluster.display());
             let path = cluster.join(name);
             fs::write(&path, first + script).unwrap();
             fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
         }
         let milliseconds = Duration::from_millis;
-        let times =
-            SlurmTimes { command: milliseconds(2000), list: milliseconds(20), list_after_error: milliseconds(20), sacct: milliseconds(20) };
+        let times = SlurmTimes {
+            command: milliseconds(2000),
+            list: milliseconds(20),
+            list_after_error: milliseconds(20),
+            sacct: milliseconds(20),
+        };
         let config = SlurmConfig { commands: Some(cluster.clone()), times, ..SlurmConfig::default() };
         let slurm = Slurm::new(config, env!("CARGO_BIN_EXE_qedgix").into(), dir.path().join("shared")).unwrap();
         let server = Server::start_on(&data, 1, |_| {}, Some(Arc::new(slurm))).await;

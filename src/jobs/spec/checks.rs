@@ -13,7 +13,11 @@ const MAX_AFTER: usize = 100;
 /// Most seconds of a timeout or a back-off: a year.
 const MAX_SECONDS: u64 = 366 * 24 * 3600;
 
-pub(super) fn resolve_limits(max_attempts: Option<u32>, timeout: Option<u64>, backoff: Option<u64>) -> Result<JobLimits, Invalid> {
+pub(super) fn resolve_limits(
+    max_attempts: Option<u32>,
+    timeout: Option<u64>,
+    backoff: Option<u64>,
+) -> Result<JobLimits, Invalid> {
     let backoff = backoff.unwrap_or(0);
     in_range("max_attempts", max_attempts.unwrap_or(1), 1..=1000)?;
     in_range("timeout", timeout.unwrap_or(1), 1..=MAX_SECONDS)?;

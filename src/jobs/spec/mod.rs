@@ -10,10 +10,10 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 
-pub use self::checks::{MAX_NOTES, check_name};
 use self::checks::{
     MAX_MEMORY, MIN_MEMORY, check_labels, check_notes, check_priority, check_stop, resolve_dependencies, resolve_limits,
 };
+pub use self::checks::{MAX_NOTES, check_name};
 pub use self::edit::EditRequest;
 use super::evaluation::EvaluationRequest;
 use super::memory;

@@ -174,13 +174,7 @@ pub async fn align(app: &App, manifest: &Manifest) -> Result<bool, Error> {
 }
 
 impl PolicyStores {
-    async fn align(
-        &self,
-        name: &str,
-        wanted: &ManifestPolicy,
-        followed: BTreeSet<u64>,
-        now: Timestamp,
-    ) -> Result<bool, Error> {
+    async fn align(&self, name: &str, wanted: &ManifestPolicy, followed: BTreeSet<u64>, now: Timestamp) -> Result<bool, Error> {
         let listed: HashMap<u64, &ManifestVersion> = wanted.versions.iter().map(|listed| (listed.version, listed)).collect();
         let (mut common, mut others) = (BTreeSet::new(), Vec::new());
         for VersionState { reference: PolicyRef { version, digest, .. }, loaded, .. } in self.registry.versions_of(name) {

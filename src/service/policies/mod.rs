@@ -22,7 +22,9 @@ pub use deletion::{Retention, delete, delete_excess_checkpoints, delete_excess_v
 pub use info::PolicyDetails;
 pub use loading::{IndexEntry, Loads, fill_registry, index, load_policy, unload_policy};
 pub(super) use loading::{pinned, resolve};
-pub use manifest::{Manifest, ManifestPolicy, ManifestVersion, MissingVersion, align, checkpoint_of, manifest, missing, take_over};
+pub use manifest::{
+    Manifest, ManifestPolicy, ManifestVersion, MissingVersion, align, checkpoint_of, manifest, missing, take_over,
+};
 pub(super) use promotion::{JobResult, Promotion};
 pub use publish::{CheckpointSource, PublishRequest, Publisher, check_owner, check_publishable, publish, publish_bytes};
 pub(super) use publish::{NewVersion, publish_and_end};
