@@ -51,7 +51,11 @@ impl Secured {
 
     fn connector(&self, http2: bool) -> HttpsConnector<HttpConnector> {
         let builder = HttpsConnectorBuilder::new().with_tls_config(self.caller.clone()).https_only();
-        if http2 { builder.enable_http2().build() } else { builder.enable_http1().build() }
+        let mut connector = HttpConnector::new();
+        connector.enforce_http(false);
+        // A body after its head would wait for an acknowledgement.
+        connector.set_nodelay(true);
+        if http2 { builder.enable_http2().wrap_connector(connector) } else { builder.enable_http1().wrap_connector(connector) }
     }
 
     /// A service that sends requests of REST or, with HTTP/2, of gRPC to the server.
