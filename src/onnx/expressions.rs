@@ -65,6 +65,46 @@ impl Graph {
         self.with("Add", &x, &y)
     }
 
+    /// The lengths of differences, rounded as `f64::hypot` does (Borges, An Improved Algorithm for hypot(a, b), 2019). UAVs may be almost equally
+    /// far from a goal, and rounding then decides which is nearer.
+    pub(super) fn length(&mut self, [dx, dy]: &[Tensor; 2]) -> Tensor {
+        let (dx, dy) = (self.map("Abs", dx), self.map("Abs", dy));
+        let (long, short) = (self.with("Max", &dx, &dy), self.with("Min", &dx, &dy));
+        let squares = self.squares(&[long.clone(), short.clone()]);
+        let h = self.map("Sqrt", &squares);
+        let twice_short = self.times(&short, 2.0);
+        // What h^2 is too large by, without cancellation: from h - short where the sides are alike, else from h - long.
+        let alike = {
+            let delta = self.with("Sub", &h, &short);
+            let a = self.times(&delta, 2.0);
+            let a = self.with("Sub", &a, &long);
+            let a = self.with("Mul", &long, &a);
+            let b = self.with("Sub", &long, &short);
+            let b = self.times(&b, 2.0);
+            let b = self.with("Sub", &delta, &b);
+            let b = self.with("Mul", &b, &delta);
+            self.with("Add", &a, &b)
+        };
+        let different = {
+            let delta = self.with("Sub", &h, &long);
+            let a = self.with("Sub", &long, &twice_short);
+            let b = self.times(&delta, 2.0);
+            let a = self.with("Mul", &b, &a);
+            let b = self.times(&delta, 4.0);
+            let b = self.with("Sub", &b, &short);
+            let b = self.with("Mul", &b, &short);
+            let c = self.square(&delta);
+            let b = self.with("Add", &b, &c);
+            self.with("Add", &a, &b)
+        };
+        let is_alike = self.with("LessOrEqual", &h, &twice_short);
+        let excess = self.choose(&is_alike, &alike, &different);
+        let twice = self.times(&h, 2.0);
+        let twice = self.at_least(&twice, f64::MIN_POSITIVE);
+        let correction = self.with("Div", &excess, &twice);
+        self.with("Sub", &h, &correction)
+    }
+
     /// Slots of flight over the differences `[dx, dy]` until the target is within `range`.
     pub(super) fn travel(&mut self, env: &EnvParams, [dx, dy]: &[Tensor; 2], range: f64) -> Tensor {
         let (dx, dy) = (self.map("Abs", dx), self.map("Abs", dy));

@@ -329,10 +329,7 @@ pub(super) fn headings_toward(g: &mut Graph, env: &EnvParams, positions: &Tensor
 pub(super) fn distances(g: &mut Graph, sight: &Sight, positions: &Tensor, targets: &Tensor) -> [Tensor; 2] {
     let mine = g.difference((targets, &[]), (positions, &[1]));
     let others = g.difference((&sight.uavs, &[2]), (targets, &[1]));
-    let [mine, others] = [mine, others].map(|offsets| {
-        let squares = g.squares(&offsets);
-        g.map("Sqrt", &squares)
-    });
+    let (mine, others) = (g.length(&mine), g.length(&others));
     let sees = g.unsqueeze(&sight.sees_uav, &[2]);
     let far = g.double(HUGE);
     let others = g.choose(&sees, &others, &far);

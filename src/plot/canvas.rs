@@ -79,9 +79,14 @@ fn dark_style() -> String {
     rules + "}"
 }
 
+/// A character that XML may contain and that has no effect on its surroundings: a space in place of others.
+fn printable(c: char) -> char {
+    if c.is_control() || matches!(c, '\u{fffe}' | '\u{ffff}') { ' ' } else { c }
+}
+
 /// Text for an element of XML.
 fn escaped(text: &str) -> String {
-    let clean: String = text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+    let clean: String = text.chars().map(printable).collect();
     clean.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
 }
 
@@ -302,7 +307,7 @@ pub(super) fn text_width(text: &str, size: i32) -> i32 {
 
 /// `text` shortened so that it fits into `width` pixels. The middle is left out, because file names differ at either end.
 pub(super) fn fitting(text: &str, width: i32, size: i32) -> String {
-    let all: Vec<char> = text.chars().take(1000).map(|c| if c.is_control() { ' ' } else { c }).collect();
+    let all: Vec<char> = text.chars().take(1000).map(printable).collect();
     let cut = |kept: usize| -> String {
         if kept >= all.len() {
             return all.iter().collect();

@@ -1,5 +1,5 @@
-//! Figures as PDF and PNG. Text has a font that is part of the program, so no font of the machine is needed, and the same figure gives
-//! the same bytes.
+//! Figures as PDF and PNG. Text has a font that is part of the program, so no font of the machine is needed. The same figure gives the same
+//! PNG; PDFs of it show the same, but number their objects in any order.
 
 use std::sync::{Arc, LazyLock};
 
@@ -54,7 +54,7 @@ pub fn pdf(svg: &str) -> Result<Vec<u8>, ConversionError> {
 pub fn png(svg: &str) -> Result<Vec<u8>, ConversionError> {
     let tree = tree(svg)?;
     let size = tree.size().to_int_size();
-    let pixmap = Pixmap::new(SCALE * size.width(), SCALE * size.height());
+    let pixmap = Pixmap::new(size.width().saturating_mul(SCALE), size.height().saturating_mul(SCALE));
     let mut pixmap = pixmap.ok_or_else(|| ConversionError::Png("it is too large".into()))?;
     resvg::render(&tree, Transform::from_scale(SCALE as f32, SCALE as f32), &mut pixmap.as_mut());
     pixmap.encode_png().map_err(|error| ConversionError::Png(error.to_string()))

@@ -94,13 +94,13 @@ def act(client, session, slot, uavs, users, aoi):
 
 
 def fly(client, model, policy, seed, size, slots=80):
-    """An episode, flown as Act decides. Returns the largest difference of a Q-value."""
+    """An episode, flown as Act decides. Returns the largest difference of a Q-value, and how many headings differ."""
     rng = np.random.default_rng(seed)
     uavs = rng.random((size[0], 2)) if seed % 2 else np.full((size[0], 2), 0.5)
     users, aoi = rng.random((size[1], 2)), np.zeros(size[1])
     model.begin(*size)
     session = client.post("/v1/sessions", json={"policy": policy, "seed": seed}).json()["session_id"]
-    worst = 0.0
+    worst, other = 0.0, 0
     for slot in range(slots):
         headings, values = act(client, session, slot, uavs, users, aoi)
         outputs = model.act(slot, uavs, users, aoi)
@@ -109,7 +109,8 @@ def fly(client, model, policy, seed, size, slots=80):
         # Of two headings of equal value, either may be chosen.
         chosen = np.take_along_axis(values, outputs["heading_index"][:, None], axis=1)
         assert (values.max(axis=1, keepdims=True) - chosen < 2e-5).all()
-        assert (outputs["heading_index"] == headings).all() or worst > 0
+        other += int((outputs["heading_index"] != headings).sum())
+        assert other == 0 or worst > 0
         model.heading = headings
         angle = np.deg2rad(45.0 * headings)[:, None]
         move = model.world["speed"] * np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
@@ -117,7 +118,7 @@ def fly(client, model, policy, seed, size, slots=80):
         visited = np.linalg.norm(uavs[:, None] - users, axis=-1).min(axis=0) <= model.world["transmission_range"]
         aoi = np.where(visited, 0, aoi + 1)
     client.delete(f"/v1/sessions/{session}")
-    return worst
+    return worst, other
 
 
 @pytest.fixture(scope="module")
@@ -129,8 +130,8 @@ def client():
 @pytest.mark.parametrize("policy", ["qedgix", "qedgix-onboard", "qedgix-paper", "qmix"])
 def test_the_model_decides_as_act_does(client, policy, tmp_path):
     model = exported(policy, tmp_path)
-    worst = [fly(client, model, policy, seed, SIZES[seed % len(SIZES)]) for seed in range(LAYOUTS)]
-    print(f"{policy}: {LAYOUTS} layouts, Q-values differ by at most {max(worst):.1e}")
+    worst, other = zip(*(fly(client, model, policy, seed, SIZES[seed % len(SIZES)]) for seed in range(LAYOUTS)))
+    print(f"{policy}: {LAYOUTS} layouts, Q-values differ by at most {max(worst):.1e}, {sum(other)} headings differ")
 
 
 @pytest.mark.parametrize("name", TRAINED)
