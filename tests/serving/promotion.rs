@@ -340,3 +340,17 @@ async fn of_all_who_expect_the_same_one_moves_it() {
     }
     assert_eq!(moves(&server.app, "mine").await.len(), 20);
 }
+
+#[tokio::test]
+async fn what_is_missing_is_looked_for_again_after_the_change_in_progress() {
+    let server = Server::start().await;
+    let spec = "qedgix@late".parse().unwrap();
+    // A change has reached the database and not yet the registry.
+    let change = server.app.registry.lock_changes().await;
+    let mut asked = std::pin::pin!(policies::get(&server.app, &spec));
+    assert!(futures::poll!(&mut asked).is_pending());
+    server.app.registry.set_alias("qedgix", "late", 1);
+    drop(change);
+    assert_eq!(with_timeout(asked).await.unwrap().info.reference.version, 1);
+    assert!(policies::get(&server.app, &"qedgix@later".parse().unwrap()).await.is_err());
+}

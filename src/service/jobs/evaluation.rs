@@ -8,7 +8,7 @@ use crate::invalid::Invalid;
 use crate::jobs::evaluation::EvaluationSpec;
 use crate::policy::baselines;
 use crate::service::keys::Caller;
-use crate::service::{App, Error};
+use crate::service::{App, Error, policies};
 use crate::serving::PolicySpec;
 use crate::store::JobKind;
 
@@ -16,7 +16,7 @@ use crate::store::JobKind;
 ///
 /// # Errors
 /// [`Error::Invalid`] with the policy that does not exist.
-pub(super) fn pin_versions(app: &App, evaluation: Value) -> Result<Value, Error> {
+pub(super) async fn pin_versions(app: &App, evaluation: Value) -> Result<Value, Error> {
     let mut evaluation: EvaluationSpec = serde_json::from_value(evaluation).map_err(Error::internal)?;
     for (i, name) in evaluation.policies.iter_mut().enumerate() {
         if baselines::LIST.iter().any(|baseline| baseline.name == name) {
@@ -24,7 +24,7 @@ pub(super) fn pin_versions(app: &App, evaluation: Value) -> Result<Value, Error>
         }
         let unknown = || Invalid::new(format!("evaluation.policies[{i}]"), format!("{name:?}"), "a policy of this server");
         let spec: PolicySpec = name.parse().map_err(|_| unknown())?;
-        let found = app.registry.describe(&spec).map_err(|_| unknown())?.state.reference;
+        let found = policies::found(app, |registry| registry.describe(&spec)).await.map_err(|_| unknown())?.state.reference;
         *name = format!("{}:{}", found.name, found.version);
     }
     let twice = evaluation.policies.iter().enumerate().find(|(i, name)| evaluation.policies[..*i].contains(name));

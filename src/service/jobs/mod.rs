@@ -66,7 +66,7 @@ async fn submit_job(
     let mut spec = request.resolve(app.scheduler.cpu_budget())?;
     app.webhooks.check(&spec.webhooks)?;
     if let Some(evaluation) = spec.evaluation.take() {
-        spec.evaluation = Some(evaluation::pin_versions(app, evaluation)?);
+        spec.evaluation = Some(evaluation::pin_versions(app, evaluation).await?);
     }
     let beginning = match init {
         Some(init) => Some(InitialWeights::find(app, caller, &init).await?.put_into(&mut spec)?),

@@ -122,7 +122,7 @@ async fn in_memory(app: &App, found: Resolved) -> Result<Arc<LoadedPolicy>, Erro
 /// [`Error::NotFound`], `policy_unloaded`; [`Error::Busy`] if sessions and requests use all memory of policies;
 /// [`Error::Internal`] if its checkpoint is damaged.
 pub(in crate::service) async fn resolve(app: &App, spec: &PolicySpec) -> Result<Arc<LoadedPolicy>, Error> {
-    in_memory(app, app.registry.resolve(spec)?).await
+    in_memory(app, super::found(app, |registry| registry.resolve(spec)).await?).await
 }
 
 /// The version with this digest that wrote a state of the caller, in memory: an episode stays on its version even if an alias has moved

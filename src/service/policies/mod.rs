@@ -61,7 +61,7 @@ pub async fn list(app: &App, page: &PageRequest) -> Result<Page<PolicyDetails>, 
 /// # Errors
 /// [`Error::NotFound`], [`Error::Internal`] when its checkpoint is damaged.
 pub async fn get(app: &App, spec: &PolicySpec) -> Result<PolicyDetails, Error> {
-    info::complete(app, app.registry.describe(spec)?).await
+    info::complete(app, found(app, |registry| registry.describe(spec)).await?).await
 }
 
 /// Whether the version that `spec` names is loaded.
@@ -101,7 +101,7 @@ pub fn versions(app: &App, name: &str, page: &PageRequest) -> Result<Page<Versio
 /// # Errors
 /// [`Error::NotFound`], or [`Error::Precondition`] for a baseline, which has no checkpoint.
 pub async fn export(app: &App, spec: &PolicySpec) -> Result<(PolicyRef, Vec<u8>), Error> {
-    let found = app.registry.describe(spec)?.state;
+    let found = found(app, |registry| registry.describe(spec)).await?.state;
     let PolicyRef { name, version, .. } = &found.reference;
     if found.kind == PolicyKind::Baseline {
         let message = format!("{name} is a baseline, which has no checkpoint to export");
@@ -114,6 +114,22 @@ pub async fn export(app: &App, spec: &PolicySpec) -> Result<(PolicyRef, Vec<u8>)
 struct PolicyStores {
     store: Store,
     registry: Arc<Registry>,
+}
+
+/// What `look` finds in the registry. If it finds nothing, it looks again after the change that is in progress: the end of a job is visible
+/// in the database a moment before the registry has the version that it names.
+pub(in crate::service) async fn found<T>(
+    app: &App,
+    look: impl Fn(&Registry) -> Result<T, crate::serving::Error>,
+) -> Result<T, crate::serving::Error> {
+    match look(&app.registry) {
+        Ok(found) => Ok(found),
+        // In a box, because it is rare and would make the futures of all requests larger.
+        Err(_) => {
+            drop(Box::pin(app.registry.lock_changes()).await);
+            look(&app.registry)
+        }
+    }
 }
 
 /// Runs `change` after all changes that were begun before. It completes even if the caller disconnects.
