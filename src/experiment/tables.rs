@@ -1,6 +1,7 @@
 //! The results of an experiment as a Markdown page.
 
 use std::fmt::Write;
+use std::path::Path;
 
 use super::{Experiment, ExperimentSummary};
 use crate::env::EpisodeMetrics;
@@ -8,7 +9,7 @@ use crate::learner::Interval;
 
 /// A figure in Markdown: the picture, or, as Markdown shows no PDF, a link to it.
 pub fn figure_link(caption: &str, file: &str) -> String {
-    let picture = if file.ends_with(".pdf") { "" } else { "!" };
+    let picture = if Path::new(file).extension().is_some_and(|extension| extension == "pdf") { "" } else { "!" };
     format!("{picture}[{caption}]({file})")
 }
 

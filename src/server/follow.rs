@@ -188,12 +188,11 @@ impl Follower {
             Some(known) => policies::checkpoint_of(app, known).await.ok(),
             None => None,
         };
-        let checkpoint = match here {
-            Some(checkpoint) => checkpoint,
-            None => {
-                let path = format!("{path}/export");
-                body(&path, self.get(&path, None).await?, MAX_CHECKPOINT).await?
-            }
+        let checkpoint = if let Some(checkpoint) = here {
+            checkpoint
+        } else {
+            let path = format!("{path}/export");
+            body(&path, self.get(&path, None).await?, MAX_CHECKPOINT).await?
         };
         Ok(policies::take_over(app, reference.clone(), checkpoint, created_at).await?)
     }

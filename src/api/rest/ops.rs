@@ -47,11 +47,11 @@ async fn live() -> &'static str {
 )]
 async fn ready(State(app): State<Arc<App>>) -> Result<String, Error> {
     app.ready().await?;
-    let mut text = "ok\n".to_owned();
-    if let Some((replica, age)) = app.replica.as_ref().and_then(|replica| Some((replica, replica.age(&app.clock)?))) {
-        text += &format!("replica of {}, whose policies it had {} s ago\n", replica.primary(), age.as_secs());
-    }
-    Ok(text)
+    let replica = app.replica.as_ref().and_then(|replica| Some((replica.primary(), replica.age(&app.clock)?.as_secs())));
+    Ok(match replica {
+        Some((primary, age)) => format!("ok\nreplica of {primary}, whose policies it had {age} s ago\n"),
+        None => "ok\n".to_owned(),
+    })
 }
 
 /// The CPU budget of training.

@@ -122,14 +122,12 @@ pub(in crate::service) async fn found<T>(
     app: &App,
     look: impl Fn(&Registry) -> Result<T, crate::serving::Error>,
 ) -> Result<T, crate::serving::Error> {
-    match look(&app.registry) {
-        Ok(found) => Ok(found),
-        // In a box, because it is rare and would make the futures of all requests larger.
-        Err(_) => {
-            drop(Box::pin(app.registry.lock_changes()).await);
-            look(&app.registry)
-        }
+    if let Ok(found) = look(&app.registry) {
+        return Ok(found);
     }
+    // In a box, because it is rare and would make the futures of all requests larger.
+    drop(Box::pin(app.registry.lock_changes()).await);
+    look(&app.registry)
 }
 
 /// Runs `change` after all changes that were begun before. It completes even if the caller disconnects.
