@@ -275,17 +275,21 @@ impl SoakCaller {
         let opened = self.client.open_session(request).await.map_err(unexpected("opening"))?.into_inner();
         let digest = opened.policy.unwrap_or_default().digest;
         let mut reference = Reference::new(&self.policies, &digest, size, seed);
-        let mut run = None;
+        // A request without a run id continues the run that is current when it arrives: a cancelled one could arrive in the next run. So
+        // callers that have several runs name all of them.
+        let mut run = self.chance(50).then(|| "run".to_owned());
+        let mut streams = true;
         loop {
             let slots = self.rng.random_range(1..40);
-            if self.chance(15) && run.is_none() {
-                self.stream(&id, size, slots, &mut reference).await?;
+            if self.chance(15) && streams {
+                self.stream(&id, size, slots, &mut reference, run.as_deref()).await?;
             } else {
                 self.slots(&id, size, slots, &mut reference, run.as_deref()).await?;
             }
-            if !self.chance(15) {
+            if run.is_none() || !self.chance(30) {
                 break;
             }
+            streams = false;
             // Like a simulator that restarts.
             self.counts.add("new runs");
             run = Some(format!("run-{}", self.rng.random::<u32>()));
@@ -376,12 +380,20 @@ impl SoakCaller {
     }
 
     /// Slots over a stream, which is sometimes dropped before all responses have arrived.
-    async fn stream(&mut self, id: &str, size: (usize, usize), slots: u64, reference: &mut Reference) -> CheckResult {
+    async fn stream(
+        &mut self,
+        id: &str,
+        size: (usize, usize),
+        slots: u64,
+        reference: &mut Reference,
+        run: Option<&str>,
+    ) -> CheckResult {
         let requests: Vec<(v1::ActRequest, _)> = (0..slots)
             .map(|step| {
                 let observation = self.observe(size);
                 let mut request = in_session(id, Some(step), v1::Scene::default());
                 (request.observation, request.return_q_values) = (Some(observation.clone()), true);
+                request.run_id = run.map(str::to_owned);
                 (request, reference.decide(&observation))
             })
             .collect();
