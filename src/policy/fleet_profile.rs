@@ -41,9 +41,36 @@ impl Place {
     /// Whether `p` is in the sector of this UAV: in its direction rather than in that of a neighbour. UAVs that start together search
     /// different sectors.
     pub fn owns(&self, p: Point) -> bool {
-        let off = ((p[1] - 0.5).atan2(p[0] - 0.5) - self.angle).rem_euclid(TAU);
+        self.owns_direction(direction(p))
+    }
+
+    /// As [`Place::owns`] for a point in this [`direction`].
+    pub(super) fn owns_direction(&self, direction: f64) -> bool {
+        let off = turn(direction - self.angle);
         off <= self.half_gaps[1] || TAU - off <= self.half_gaps[0]
     }
+}
+
+/// The direction of a point around the centre of the square, in radians from -pi to pi.
+pub(super) fn direction(p: Point) -> f64 {
+    (p[1] - 0.5).atan2(p[0] - 0.5)
+}
+
+/// `angle` as an angle of at least 0 and less than 2 pi. The same bits as `angle.rem_euclid(TAU)`, without a division for less than two
+/// turns.
+fn turn(angle: f64) -> f64 {
+    if angle.abs() >= 2.0 * TAU {
+        return angle.rem_euclid(TAU);
+    }
+    // Exact: the sum of numbers of different sign whose sizes differ at most by a factor of 2.
+    let rest = if angle >= TAU {
+        angle - TAU
+    } else if angle <= -TAU {
+        angle + TAU
+    } else {
+        angle
+    };
+    if rest < 0.0 { rest + TAU } else { rest }
 }
 
 /// How a fleet differs from one of equal UAVs that has not changed since slot 0 and whose users are all known.
@@ -115,6 +142,17 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn turns_are_euclidean_remainders_to_the_bit() {
+        for k in -4000..4000 {
+            for angle in [f64::from(k) * 0.0123, f64::from(k) * TAU / 8.0] {
+                // Zeros of both signs are equal.
+                assert_eq!(turn(angle), angle.rem_euclid(TAU), "{angle}");
+            }
+        }
+        assert!(turn(f64::NAN).is_nan());
     }
 
     #[test]

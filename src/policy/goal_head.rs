@@ -33,6 +33,7 @@ pub(super) struct GoalCache<T: Real> {
     features: Batch<T>,
     context: Batch<T>,
     hidden: Batch<T>,
+    lanes: Vec<[T; LANES]>,
     /// (rows, A) the best goal of each heading, or [`NONE`].
     best: Vec<u32>,
     /// Row, goal and value of each derivative that is not zero.
@@ -98,9 +99,14 @@ impl GoalHead {
                 let hidden = c.hidden.as_mut_slice().as_chunks_mut::<HIDDEN>().0;
                 let rows = q.as_mut_slice().chunks_exact_mut(actions).zip(c.best.chunks_exact_mut(actions));
                 for ((r, (q, best)), context) in rows.enumerate().zip(c.context.as_slice().as_chunks::<HIDDEN>().0) {
+                    let hidden = &mut hidden[goals.of_row(r)];
+                    c.lanes.resize(hidden.len(), [T::ZERO; LANES]);
+                    for (lanes, hidden) in c.lanes.iter_mut().zip(hidden) {
+                        *lanes = product(activate(hidden, context), value);
+                    }
                     let mut scores = [T::ZERO; 16];
-                    for g in goals.of_row(r) {
-                        let score = bias + score(&mut hidden[g], context, value);
+                    for (g, lanes) in goals.of_row(r).zip(&c.lanes) {
+                        let score = lanes.iter().fold(T::ZERO, |sum, &lane| sum + lane) + bias;
                         let h = usize::from(goals.headings()[g]);
                         if best[h] == NONE || score > scores[h] {
                             (best[h], scores[h]) = (g as u32, score);
@@ -166,19 +172,27 @@ impl GoalHead {
     }
 }
 
-/// Adds the context to a hidden row, applies ReLU, and returns the product with `value`.
+/// Lanes of a sum over hidden units, which have a fixed order for any vector unit.
+const LANES: usize = 16;
+
+/// Adds the context to a hidden row, and applies ReLU.
 #[inline(always)]
-fn score<T: Real>(hidden: &mut [T; HIDDEN], context: &[T; HIDDEN], value: &[T; HIDDEN]) -> T {
-    // Lanes have a fixed order of summation, for any vector unit.
-    let mut lanes = [T::ZERO; 16];
-    for k in 0..HIDDEN {
-        let x = hidden[k] + context[k];
-        hidden[k] = if x > T::ZERO { x } else { T::ZERO };
-        lanes[k % 16] += hidden[k] * value[k];
+fn activate<'a, T: Real>(hidden: &'a mut [T; HIDDEN], context: &[T; HIDDEN]) -> &'a [T; HIDDEN] {
+    for (hidden, &context) in hidden.iter_mut().zip(context) {
+        let x = *hidden + context;
+        *hidden = if x > T::ZERO { x } else { T::ZERO };
     }
-    let mut sum = T::ZERO;
-    for lane in lanes {
-        sum += lane;
+    hidden
+}
+
+/// The product of two rows, lane by lane. Its sum is left to another loop: a compiler that sees both computes the lanes one by one.
+#[inline(always)]
+fn product<T: Real>(hidden: &[T; HIDDEN], value: &[T; HIDDEN]) -> [T; LANES] {
+    let mut lanes = [T::ZERO; LANES];
+    for (hidden, value) in hidden.as_chunks::<LANES>().0.iter().zip(value.as_chunks::<LANES>().0) {
+        for l in 0..LANES {
+            lanes[l] += hidden[l] * value[l];
+        }
     }
-    sum
+    lanes
 }

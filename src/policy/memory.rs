@@ -43,6 +43,9 @@ pub struct UavMemory<'a> {
 }
 
 impl<'a> UavMemory<'a> {
+    /// The memory of a UAV that knows nothing.
+    pub const EMPTY: UavMemory<'static> = UavMemory { ground: &[0.0; GRID], users: &[] };
+
     /// The memory in `numbers`, of length [`uav_memory_len`].
     pub fn new(numbers: &'a [f32]) -> Self {
         let (ground, users) = numbers.split_at(GRID);

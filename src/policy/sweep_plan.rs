@@ -4,10 +4,14 @@
 //! searched and that may hold the users it does not know. Each UAV searches its own sector of the square first. The heading follows from
 //! the UAV's memory and what it detects in this slot; the rule has no state of its own.
 
-use super::flight::{distance, heading_toward, travel_slots};
+use std::sync::LazyLock;
+
+use super::fleet_profile::direction;
+use super::flight::{Headings, distance, travel_slots};
 use super::memory::{GRID, RememberedUser, UavMemory};
 use super::{EnvParams, FleetProfile, Place, Sight};
 use crate::env::Point;
+use crate::nn::simd;
 
 /// Blocks of cells along each side of the square.
 pub(crate) const BLOCKS: usize = 10;
@@ -44,7 +48,7 @@ pub(super) fn sweep_headings<'a>(
         let serving = uav.best_user(memory.users().flatten(), sight.detected_uavs(i).map(|(_, at)| at));
         let searching = uav.best_block(memory, memory.unknown_users(FleetProfile::is_open(profile)));
         let best = if serving.score >= searching.score { serving } else { searching };
-        advise(i, heading_toward(env, uav.at, best.position));
+        advise(i, Headings::new(env, uav.at).toward(best.position));
     }
 }
 
@@ -76,7 +80,7 @@ impl Uav<'_> {
             let slots = travel_slots(self.env, self.at, to, self.env.transmission_range);
             let age = self.now - f64::from(user.collected) + slots;
             let contested = uavs.clone().any(|r| distance(r, to) < distance(self.at, to));
-            let score = age / slots.powf(WEIGHTS.time_power) * if contested { WEIGHTS.contested } else { 1.0 };
+            let score = age / time_weight(slots) * if contested { WEIGHTS.contested } else { 1.0 };
             if score > best.score {
                 best = Candidate { score, position: to };
             }
@@ -86,74 +90,114 @@ impl Uav<'_> {
 
     /// The block with the best score among those that are not searched.
     fn best_block(&self, memory: UavMemory<'_>, unknown: usize) -> Candidate {
-        let ground = Ground::new(memory, |center| self.sector_weight(center));
+        let ground = Ground::new(memory, &self.place);
         let range = self.env.detection_range;
         let users_per_block = unknown as f64 / ground.unsearched.max(1.0);
         let mut best = NOTHING;
-        for &(to, _) in &ground.blocks[..ground.len()] {
-            let slots = travel_slots(self.env, self.at, to, range);
-            let weight = ground.weight_within(to, range);
-            let score = WEIGHTS.search * weight * users_per_block * (self.now + slots) / (slots + 1.0);
-            if score > best.score {
-                best = Candidate { score, position: to };
+        for (row, &unsearched) in ground.shares.iter().enumerate().filter(|(_, shares)| **shares != [0; _]) {
+            let y = CENTERS[row];
+            let scores = simd(
+                #[inline(always)]
+                || {
+                    let weights = ground.weights_within(row, range);
+                    let mut scores = [0.0; LANES];
+                    for ((score, weight), &x) in scores.iter_mut().zip(weights).zip(&CENTERS) {
+                        let slots = travel_slots(self.env, self.at, [x, y], range);
+                        *score = WEIGHTS.search * weight * users_per_block * (self.now + slots) / (slots + 1.0);
+                    }
+                    scores
+                },
+            );
+            for (column, (&score, unsearched)) in scores.iter().zip(unsearched).enumerate() {
+                if unsearched > 0 && score > best.score {
+                    best = Candidate { score, position: [CENTERS[column], y] };
+                }
             }
         }
         best
     }
-
-    /// Weight of a block at `p`: 1 in the UAV's own sector around the centre of the square.
-    fn sector_weight(&self, p: Point) -> f64 {
-        if self.place.owns(p) { 1.0 } else { WEIGHTS.foreign_sector }
-    }
 }
 
-/// The blocks with ground that was not searched, row by row.
+/// Blocks of a row, filled up to a whole number of vectors.
+const LANES: usize = 16;
+
+/// The coordinates of the centres of the blocks; far away beyond the last block.
+const CENTERS: [f64; LANES] = {
+    let mut centers = [1e9; LANES];
+    let mut k = 0;
+    while k < BLOCKS {
+        centers[k] = (k as f64 + 0.5) / BLOCKS as f64;
+        k += 1;
+    }
+    centers
+};
+
+/// Squares of the distances between the centres of blocks k and l.
+const SQUARES: [[f64; LANES]; BLOCKS] = {
+    let mut squares = [[f64::INFINITY; LANES]; BLOCKS];
+    let mut k = 0;
+    while k < BLOCKS * BLOCKS {
+        let difference = CENTERS[k / BLOCKS] - CENTERS[k % BLOCKS];
+        squares[k / BLOCKS][k % BLOCKS] = difference * difference;
+        k += 1;
+    }
+    squares
+};
+
+/// The [`direction`] of the centre of each block.
+static DIRECTIONS: LazyLock<[[f64; BLOCKS]; BLOCKS]> =
+    LazyLock::new(|| std::array::from_fn(|row| std::array::from_fn(|column| direction([CENTERS[column], CENTERS[row]]))));
+
+/// The flight time to the power of the rule. Most flights take few slots.
+fn time_weight(slots: f64) -> f64 {
+    static OF_INTEGERS: LazyLock<[f64; 64]> = LazyLock::new(|| std::array::from_fn(|k| (k as f64).powf(WEIGHTS.time_power)));
+    // Numbers of slots are whole, and at least 1.
+    OF_INTEGERS.get(slots as usize).copied().unwrap_or_else(|| slots.powf(WEIGHTS.time_power))
+}
+
+/// The blocks of ground, row by row.
 struct Ground {
-    /// Centre and weight of each block: the share of it that was not searched, times the weight of its sector.
-    blocks: [(Point, f64); BLOCKS * BLOCKS],
-    /// The blocks of row r are `rows[r]..rows[r + 1]`.
-    rows: [usize; BLOCKS + 1],
+    /// Cells of each block that were not searched.
+    shares: [[u8; BLOCKS]; BLOCKS],
+    /// The share of each block that was not searched, times the weight of its sector.
+    weights: [[f64; BLOCKS]; BLOCKS],
     /// The shares of all blocks together.
     unsearched: f64,
 }
 
 impl Ground {
-    fn new(memory: UavMemory<'_>, sector_weight: impl Fn(Point) -> f64) -> Self {
-        let mut ground = Self { blocks: [([0.0; 2], 0.0); _], rows: [0; _], unsearched: 0.0 };
-        let mut len = 0;
+    fn new(memory: UavMemory<'_>, place: &Place) -> Self {
+        let mut ground = Self { shares: [[0; _]; _], weights: [[0.0; _]; _], unsearched: 0.0 };
+        let directions = &*DIRECTIONS;
         for row in 0..BLOCKS {
             let cells: [u32; SIDE] = std::array::from_fn(|r| !memory.searched(SIDE * row + r));
             for column in 0..BLOCKS {
-                let left = cells.map(|cells| ((cells >> (SIDE * column)) & ((1 << SIDE) - 1)).count_ones());
-                let share = f64::from(left.iter().sum::<u32>()) / (SIDE * SIDE) as f64;
-                if share > 0.0 {
-                    let center = [column, row].map(|k| (k as f64 + 0.5) / BLOCKS as f64);
+                let left = cells.map(|cells| ((cells >> (SIDE * column)) & ((1 << SIDE) - 1)).count_ones() as u8);
+                let left = left.iter().sum::<u8>();
+                if left > 0 {
+                    let share = f64::from(left) / (SIDE * SIDE) as f64;
+                    let own = place.owns_direction(directions[row][column]);
+                    ground.shares[row][column] = left;
+                    ground.weights[row][column] = share * if own { 1.0 } else { WEIGHTS.foreign_sector };
                     ground.unsearched += share;
-                    ground.blocks[len] = (center, share * sector_weight(center));
-                    len += 1;
                 }
             }
-            ground.rows[row + 1] = len;
         }
         ground
     }
 
-    /// Number of blocks.
-    fn len(&self) -> usize {
-        self.rows[BLOCKS]
-    }
-
-    /// Sum of the weights of the blocks whose centre is within `range` of `to`.
-    fn weight_within(&self, to: Point, range: f64) -> f64 {
+    /// For each block of row `row`, the sum of the weights of the blocks whose centre is within `range` of its centre.
+    #[inline(always)]
+    fn weights_within(&self, row: usize, range: f64) -> [f64; LANES] {
         let square = range * range;
-        let mut sum = 0.0;
-        for row in self.rows.windows(2).map(|ends| &self.blocks[ends[0]..ends[1]]) {
-            // All blocks of a row have the same y.
-            let Some(dy) = row.first().map(|(p, _)| (p[1] - to[1]).powi(2)).filter(|dy| *dy <= square) else { continue };
-            for &(p, weight) in row {
-                sum += if (p[0] - to[0]).powi(2) + dy <= square { weight } else { 0.0 };
+        let mut sums = [0.0; LANES];
+        for (weights, &dy) in self.weights.iter().zip(&SQUARES[row]).filter(|(_, dy)| **dy <= square) {
+            for (&weight, squares) in weights.iter().zip(&SQUARES) {
+                for (sum, dx) in sums.iter_mut().zip(squares) {
+                    *sum += if dx + dy <= square { weight } else { 0.0 };
+                }
             }
         }
-        sum
+        sums
     }
 }

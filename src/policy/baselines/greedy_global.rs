@@ -1,7 +1,7 @@
 //! `greedy-global`: knows all positions and AoI, and pairs UAVs with users by AoI per slot of flight.
 
 use super::rule::{Rule, Slot, uav_positions, user_positions};
-use crate::policy::flight::{heading_toward, travel_slots};
+use crate::policy::flight::{Headings, travel_slots};
 use crate::policy::{FleetProfile, RequiredInput};
 
 /// Has no memory.
@@ -51,7 +51,7 @@ impl Rule for GreedyGlobal {
             target[i].get_or_insert(j);
         }
         for ((heading, &at), target) in headings.iter_mut().zip(uavs).zip(target) {
-            *heading = target.map_or(0, |j| heading_toward(env, at, users[j]));
+            *heading = target.map_or(0, |j| Headings::new(env, at).toward(users[j]));
         }
     }
 }

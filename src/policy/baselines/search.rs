@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::rule::{Rule, SEED_LEN, Slot, slot_rng, store_seed, uav_positions};
 use crate::env::{EnvConfig, Point};
-use crate::policy::flight::{heading_toward, next_position};
+use crate::policy::flight::{Headings, next_position};
 use crate::policy::{Carry, EnvParams, FleetGraph, FleetProfile, RequiredInput};
 
 /// A user that a UAV detects.
@@ -61,7 +61,7 @@ impl<T: TargetChoice> Rule for Search<T> {
             // Always called, so that the random numbers of other UAVs do not depend on what this UAV detects.
             *heading = cruise(env, &mut rng, at, course);
             if let Some(user) = T::choose(detected_users(graph, i, at)) {
-                *heading = heading_toward(env, at, user.position);
+                *heading = Headings::new(env, at).toward(user.position);
                 // The search continues in the direction of the last target.
                 *course = f32::from(*heading) + 1.0;
             }

@@ -2,13 +2,22 @@
 //! "Goals"). Each goal lies in the direction of one heading, and has features that do not depend on the size of the fleet, the ranges
 //! or the horizon, except through the quantities that matter: flight times, ages, and numbers of users.
 
+mod columns;
+mod ground;
+
+use std::sync::LazyLock;
+
+use columns::Columns;
+use ground::Ground;
+
 use super::env_params::EnvParams;
 use super::fleet_profile::{FleetProfile, Place};
-use super::flight::{distance, heading_toward, travel_slots};
+use super::flight::{Headings, travel_slots};
 use super::memory::{GRID, RememberedUser, UavMemory};
 use super::sight::Sight;
 use super::sweep_plan::sweep_headings;
 use crate::env::Point;
+use crate::nn::simd;
 
 /// Number of features of a goal.
 pub const FEATURES: usize = 16;
@@ -18,8 +27,6 @@ pub const MAX_USERS: usize = 64;
 const BLOCKS: usize = 5;
 /// Maximum number of goals in the ground.
 pub const MAX_BLOCKS: usize = BLOCKS * BLOCKS;
-/// Cells along each side of a block.
-const SIDE: usize = GRID / BLOCKS;
 
 /// The goals of a batch of UAVs, in the order of the rows of a [`super::Geometry`].
 #[derive(Clone, Debug, Default)]
@@ -34,6 +41,8 @@ pub struct Goals {
     /// The advised heading of each row; empty without advice.
     advice: Vec<u8>,
     users: Vec<RememberedUser>,
+    others: Vec<Point>,
+    columns: Columns,
 }
 
 impl Goals {
@@ -115,13 +124,16 @@ impl Goals {
             let place = FleetProfile::place(profile, i, sight.uavs());
             let open = FleetProfile::is_open(profile);
             let own = FleetProfile::env(profile, env, i);
-            let view = View { env: &own, place, open, uavs: sight.uavs(), at, slot: slot as f64, last };
-            self.push_row(&view, memory, sight.detected_uavs(i).map(|(_, at)| at));
+            let headings = Headings::new(&own, at);
+            let view = View { env: &own, place, open, uavs: sight.uavs(), at, headings, slot: slot as f64, last };
+            self.others.clear();
+            self.others.extend(sight.detected_uavs(i).map(|(_, at)| at));
+            self.push_row(&view, memory);
         }
     }
 
-    fn push_row(&mut self, view: &View<'_>, memory: UavMemory<'_>, others: impl Iterator<Item = Point> + Clone) {
-        let mut users = std::mem::take(&mut self.users);
+    fn push_row(&mut self, view: &View<'_>, memory: UavMemory<'_>) {
+        let Self { users, others, columns, .. } = self;
         users.clear();
         users.extend(memory.users().flatten());
         let unknown = memory.unknown_users(view.open);
@@ -134,46 +146,31 @@ impl Goals {
             ln1(users.len() as f64 / view.uavs as f64),
         ];
         self.load.push(users.len() as f32 / view.uavs as f32);
-        view.keep_best(&mut users);
-        for (j, user) in users.iter().enumerate() {
-            let goal = view.user(user, &users, j);
-            self.push(view, user.position, goal, common, others.clone());
-        }
-        for block in 0..BLOCKS * BLOCKS {
-            if ground.blocks[block] > 0 {
-                let to = ground.centers[block];
-                let goal = view.ground(to, &ground, unknown);
-                self.push(view, to, goal, common, others.clone());
-            }
-        }
-        self.users = users;
+        view.keep_best(users);
+        columns.begin(view, users, &ground);
+        simd(
+            #[inline(always)]
+            || columns.compute(view, (&ground, unknown), others),
+        );
+        self.headings.extend_from_slice(columns.headings());
+        self.features.reserve(FEATURES * columns.headings().len());
+        columns.features(view, common).for_each(|features| self.features.extend_from_slice(&features));
         self.offsets.push(self.headings.len() as u32);
-    }
-
-    /// Adds a goal at `to`.
-    fn push(&mut self, view: &View<'_>, to: Point, own: [f64; 7], common: [f64; 4], others: impl Iterator<Item = Point>) {
-        let heading = heading_toward(view.env, view.at, to);
-        let mine = distance(view.at, to);
-        let nearest = others.map(|other| distance(other, to)).fold(f64::INFINITY, f64::min);
-        // How much nearer this UAV is than the nearest other one that it detects, in units of d.
-        let lead = ((nearest - mine) / view.env.detection_range).clamp(-1.0, 1.0);
-        let contested = f64::from(u8::from(nearest < mine));
-        let onward = f64::from(u8::from(heading == view.last));
-        let shared = [lead, contested, onward, ((mine / view.env.detection_range) - 1.0).clamp(-1.0, 1.0), 1.0];
-        self.headings.push(heading);
-        self.features.extend(own.iter().chain(&common).chain(&shared).map(|&x| x as f32));
     }
 }
 
 /// Share of a cell of the ground.
 const CELL_SHARE: f64 = 1.0 / (GRID * GRID) as f64;
 
-/// A coordinate that is out of range of everything.
-const FAR: f64 = 1e9;
-
-/// ln(1 + x).
+/// ln(1 + x). Most arguments are small numbers of slots.
 fn ln1(x: f64) -> f64 {
-    x.max(0.0).ln_1p()
+    static OF_INTEGERS: LazyLock<[f64; 256]> = LazyLock::new(|| std::array::from_fn(|k| (k as f64).ln_1p()));
+    let x = x.max(0.0);
+    let integer = x as usize;
+    match OF_INTEGERS.get(integer) {
+        Some(&ln) if integer as f64 == x => ln,
+        _ => x.ln_1p(),
+    }
 }
 
 /// One UAV in one slot.
@@ -183,6 +180,7 @@ struct View<'a> {
     open: bool,
     uavs: usize,
     at: Point,
+    headings: Headings,
     slot: f64,
     last: u8,
 }
@@ -207,71 +205,6 @@ impl View<'_> {
     fn rate(&self, user: &RememberedUser) -> f64 {
         let slots = travel_slots(self.env, self.at, user.position, self.env.transmission_range);
         (self.slot - f64::from(user.collected) + slots) / slots
-    }
-
-    /// Features of user `j` of the remembered users.
-    fn user(&self, user: &RememberedUser, users: &[RememberedUser], j: usize) -> [f64; 7] {
-        let range = self.env.transmission_range;
-        let age_after = |user: &RememberedUser, slots: f64| self.slot - f64::from(user.collected) + slots;
-        let slots = travel_slots(self.env, self.at, user.position, range);
-        let age = age_after(user, slots);
-        // The best AoI per slot that the next flight, from there, promises.
-        let next = users.iter().enumerate().filter(|(k, _)| *k != j).fold(0.0, |best: f64, (_, next)| {
-            let onward = travel_slots(self.env, user.position, next.position, range);
-            best.max(age_after(next, slots + onward) / onward)
-        });
-        let rate = age / slots;
-        [1.0, ln1(slots), 1.0 / slots, ln1(age), ln1(rate), ln1(next), ln1(self.slot - f64::from(user.observed))]
-    }
-
-    /// Features of unsearched ground around `to`.
-    fn ground(&self, to: Point, ground: &Ground, unknown: usize) -> [f64; 7] {
-        let range = self.env.detection_range;
-        let slots = travel_slots(self.env, self.at, to, range);
-        let expected = unknown as f64 * ground.within(to, range) / f64::from(ground.unsearched.max(1));
-        let rate = expected * (self.slot + slots) / slots;
-        let own = f64::from(u8::from(self.place.owns(to)));
-        [0.0, ln1(slots), 1.0 / slots, ln1(self.slot + slots), ln1(rate), ln1(expected), own]
-    }
-}
-
-/// The ground that was not searched, by block.
-struct Ground {
-    /// Cells per block.
-    blocks: [u32; BLOCKS * BLOCKS],
-    /// Mean position of these cells; far away without any.
-    centers: [Point; BLOCKS * BLOCKS],
-    /// Cells of all blocks.
-    unsearched: u32,
-}
-
-impl Ground {
-    fn new(memory: UavMemory<'_>) -> Self {
-        let mut ground = Self { blocks: [0; _], centers: [[FAR; 2]; _], unsearched: 0 };
-        let mut sums = [[0; 2]; BLOCKS * BLOCKS];
-        for row in 0..GRID {
-            let mut cells = !memory.searched(row) & ((1 << GRID) - 1);
-            while cells != 0 {
-                let column = cells.trailing_zeros();
-                cells &= cells - 1;
-                let block = row / SIDE * BLOCKS + column as usize / SIDE;
-                ground.blocks[block] += 1;
-                sums[block][0] += column;
-                sums[block][1] += row as u32;
-                ground.unsearched += 1;
-            }
-        }
-        for ((center, sums), &cells) in ground.centers.iter_mut().zip(sums).zip(&ground.blocks).filter(|(_, cells)| **cells > 0) {
-            *center = sums.map(|sum: u32| (f64::from(sum) / f64::from(cells) + 0.5) / GRID as f64);
-        }
-        ground
-    }
-
-    /// Cells of the blocks whose centre is within `range` of `to`.
-    fn within(&self, to: Point, range: f64) -> f64 {
-        let near = |p: &Point| (p[0] - to[0]).powi(2) + (p[1] - to[1]).powi(2) <= range * range;
-        let cells: u32 = self.centers.iter().zip(&self.blocks).map(|(center, cells)| if near(center) { *cells } else { 0 }).sum();
-        f64::from(cells)
     }
 }
 
