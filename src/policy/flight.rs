@@ -78,7 +78,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn lengths_are_rounded_to_the_nearest_number_or_its_neighbour(x in -2.0..2.0_f64, y in -2.0..2.0_f64, small in 0..60) {
+        fn lengths_are_rounded_to_the_nearest_number_or_its_neighbour(x in -2.0..2.0_f64, y in -2.0..2.0_f64, small in 0..60_i32) {
             for (x, y) in [(x, y), (x, x), (x, x * 2.0_f64.powi(-small)), (x * 2.0_f64.powi(-small), y), (0.0, y), (0.0, 0.0)] {
                 let (ours, exact) = (length(x, y), x.hypot(y));
                 prop_assert!(ours.to_bits().abs_diff(exact.to_bits()) <= 1, "{x}, {y}: {ours}, {exact}");
