@@ -16,6 +16,7 @@ use rayon::prelude::*;
 
 use super::episodes::Episodes;
 use crate::nn::{Batch, ParameterLayout, Real, Weights, argmax, norm_squared};
+use crate::policy::memory::Exchange;
 use crate::policy::mixer::{Mixer, MixerCache, MixerKind};
 use crate::policy::{Agent, AgentCache, AgentConfig, Dims, Geometry, Goals, Inputs, NO_ACTION, TOKEN, flat_state};
 
@@ -91,7 +92,7 @@ struct Workspace<T: Real> {
     goals: Goals,
     /// What the UAVs of each episode remember.
     memory: Vec<f32>,
-    received: Vec<f32>,
+    exchange: Exchange,
     last: Vec<u8>,
     identity_token: Vec<f32>,
     position: Vec<f32>,
@@ -344,7 +345,7 @@ impl<T: Real> Workspace<T> {
                     let memory = &mut self.memory[(e - range.start) * memory_len..][..memory_len];
                     let sight = self.geometry.last_sight(aoi);
                     let last = &self.last[self.last.len() - m..];
-                    agent.remember((env, &sight, t as u64), (last, None), memory, &mut self.received, &mut self.goals);
+                    agent.remember((env, &sight, t as u64), (last, None), memory, &mut self.exchange, &mut self.goals);
                 }
                 self.identity_token.extend_from_slice(&ep.identity_token[e * m * TOKEN..][..m * TOKEN]);
                 self.position.extend_from_slice(uav_xy);

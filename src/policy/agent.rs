@@ -16,7 +16,7 @@ use super::geometry::{Geometry, GeometryConfig};
 use super::goal_head::{GoalCache, GoalHead};
 use super::goals::Goals;
 use super::hop_search::HopSearch;
-use super::memory::{memories, remember, uav_memory_len};
+use super::memory::{Exchange, memories, remember, uav_memory_len};
 use super::sight::Sight;
 use crate::invalid::Invalid;
 use crate::nn::matmul::InitialValue;
@@ -176,18 +176,18 @@ impl Agent {
     }
 
     /// Advances what the UAVs of a fleet remember to slot `slot`, and adds their goals, and the advice from it, to `goals`. Does nothing
-    /// without memory. `last` holds the last headings of the UAVs. `received` is a buffer.
+    /// without memory. `last` holds the last headings of the UAVs. `exchange` keeps buffers between calls.
     pub fn remember(
         &self,
         slot: (&EnvParams, &Sight<'_>, u64),
         (last, profile): (&[u8], Option<&FleetProfile>),
         memory: &mut [f32],
-        received: &mut Vec<f32>,
+        exchange: &mut Exchange,
         goals: &mut Goals,
     ) {
         let Some(sharing) = self.config.memory.sharing() else { return };
         let (env, sight, step) = slot;
-        remember(sight, env.detection_range, step, sharing, memory, received);
+        remember(sight, env.detection_range, step, sharing, memory, exchange);
         goals.push_fleet(slot, memories(memory, sight.users()), (last, profile));
         if self.advice.is_some() {
             goals.push_advice(slot, memories(memory, sight.users()), profile);

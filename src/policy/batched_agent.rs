@@ -5,6 +5,7 @@ use super::config::TOKEN;
 use super::features::{Inputs, NO_ACTION};
 use super::geometry::Geometry;
 use super::goals::Goals;
+use super::memory::Exchange;
 use crate::nn::{HIDDEN, Weights};
 
 /// The scenes of B fleets in one slot.
@@ -32,7 +33,7 @@ pub struct BatchedAgent {
     geometry: Geometry,
     /// What the UAVs remember, fleet after fleet.
     memory: Vec<f32>,
-    received: Vec<f32>,
+    exchange: Exchange,
     goals: Goals,
     slot: u64,
     cache: AgentCache<f32>,
@@ -52,7 +53,7 @@ impl BatchedAgent {
             identity_token: vec![0.0; rows * TOKEN],
             geometry: Geometry::default(),
             memory: vec![0.0; agent.memory_len(dims.uavs, dims.users) * fleets],
-            received: Vec::new(),
+            exchange: Exchange::default(),
             goals: Goals::default(),
             slot: 0,
             cache: AgentCache::default(),
@@ -92,7 +93,7 @@ impl BatchedAgent {
                 let len = agent.memory_len(m, n);
                 let (memory, last) = (&mut self.memory[f * len..][..len], &self.last[f * m..][..m]);
                 let sight = self.geometry.last_sight(aoi);
-                agent.remember((env, &sight, self.slot), (last, None), memory, &mut self.received, &mut self.goals);
+                agent.remember((env, &sight, self.slot), (last, None), memory, &mut self.exchange, &mut self.goals);
             }
         }
         self.geometry.finish(&config);

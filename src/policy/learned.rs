@@ -12,7 +12,7 @@ use super::config::{AgentConfig, Identity, TOKEN};
 use super::features::{Inputs, NO_ACTION};
 use super::geometry::Geometry;
 use super::goals::{self, Goals};
-use super::memory::{self, uav_memory_len};
+use super::memory::{self, Exchange, uav_memory_len};
 use super::{Carry, EnvParams, FleetStep, Policy, Reach, RequiredInput};
 use crate::invalid::{Invalid, in_range};
 use crate::nn::{HIDDEN, Weights, argmax};
@@ -39,7 +39,7 @@ pub struct LearnedPolicy {
 struct Buffers {
     geometry: Geometry,
     goals: Goals,
-    received: Vec<f32>,
+    exchange: Exchange,
     cache: AgentCache<f32>,
     last: Vec<u8>,
     identity_token: Vec<f32>,
@@ -225,7 +225,7 @@ impl LearnedPolicy {
                 memory::exclude_outside(&fleet.env, sight.users(), remembered);
                 let slot = (&fleet.env, &sight, fleet.step);
                 let last = &b.last[b.last.len() - sight.uavs()..];
-                self.agent.remember(slot, (last, fleet.profile), remembered, &mut b.received, &mut b.goals);
+                self.agent.remember(slot, (last, fleet.profile), remembered, &mut b.exchange, &mut b.goals);
             }
             if let Some(own) = fleet.graph.uav_positions() {
                 b.position.extend(own.iter().flatten().map(|&x| x as f32));

@@ -9,6 +9,7 @@
 
 use super::{Carry, EnvParams, Sight};
 use crate::env::Point;
+use crate::nn::simd;
 
 /// Cells along each side of the unit square. A row of cells is an integer below 2^GRID, which f32 holds exactly.
 pub const GRID: usize = 20;
@@ -131,20 +132,14 @@ pub fn exclude_outside(env: &EnvParams, users: usize, memories: &mut [f32]) {
     }
 }
 
-/// Advances the memories of a fleet, one after another in `memories`, to slot `slot`. `received` is a buffer.
-pub fn remember(sight: &Sight<'_>, range: f64, slot: u64, sharing: Sharing, memories: &mut [f32], received: &mut Vec<f32>) {
+/// Advances the memories of a fleet, one after another in `memories`, to slot `slot`.
+pub fn remember(sight: &Sight<'_>, range: f64, slot: u64, sharing: Sharing, memories: &mut [f32], exchange: &mut Exchange) {
     let len = uav_memory_len(sight.users());
     for (i, memory) in memories.chunks_exact_mut(len).enumerate() {
         observe(sight, i, range, slot as f32, memory);
     }
     if sharing == Sharing::Shared && sight.uavs() > 1 {
-        received.clear();
-        received.extend_from_slice(memories);
-        for (i, memory) in memories.chunks_exact_mut(len).enumerate() {
-            for (j, _) in sight.detected_uavs(i) {
-                merge(&received[j * len..][..len], memory);
-            }
-        }
+        exchange.run(sight, memories);
     }
 }
 
@@ -182,15 +177,95 @@ fn search(at: Point, range: f64, ground: &mut [f32]) {
     }
 }
 
-/// Adds what the memory `received` knows to `memory`.
-fn merge(received: &[f32], memory: &mut [f32]) {
-    let (ground, users) = memory.split_at_mut(GRID);
-    for (bits, &other) in ground.iter_mut().zip(received) {
-        *bits = ((*bits as u32 | other as u32) & ALL) as f32;
+/// The exchange of memories in one slot; kept between slots for its buffers.
+///
+/// Of two entries for a user, the newer one wins. Most entries that a UAV hears of are not newer than its own, so the times of all
+/// entries are compared first, in a matrix of their own.
+#[derive(Clone, Debug, Default)]
+pub struct Exchange {
+    /// (M, N, filled up to whole vectors) when each entry was observed, plus 1; 0 if nothing is known.
+    times: Vec<f32>,
+    /// (M, [`GRID`]) the ground that the UAVs knew before.
+    ground: Vec<f32>,
+    /// For each user, the newest time that one UAV hears of.
+    newest: Vec<f32>,
+    /// Whose entry that is, or [`OWN`].
+    source: Vec<u32>,
+    /// Where the entries that change are in the memories, and what they become.
+    received: Vec<(usize, [f32; USER])>,
+}
+
+/// Entries that are compared at once.
+const LANES: usize = 16;
+/// The source of an entry that does not change.
+const OWN: u32 = u32::MAX;
+
+impl Exchange {
+    /// Lets all UAVs of a fleet receive the memories of the UAVs that they detect.
+    fn run(&mut self, sight: &Sight<'_>, memories: &mut [f32]) {
+        let len = uav_memory_len(sight.users());
+        self.list_times(sight.users(), memories);
+        self.received.clear();
+        for i in 0..sight.uavs() {
+            let others = sight.detected_uavs(i).map(|(j, _)| j);
+            for j in others.clone() {
+                for (bits, &other) in memories[i * len..][..GRID].iter_mut().zip(&self.ground[j * GRID..]) {
+                    *bits = ((*bits as u32 | other as u32) & ALL) as f32;
+                }
+            }
+            self.choose_sources(i, sight.users(), others);
+            for (user, &j) in self.source.iter().enumerate().filter(|(_, j)| **j != OWN) {
+                let [from, to] = [j as usize, i].map(|uav| uav * len + GRID + user * USER);
+                let entry = std::array::from_fn(|k| memories[from + k]);
+                self.received.push((to, entry));
+            }
+        }
+        for (at, entry) in &self.received {
+            memories[*at..][..USER].copy_from_slice(entry);
+        }
     }
-    for (user, other) in users.chunks_exact_mut(USER).zip(received[GRID..].chunks_exact(USER)) {
-        if other[4] > user[4] || (user[0] == UNKNOWN && user[4] == 0.0) {
-            user.copy_from_slice(other);
+
+    /// Fills `times` and `ground`.
+    fn list_times(&mut self, users: usize, memories: &[f32]) {
+        self.times.clear();
+        self.ground.clear();
+        for memory in memories.chunks_exact(uav_memory_len(users)) {
+            let (ground, entries) = memory.split_at(GRID);
+            self.ground.extend_from_slice(ground);
+            let time = |user: &[f32]| if user[0] == KNOWN || user[4] > 0.0 { user[4] + 1.0 } else { 0.0 };
+            self.times.extend(entries.chunks_exact(USER).map(time));
+            self.times.resize(self.times.len().next_multiple_of(LANES), 0.0);
+        }
+    }
+
+    /// Fills `source` for UAV `i`.
+    fn choose_sources(&mut self, i: usize, users: usize, others: impl Iterator<Item = usize>) {
+        let width = users.next_multiple_of(LANES);
+        self.newest.clear();
+        self.newest.extend_from_slice(&self.times[i * width..][..width]);
+        self.source.clear();
+        self.source.resize(width, OWN);
+        let (newest, sources) = (self.newest.as_chunks_mut::<LANES>().0, self.source.as_chunks_mut::<LANES>().0);
+        for j in others {
+            let times = self.times[j * width..][..width].as_chunks::<LANES>().0;
+            simd(
+                #[inline(always)]
+                || {
+                    for ((newest, source), times) in newest.iter_mut().zip(&mut *sources).zip(times) {
+                        let mut newer = false;
+                        for l in 0..LANES {
+                            newer |= times[l] > newest[l];
+                        }
+                        if newer {
+                            for l in 0..LANES {
+                                let newer = times[l] > newest[l];
+                                newest[l] = if newer { times[l] } else { newest[l] };
+                                source[l] = if newer { j as u32 } else { source[l] };
+                            }
+                        }
+                    }
+                },
+            );
         }
     }
 }
@@ -205,18 +280,18 @@ mod tests {
 
     struct Fleet {
         memory: Vec<f32>,
-        buffer: Vec<f32>,
+        exchange: Exchange,
         users: usize,
     }
 
     impl Fleet {
         fn new(uavs: usize, users: usize) -> Self {
-            Self { memory: vec![0.0; uavs * uav_memory_len(users)], buffer: Vec::new(), users }
+            Self { memory: vec![0.0; uavs * uav_memory_len(users)], exchange: Exchange::default(), users }
         }
 
         fn see(&mut self, slot: u64, uavs: &[Point], users: &[Point], aoi: &[f32], sharing: Sharing, ranges: Ranges) {
             let graph = FleetGraph::from_scene(uavs, users, aoi, ranges);
-            remember(&graph.sight().unwrap(), ranges.detection, slot, sharing, &mut self.memory, &mut self.buffer);
+            remember(&graph.sight().unwrap(), ranges.detection, slot, sharing, &mut self.memory, &mut self.exchange);
         }
 
         fn of(&self, uav: usize) -> UavMemory<'_> {

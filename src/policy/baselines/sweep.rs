@@ -4,7 +4,7 @@
 //! A UAV knows the square, its place among the UAVs, and what it remembers (`policy::memory`). `policy::sweep_plan` is where it flies.
 
 use super::rule::{Rule, Slot};
-use crate::policy::memory::{self, Sharing, memories, remember, uav_memory_len};
+use crate::policy::memory::{self, Exchange, Sharing, memories, remember, uav_memory_len};
 use crate::policy::sweep_plan::sweep_headings;
 use crate::policy::{Carry, Reach, RequiredInput};
 
@@ -47,7 +47,7 @@ impl<const SHARED: bool> Rule for Sweep<SHARED> {
         let sight = graph.sight().expect("the caller provides what `needs` requires");
         let sharing = if SHARED { Sharing::Shared } else { Sharing::Own };
         memory::exclude_outside(env, sight.users(), memory);
-        remember(&sight, env.detection_range, step, sharing, memory, &mut Vec::new());
+        remember(&sight, env.detection_range, step, sharing, memory, &mut Exchange::default());
         sweep_headings((env, &sight, step), memories(memory, graph.users()), profile, |i, heading| headings[i] = heading);
     }
 }
