@@ -63,13 +63,17 @@ impl Replica {
     /// [`store::Error`] when the database fails. The copy is up to date all the same.
     pub async fn confirm(&self, missing: usize, store: &Store, clock: &Clock) -> Result<(), store::Error> {
         let at = clock.monotonic();
-        let lock = || self.copy.lock().unwrap_or_else(PoisonError::into_inner);
-        let recorded = (*lock()).and_then(|copy| copy.recorded);
         self.missing.store(missing, Ordering::Relaxed);
-        *lock() = Some(CopyAge { age: Duration::ZERO, at, recorded });
+        let update = |recorded: Option<Duration>| {
+            let mut copy = self.copy.lock().unwrap_or_else(PoisonError::into_inner);
+            let recorded = recorded.or_else(|| copy.and_then(|copy| copy.recorded));
+            *copy = Some(CopyAge { age: Duration::ZERO, at, recorded });
+            recorded
+        };
+        let recorded = update(None);
         if recorded.is_none_or(|recorded| at.saturating_sub(recorded) >= RECORD_INTERVAL) {
             store.set_followed_until(clock.now()).await?;
-            *lock() = Some(CopyAge { age: Duration::ZERO, at, recorded: Some(at) });
+            update(Some(at));
         }
         Ok(())
     }

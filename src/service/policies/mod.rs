@@ -122,8 +122,9 @@ pub(in crate::service) async fn found<T>(
     app: &App,
     look: impl Fn(&Registry) -> Result<T, crate::serving::Error>,
 ) -> Result<T, crate::serving::Error> {
-    if let Ok(found) = look(&app.registry) {
-        return Ok(found);
+    match look(&app.registry) {
+        Err(crate::serving::Error::NotFound { .. }) => {}
+        found => return found,
     }
     // In a box, because it is rare and would make the futures of all requests larger.
     drop(Box::pin(app.registry.lock_changes()).await);
