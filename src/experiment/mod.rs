@@ -18,5 +18,5 @@ pub use plan::{Experiment, ExperimentPoint, PlotKind, Run};
 pub use plots::plots;
 pub use run_result::{EvaluatedWeights, RunResult};
 pub use settings::Overrides;
-pub use summary::{BaselineSummary, ExperimentSummary, PairedDifference, SeriesSummary};
+pub use summary::{BaselineSummary, ExperimentSummary, PairedDifference, ParameterCounts, SeriesSummary};
 pub use tables::{difference_cells, figure_link, metric_cells, readme};

@@ -4,8 +4,11 @@ use serde::Serialize;
 
 use super::statistics::{interval, minus};
 use super::{EvaluatedWeights, Experiment, PlotKind, Run, RunResult};
+use crate::checkpoint::parameter_layout;
 use crate::env::EpisodeMetrics;
 use crate::learner::Interval;
+use crate::policy::Agent;
+use crate::train_config::TrainConfig;
 
 /// The summary of an experiment. AoI is in slots.
 #[derive(Clone, Debug, Serialize)]
@@ -47,6 +50,24 @@ pub struct SeriesSummary {
     pub mean: EpisodeMetrics,
     /// Mean AoI of each seed's best weights, in the order of the seeds.
     pub per_seed: Vec<f64>,
+    /// Numbers that training learns.
+    pub parameters: ParameterCounts,
+}
+
+/// Numbers of parameters. The agent flies; the mixer is used in training only.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct ParameterCounts {
+    /// Of the agent, which all UAVs share.
+    pub agent: usize,
+    /// Of the mixer.
+    pub mixer: usize,
+}
+
+impl ParameterCounts {
+    fn of(config: &TrainConfig) -> Self {
+        let agent = Agent::new(config.agent(), config.dims()).layout().len();
+        Self { agent, mixer: parameter_layout(config).len() - agent }
+    }
 }
 
 /// A baseline at a point.
@@ -120,8 +141,7 @@ impl ExperimentSummary {
             let mut values: Vec<(&str, Vec<Vec<f64>>)> = Vec::new();
             for (s, series) in experiment.series.iter().enumerate() {
                 let belongs = |(run, _): &(&Run, &RunResult)| run.series == s && run.point == p;
-                let all: Vec<&RunResult> =
-                    experiment.runs.iter().zip(results).filter(belongs).map(|(_, result)| result).collect();
+                let (runs, all): (Vec<&Run>, Vec<&RunResult>) = experiment.runs.iter().zip(results).filter(belongs).unzip();
                 let best: Vec<Vec<f64>> = all.iter().map(|result| aoi(&result.best.episodes)).collect();
                 let last: Option<Vec<Vec<f64>>> =
                     all.iter().map(|result| result.last.as_ref().map(|last| aoi(&last.episodes))).collect();
@@ -133,6 +153,7 @@ impl ExperimentSummary {
                     last_mean_aoi: last.map(|last| interval(&last)),
                     mean: EpisodeMetrics::mean(&episodes),
                     per_seed: all.iter().map(|result| mean(&result.best).mean_aoi).collect(),
+                    parameters: ParameterCounts::of(&runs[0].config),
                 });
                 values.push((series, best));
             }

@@ -3,7 +3,7 @@
 use std::fmt::Write;
 use std::path::Path;
 
-use super::{Experiment, ExperimentSummary};
+use super::{Experiment, ExperimentSummary, SeriesSummary};
 use crate::env::EpisodeMetrics;
 use crate::learner::Interval;
 
@@ -41,6 +41,12 @@ pub fn readme(experiment: &Experiment, summary: &ExperimentSummary, command: &st
         let [aoi, interval, others @ ..] = metric_cells(&row.mean_aoi, &row.mean);
         let cells = [row.point.clone(), row.series.clone(), aoi, interval, last];
         page.row(points, cells.into_iter().chain(others).chain(row.per_seed.iter().map(|aoi| format!("{aoi:.2}"))));
+    }
+    page.line("## Parameters");
+    page.line("UAVs share one agent. The mixer is used in training only. How long the runs trained is in `timing.json`.");
+    page.head(points, ["point", "series", "agent", "mixer"]);
+    for SeriesSummary { point, series, parameters, .. } in &summary.series_summaries {
+        page.row(points, [point.clone(), series.clone(), parameters.agent.to_string(), parameters.mixer.to_string()]);
     }
     if !summary.baselines.is_empty() {
         page.line("## Baselines on the same layouts");

@@ -3,15 +3,15 @@
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, VPos};
 
-use super::canvas::{self, Axes, BOTTOM, HEIGHT, INK, Key, Legend, TEXT, TOP, WIDTH, Words, fitting, text};
+use super::canvas::{self, Axes, BOTTOM, HEIGHT, INK, Key, Legend, TEXT, TOP, WIDTH, Words, fitting, text, text_width};
 use super::data::Bar;
 use super::palette::looks;
 use super::scale::{drawable, extent, value};
 
 /// Height of a bar in pixels.
 const ROW: u32 = 30;
-/// Width of the labels in pixels.
-const NAMES: u32 = 158;
+/// Least and greatest width of the labels in pixels.
+const NAMES: [i32; 2] = [158, 260];
 
 /// Bars as SVG. `value_label` labels the axis of the values, with the unit, and `note` says what the error bars are. The height depends on
 /// the number of bars.
@@ -25,6 +25,8 @@ pub fn bars(title: &str, value_label: &str, note: &str, bars: &[Bar]) -> String 
     let rows = bars.len().min(MAX_BARS);
     let legend = Legend::new(vec![(Key::Note, note.to_owned())]);
     let looks = looks(bars[..rows].iter().map(|bar| bar.name.as_str()));
+    let widest = bars[..rows].iter().map(|bar| text_width(&bar.name, TEXT)).max();
+    let names = (widest.unwrap_or_default() + 5).clamp(NAMES[0], NAMES[1]);
     let size = (WIDTH, TOP + BOTTOM + 6 + ROW * rows as u32 + legend.height());
     let means: Vec<String> = bars[..rows].iter().map(|bar| format!("{} {}", bar.name, value(bar.mean))).collect();
     let words = Words { title, description: format!("{value_label}: {}. {note}", means.join("; ")) };
@@ -32,13 +34,14 @@ pub fn bars(title: &str, value_label: &str, note: &str, bars: &[Bar]) -> String 
         canvas::heading(sheet, title)?;
         // Bar i is at y = -i, so that the first is on top.
         let ranges = [axis, 0.5 - rows as f64..0.5];
-        let axes = Axes { ranges, names: [value_label, ""], x_ticks: None, left: NAMES, right: 16, below: legend.height() };
+        let axes =
+            Axes { ranges, names: [value_label, ""], x_ticks: None, left: names as u32, right: 16, below: legend.height() };
         let mut plot = canvas::axes(sheet, axes)?;
-        let left = 10 + NAMES as i32;
+        let left = 10 + names;
         for (i, bar) in bars[..rows].iter().enumerate() {
             let at = -(i as f64);
             let row = plot.backend_coord(&(0.0, at)).1;
-            let name = fitting(&bar.name, NAMES as i32 - 4, TEXT);
+            let name = fitting(&bar.name, names - 4, TEXT);
             sheet.draw(&Text::new(name, (left - 8, row), text(TEXT, INK, HPos::Right, VPos::Center)))?;
             if !drawable(bar.mean) {
                 continue;
