@@ -376,4 +376,53 @@ mod tests {
         fleet.see(1, &uavs, &users, &[1.0], Sharing::Own, Ranges { communication: 2.0, ..RANGES });
         assert_eq!(fleet.user(1, 0), None);
     }
+
+    /// The exchange as docs/model.md defines it, entry by entry.
+    fn exchange_one_by_one(sight: &Sight<'_>, before: &[f32]) -> Vec<f32> {
+        let len = uav_memory_len(sight.users());
+        let mut after = before.to_vec();
+        for (i, memory) in after.chunks_exact_mut(len).enumerate() {
+            for (j, _) in sight.detected_uavs(i) {
+                let (ground, users) = memory.split_at_mut(GRID);
+                let (other_ground, others) = before[j * len..][..len].split_at(GRID);
+                ground.iter_mut().zip(other_ground).for_each(|(bits, &other)| *bits = (*bits as u32 | other as u32) as f32);
+                for (user, other) in users.chunks_exact_mut(USER).zip(others.chunks_exact(USER)) {
+                    let nothing = user[0] == UNKNOWN && user[4] == 0.0;
+                    if other[4] > user[4] || (nothing && other[0] == KNOWN) {
+                        user.copy_from_slice(other);
+                    }
+                }
+            }
+        }
+        after
+    }
+
+    #[test]
+    fn exchanges_of_many_users_are_those_of_single_entries() {
+        use rand::RngExt;
+        let mut rng = crate::rng::stream(7, "exchange", 0);
+        let mut exchange = Exchange::default();
+        for users in [1, 15, 16, 17, 40] {
+            let uavs: Vec<Point> = (0..6).map(|_| [rng.random(), rng.random()]).collect();
+            let graph = FleetGraph::from_scene(&uavs, &vec![[0.5, 0.5]; users], &vec![1.0; users], 0.5);
+            let sight = graph.sight().unwrap();
+            let mut memory = vec![0.0; uavs.len() * uav_memory_len(users)];
+            for uav in memory.chunks_exact_mut(uav_memory_len(users)) {
+                uav[..GRID].fill_with(|| rng.random_range(0..1 << GRID) as f32);
+                for user in uav[GRID..].chunks_exact_mut(USER) {
+                    if rng.random_bool(0.4) {
+                        continue;
+                    }
+                    let observed = rng.random_range(0..6) as f32;
+                    // Slot 0 leaves nothing but users that were seen in it.
+                    let state = if observed == 0.0 || rng.random_bool(0.8) { KNOWN } else { UNKNOWN };
+                    user.copy_from_slice(&[state, rng.random(), rng.random(), observed - 2.0, observed]);
+                }
+            }
+            let expected = exchange_one_by_one(&sight, &memory);
+            assert_ne!(expected, memory, "something is received");
+            exchange.run(&sight, &mut memory);
+            assert_eq!(memory, expected, "{users} users");
+        }
+    }
 }
