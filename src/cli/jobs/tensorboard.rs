@@ -67,7 +67,8 @@ pub fn write(dir: &Path, csv: impl BufRead, attempts: &[Attempt]) -> anyhow::Res
         let [name, step, value, at] = line.split(',').collect::<Vec<_>>()[..] else { bail!(malformed()) };
         let at: Timestamp = at.parse().with_context(malformed)?;
         let step: i64 = step.parse().with_context(malformed)?;
-        let value = if value.is_empty() { f32::NAN } else { value.parse().with_context(malformed)? };
+        // The number of REST, rounded: text that is read as f32 could be rounded to another neighbour.
+        let value = if value.is_empty() { f32::NAN } else { value.parse::<f64>().with_context(malformed)? as f32 };
         // Rows from before the first attempt do not exist, except if the clock of the server was moved.
         let index = attempts.partition_point(|attempt| attempt.1 <= at).saturating_sub(1);
         let Some((number, began)) = attempts.get(index) else { bail!("the job has metrics but no attempt") };
