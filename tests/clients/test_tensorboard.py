@@ -14,7 +14,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 JOB = {
     "algorithm": "vdn",
     "environment": {"slots": 10, "uavs": 2, "users": 2},
-    "training": {"steps": 60_000, "envs": 2, "batch": 2, "buffer": 20, "eval_every": 20_000, "eval_episodes": 2},
+    "training": {"steps": 20_000, "envs": 2, "batch": 2, "buffer": 20, "eval_every": 5000, "eval_episodes": 2},
 }
 
 
