@@ -11,7 +11,7 @@ use super::scale::{drawable, extent, value};
 /// Height of a bar in pixels.
 const ROW: u32 = 30;
 /// Least and greatest width of the labels in pixels.
-const NAMES: [i32; 2] = [158, 260];
+const NAMES: [i32; 2] = [158, 300];
 
 /// Bars as SVG. `value_label` labels the axis of the values, with the unit, and `note` says what the error bars are. The height depends on
 /// the number of bars.
