@@ -67,11 +67,11 @@ class Model:
         self.algorithm, self.x = algorithm, x
 
     def linear(self, p, name, v):
-        return v @ p[name + ".w"] + p[name + ".b"]
+        return self.x.linear(v, p[name + ".w"], p[name + ".b"])
 
     def norm_relu(self, p, name, v):
-        centred = v - v.mean(-1, keepdims=True)
-        rstd = 1 / self.x.sqrt((centred * centred).mean(-1, keepdims=True) + 1e-5)
+        centred = v - self.x.row_mean(v)
+        rstd = 1 / self.x.sqrt(self.x.row_mean(centred * centred) + 1e-5)
         return self.x.relu(centred * rstd * p[name + ".scale"] + p[name + ".shift"])
 
     def scene(self, b):

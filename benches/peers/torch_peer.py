@@ -15,6 +15,8 @@ class Ops:
     at_least_one = staticmethod(lambda v: v.clamp(min=1))
     one_hot = staticmethod(lambda v, n: F.one_hot(v, n).float())
     argmax = staticmethod(lambda v: v.argmax(-1))
+    linear = staticmethod(lambda v, w, b: F.linear(v, w.T, b))
+    row_mean = staticmethod(lambda v: v.mean(-1, keepdim=True))
 
     @staticmethod
     def edges(own, other, shares, scale, shift):
