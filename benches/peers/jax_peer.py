@@ -134,7 +134,7 @@ def loss_and_gradient(algorithm, p, target, b):
     return float(loss), grads
 
 
-# Episodes of a chunk.
+# Maximum number of episodes of a chunk.
 CHUNK = 8
 
 
@@ -142,7 +142,10 @@ def make(algorithm, batch):
     """A function that makes one update and waits for it."""
     net = model.Model(algorithm, Ops)
     devices = jax.device_count()
-    chunks = max(batch // devices // CHUNK, 1)
+    share, rest = divmod(batch, devices)
+    if rest:
+        raise SystemExit(f"--batch {batch}: expected a multiple of {devices}, the number of threads")
+    chunks = next(n for n in range(-(-share // CHUNK), share + 1) if share % n == 0)
 
     def gradient(p, target, b):
         def add(sums, chunk):

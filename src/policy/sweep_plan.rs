@@ -94,7 +94,7 @@ impl Uav<'_> {
         let range = self.env.detection_range;
         let users_per_block = unknown as f64 / ground.unsearched.max(1.0);
         let mut best = NOTHING;
-        for (row, &unsearched) in ground.shares.iter().enumerate().filter(|(_, shares)| **shares != [0; _]) {
+        for (row, &unsearched) in ground.cells.iter().enumerate().filter(|(_, cells)| **cells != [0; _]) {
             let y = CENTERS[row];
             let scores = simd(
                 #[inline(always)]
@@ -158,7 +158,7 @@ fn time_weight(slots: f64) -> f64 {
 /// The blocks of ground, row by row.
 struct Ground {
     /// Cells of each block that were not searched.
-    shares: [[u8; BLOCKS]; BLOCKS],
+    cells: [[u8; BLOCKS]; BLOCKS],
     /// The share of each block that was not searched, times the weight of its sector.
     weights: [[f64; BLOCKS]; BLOCKS],
     /// The shares of all blocks together.
@@ -167,7 +167,7 @@ struct Ground {
 
 impl Ground {
     fn new(memory: UavMemory<'_>, place: &Place) -> Self {
-        let mut ground = Self { shares: [[0; _]; _], weights: [[0.0; _]; _], unsearched: 0.0 };
+        let mut ground = Self { cells: [[0; _]; _], weights: [[0.0; _]; _], unsearched: 0.0 };
         let directions = &*DIRECTIONS;
         for row in 0..BLOCKS {
             let cells: [u32; SIDE] = std::array::from_fn(|r| !memory.searched(SIDE * row + r));
@@ -177,7 +177,7 @@ impl Ground {
                 if left > 0 {
                     let share = f64::from(left) / (SIDE * SIDE) as f64;
                     let own = place.owns_direction(directions[row][column]);
-                    ground.shares[row][column] = left;
+                    ground.cells[row][column] = left;
                     ground.weights[row][column] = share * if own { 1.0 } else { WEIGHTS.foreign_sector };
                     ground.unsearched += share;
                 }
