@@ -96,6 +96,8 @@ struct Workspace<T: Real> {
     last: Vec<u8>,
     identity_token: Vec<f32>,
     position: Vec<f32>,
+    /// The heading with the highest Q-value of the online network, per UAV row; [`NO_ACTION`] in slot 0.
+    greedy: Vec<u8>,
     states: Batch<T>,
     online: AgentCache<T>,
     target: AgentCache<T>,
@@ -238,16 +240,20 @@ impl<T: Real> Pass<'_, T> {
         let inputs = Inputs {
             geometry: &ws.geometry,
             goals: &ws.goals,
+            needed: None,
             last: &ws.last,
             identity_token: &ws.identity_token,
             position: &ws.position,
         };
-        for (weights, cache) in [(self.online, &mut ws.online), (self.target, &mut ws.target)] {
-            cache.begin(per_slot, slots).fill(T::ZERO);
-            self.agent.forward(weights, &inputs, slots, cache);
-        }
-
+        ws.online.begin(per_slot, slots).fill(T::ZERO);
+        self.agent.forward(self.online, &inputs, slots, &mut ws.online);
         // Double Q-learning: the online network chooses the action, the target network gives its value. Slot 0 is not needed.
+        ws.greedy.clear();
+        ws.greedy
+            .extend((0..slots * per_slot).map(|row| if row < per_slot { NO_ACTION } else { argmax(ws.online.q.row(row)) as u8 }));
+        ws.target.begin(per_slot, slots).fill(T::ZERO);
+        self.agent.forward(self.target, &Inputs { needed: Some(&ws.greedy), ..inputs }, slots, &mut ws.target);
+
         let actions = self.agent.dims().env.actions;
         // Row (slot, episode, UAV) of the batch, and the action in the order (episode, slot, UAV).
         let action = |row: usize| {
@@ -256,7 +262,7 @@ impl<T: Real> Pass<'_, T> {
         };
         ws.best.resize(m, k * b);
         for (best, row) in ws.best.as_mut_slice().iter_mut().zip(per_slot..) {
-            *best = ws.target.q.row(row)[argmax(ws.online.q.row(row))];
+            *best = ws.target.q.row(row)[usize::from(ws.greedy[row])];
         }
         ws.chosen.resize(m, k * b);
         for (chosen, row) in ws.chosen.as_mut_slice().iter_mut().zip(0..) {

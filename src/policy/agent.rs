@@ -296,7 +296,7 @@ impl Agent {
             Body::Plain { head } => {
                 head.forward(w, h, c.q.rows_mut());
                 if let Some(goals) = &self.goals {
-                    goals.forward(w, inputs.goals, &[h], &mut c.goals, &mut c.q);
+                    goals.forward(w, (inputs.goals, inputs.needed), &[h], &mut c.goals, &mut c.q);
                 }
             }
             Body::Graph { w1, w2, layers, head } => {
@@ -321,7 +321,7 @@ impl Agent {
                 let y = c.y[layers.len()].rows();
                 head.forward(w, (h, y, HIDDEN), &mut c.head, c.q.rows_mut());
                 if let Some(goals) = &self.goals {
-                    goals.forward(w, inputs.goals, &[h, y], &mut c.goals, &mut c.q);
+                    goals.forward(w, (inputs.goals, inputs.needed), &[h, y], &mut c.goals, &mut c.q);
                 }
             }
         }
@@ -354,7 +354,7 @@ impl Agent {
             Body::Plain { head } => {
                 head.backward(w.params, h, dq, grads, Some(s.dh.rows_mut()));
                 if let Some(goals) = &self.goals {
-                    goals.backward(w.params, &[h], dq, &mut c.goals, grads);
+                    goals.backward(w, (inputs.goals, &[h]), dq, &mut c.goals, grads);
                     goals.backward_context(w.params, 0, &c.goals, s.dh.rows_mut());
                 }
             }
@@ -366,7 +366,7 @@ impl Agent {
                 s.dy.resize(HIDDEN, uavs);
                 head.first.backward_input(w.params, (HIDDEN, HIDDEN), d, s.dy.rows_mut(), InitialValue::Zero);
                 if let Some(goals) = &self.goals {
-                    goals.backward(w.params, &[h, c.y[layers.len()].rows()], dq, &mut c.goals, grads);
+                    goals.backward(w, (inputs.goals, &[h, c.y[layers.len()].rows()]), dq, &mut c.goals, grads);
                     goals.backward_context(w.params, 0, &c.goals, s.dh.rows_mut());
                     goals.backward_context(w.params, 1, &c.goals, s.dy.rows_mut());
                 }

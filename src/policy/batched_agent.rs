@@ -104,6 +104,7 @@ impl BatchedAgent {
         let inputs = Inputs {
             geometry: &self.geometry,
             goals: &self.goals,
+            needed: None,
             last: &self.last,
             identity_token: &self.identity_token,
             position: input.uav_xy,

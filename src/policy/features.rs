@@ -16,6 +16,9 @@ pub struct Inputs<'a> {
     pub geometry: &'a Geometry,
     /// Goals and advice per UAV row; empty without a memory.
     pub goals: &'a Goals,
+    /// The only heading of each UAV row whose Q-value is needed; absent if all are. Q-values of other headings are then those without
+    /// goals.
+    pub needed: Option<&'a [u8]>,
     /// Last action per UAV row, [`NO_ACTION`] in slot 0.
     pub last: &'a [u8],
     /// Identity token per UAV row; used with identity `token`.

@@ -8,6 +8,8 @@
 //! A heading without a goal gets a learned constant instead. The context is the UAV's hidden state, in a graph network also the output of
 //! its last layer.
 
+use std::ops::Range;
+
 use super::goals::{FEATURES, Goals};
 use crate::nn::matmul::InitialValue;
 use crate::nn::{Batch, HIDDEN, Init, Linear, ParameterLayout, Real, Rows, RowsMut, Weights, simd};
@@ -27,21 +29,27 @@ pub(super) struct GoalHead {
     none: usize,
 }
 
-/// Activations of a forward pass, and buffers of its backward pass.
+/// What a forward pass leaves to its backward pass, and buffers. The hidden units of goals are not kept: the backward pass computes those
+/// of the few goals that were chosen again.
 #[derive(Debug, Default)]
 pub(super) struct GoalCache<T: Real> {
-    features: Batch<T>,
     context: Batch<T>,
-    hidden: Batch<T>,
-    lanes: Vec<[T; LANES]>,
     /// (rows, A) the best goal of each heading, or [`NONE`].
     best: Vec<u32>,
+    /// The goals of a tile, and for each of its rows the end of its goals among them.
+    tile: Vec<u32>,
+    ends: Vec<usize>,
+    features: Batch<T>,
+    hidden: Batch<T>,
+    lanes: Vec<[T; LANES]>,
     /// Row, goal and value of each derivative that is not zero.
     chosen: Vec<(u32, u32, T)>,
     d_hidden: Batch<T>,
     d_context: Batch<T>,
-    chosen_features: Batch<T>,
 }
+
+/// Goals that are scored at a time: few enough for the CPU's cache. One UAV may have more.
+const TILE: usize = 192;
 
 impl GoalHead {
     /// `context` is the width of the context; `advice`: whether UAVs get advice.
@@ -60,58 +68,77 @@ impl GoalHead {
         self.value.prepare(params, prepared);
     }
 
-    /// Adds the best score per heading to the Q-values `q`. `context` are the parts of the context, each [`HIDDEN`] wide.
+    /// Adds the best score per heading to the Q-values `q`. `needed`: see [`super::Inputs::needed`]. `context` are the parts of the context,
+    /// each [`HIDDEN`] wide.
     pub(super) fn forward<T: Real>(
         &self,
         w: Weights<'_, T>,
-        goals: &Goals,
+        (goals, needed): (&Goals, Option<&[u8]>),
         context: &[Rows<'_, T>],
         c: &mut GoalCache<T>,
         q: &mut Batch<T>,
     ) {
-        c.features.resize(self.features, goals.len());
-        for (row, features) in
-            c.features.as_mut_slice().chunks_exact_mut(self.features).zip(goals.features().chunks_exact(FEATURES))
-        {
-            row.iter_mut().zip(features).for_each(|(x, &f)| *x = T::from_f64(f.into()));
-        }
-        for (r, &heading) in goals.advice().iter().enumerate() {
-            for g in goals.of_row(r) {
-                c.features.row_mut(g)[FEATURES] = if goals.headings()[g] == heading { T::ONE } else { T::ZERO };
-            }
-        }
-        c.hidden.resize(HIDDEN, goals.len());
-        let first = &self.first;
-        first.forward_part(w, (0, self.features), c.features.rows(), c.hidden.rows_mut(), InitialValue::Bias(first.bias(w)));
         c.context.resize(HIDDEN, goals.rows());
         for (part, &rows) in context.iter().enumerate() {
             let initial = if part == 0 { InitialValue::Zero } else { InitialValue::Previous };
-            first.forward_part(w, (self.features + part * HIDDEN, HIDDEN), rows, c.context.rows_mut(), initial);
+            self.first.forward_part(w, (self.features + part * HIDDEN, HIDDEN), rows, c.context.rows_mut(), initial);
         }
-        let (actions, none) = (q.width(), w.params[self.none]);
-        let (value, bias) = (self.value.weight(w.params), self.value.bias(w)[0]);
-        let value: &[T; HIDDEN] = value.try_into().expect("one value per hidden unit");
         c.best.clear();
-        c.best.resize(goals.rows() * actions, NONE);
+        c.best.resize(goals.rows() * q.width(), NONE);
+        let mut row = 0;
+        while row < goals.rows() {
+            let first = row;
+            c.tile.clear();
+            c.ends.clear();
+            while row < goals.rows() && (row == first || c.tile.len() + goals.of_row(row).len() <= TILE) {
+                let needed = needed.map(|needed| needed[row]);
+                let is_needed = |&g: &usize| needed.is_none_or(|heading| goals.headings()[g] == heading);
+                c.tile.extend(goals.of_row(row).filter(is_needed).map(|g| g as u32));
+                c.ends.push(c.tile.len());
+                row += 1;
+            }
+            self.score(w, (goals, first..row), c, q);
+        }
+    }
+
+    /// Adds the best score per heading of the goals in the tile to the Q-values of its rows.
+    fn score<T: Real>(&self, w: Weights<'_, T>, (goals, rows): (&Goals, Range<usize>), c: &mut GoalCache<T>, q: &mut Batch<T>) {
+        c.features.resize(self.features, c.tile.len());
+        let mut begin = 0;
+        for (r, &end) in rows.clone().zip(&c.ends) {
+            for i in begin..end {
+                self.write_features(goals, (r, c.tile[i] as usize), c.features.row_mut(i));
+            }
+            begin = end;
+        }
+        c.hidden.resize(HIDDEN, c.tile.len());
+        self.hidden_of_features(w, c.features.rows(), c.hidden.rows_mut());
+        let (actions, none) = (q.width(), w.params[self.none]);
+        let (value, bias) = (self.value(w.params), self.value.bias(w)[0]);
         simd(
             #[inline(always)]
             || {
                 let hidden = c.hidden.as_mut_slice().as_chunks_mut::<HIDDEN>().0;
-                let rows = q.as_mut_slice().chunks_exact_mut(actions).zip(c.best.chunks_exact_mut(actions));
-                for ((r, (q, best)), context) in rows.enumerate().zip(c.context.as_slice().as_chunks::<HIDDEN>().0) {
-                    let hidden = &mut hidden[goals.of_row(r)];
+                let contexts = c.context.as_slice().as_chunks::<HIDDEN>().0;
+                let rows_of = |all: Range<usize>| all.start * actions..all.end * actions;
+                let best = c.best[rows_of(rows.clone())].chunks_exact_mut(actions);
+                let q = q.as_mut_slice()[rows_of(rows.clone())].chunks_exact_mut(actions);
+                let mut begin = 0;
+                for (((r, &end), q), best) in rows.clone().zip(&c.ends).zip(q).zip(best) {
+                    let hidden = &mut hidden[begin..end];
                     c.lanes.resize(hidden.len(), [T::ZERO; LANES]);
                     for (lanes, hidden) in c.lanes.iter_mut().zip(hidden) {
-                        *lanes = product(activate(hidden, context), value);
+                        *lanes = product(activate(hidden, &contexts[r]), value);
                     }
                     let mut scores = [T::ZERO; 16];
-                    for (g, lanes) in goals.of_row(r).zip(&c.lanes) {
+                    for (&g, lanes) in c.tile[begin..end].iter().zip(&c.lanes) {
                         let score = lanes.iter().fold(T::ZERO, |sum, &lane| sum + lane) + bias;
-                        let h = usize::from(goals.headings()[g]);
+                        let h = usize::from(goals.headings()[g as usize]);
                         if best[h] == NONE || score > scores[h] {
-                            (best[h], scores[h]) = (g as u32, score);
+                            (best[h], scores[h]) = (g, score);
                         }
                     }
+                    begin = end;
                     for (h, q) in q.iter_mut().enumerate() {
                         *q += if best[h] == NONE { none } else { scores[h] };
                     }
@@ -120,17 +147,37 @@ impl GoalHead {
         );
     }
 
+    /// Writes the inputs of the first layer, without the context, for goal `g` of row `r`.
+    fn write_features<T: Real>(&self, goals: &Goals, (r, g): (usize, usize), out: &mut [T]) {
+        let (own, advised) = out.split_at_mut(FEATURES);
+        let features = goals.features().as_chunks::<FEATURES>().0[g];
+        own.copy_from_slice(&features.map(|f| T::from_f64(f.into())));
+        if let ([advised], Some(heading)) = (advised, goals.advice().get(r)) {
+            *advised = if goals.headings()[g] == *heading { T::ONE } else { T::ZERO };
+        }
+    }
+
+    /// What the features contribute to the first layer.
+    fn hidden_of_features<T: Real>(&self, w: Weights<'_, T>, features: Rows<'_, T>, hidden: RowsMut<'_, T>) {
+        self.first.forward_part(w, (0, self.features), features, hidden, InitialValue::Bias(self.first.bias(w)));
+    }
+
+    /// v.
+    fn value<'a, T: Real>(&self, params: &'a [T]) -> &'a [T; HIDDEN] {
+        self.value.weight(params).try_into().expect("one value per hidden unit")
+    }
+
     /// Adds the gradients of the parameters, given those of the Q-values. [`GoalHead::backward_context`] then gives those of the context.
     pub(super) fn backward<T: Real>(
         &self,
-        params: &[T],
-        context: &[Rows<'_, T>],
+        w: Weights<'_, T>,
+        (goals, context): (&Goals, &[Rows<'_, T>]),
         dq: Rows<'_, T>,
         c: &mut GoalCache<T>,
         grads: &mut [T],
     ) {
         let actions = c.best.len() / dq.len.max(1);
-        let value: &[T; HIDDEN] = self.value.weight(params).try_into().expect("one value per hidden unit");
+        let value = self.value(w.params);
         c.d_context.resize_zero(HIDDEN, dq.len);
         c.chosen.clear();
         for (r, dq) in dq.data.chunks(dq.stride).take(dq.len).enumerate() {
@@ -141,25 +188,37 @@ impl GoalHead {
                 }
             }
         }
+        c.features.resize(self.features, c.chosen.len());
+        for (i, &(r, g, _)) in c.chosen.iter().enumerate() {
+            self.write_features(goals, (r as usize, g as usize), c.features.row_mut(i));
+        }
+        c.hidden.resize(HIDDEN, c.chosen.len());
+        self.hidden_of_features(w, c.features.rows(), c.hidden.rows_mut());
         c.d_hidden.resize(HIDDEN, c.chosen.len());
-        c.chosen_features.resize(self.features, c.chosen.len());
         let mut d_value = [T::ZERO; HIDDEN];
         let mut d_bias = T::ZERO;
-        for (i, &(r, g, d)) in c.chosen.iter().enumerate() {
-            let hidden = c.hidden.row(g as usize);
-            let (out, d_context) = (c.d_hidden.row_mut(i), c.d_context.row_mut(r as usize));
-            for k in 0..HIDDEN {
-                d_value[k] += d * hidden[k];
-                out[k] = if hidden[k] > T::ZERO { d * value[k] } else { T::ZERO };
-                d_context[k] += out[k];
-            }
-            d_bias += d;
-            c.chosen_features.row_mut(i).copy_from_slice(c.features.row(g as usize));
-        }
+        let (hidden, contexts) = (c.hidden.as_slice().as_chunks::<HIDDEN>().0, c.context.as_slice().as_chunks::<HIDDEN>().0);
+        let d_hidden = c.d_hidden.as_mut_slice().as_chunks_mut::<HIDDEN>().0;
+        let d_contexts = c.d_context.as_mut_slice().as_chunks_mut::<HIDDEN>().0;
+        simd(
+            #[inline(always)]
+            || {
+                for ((&(r, _, d), hidden), out) in c.chosen.iter().zip(hidden).zip(d_hidden) {
+                    let (context, d_context) = (&contexts[r as usize], &mut d_contexts[r as usize]);
+                    for k in 0..HIDDEN {
+                        let hidden = relu_of_sum(hidden[k], context[k]);
+                        d_value[k] += d * hidden;
+                        out[k] = if hidden > T::ZERO { d * value[k] } else { T::ZERO };
+                        d_context[k] += out[k];
+                    }
+                    d_bias += d;
+                }
+            },
+        );
         self.value.weight_mut(grads).iter_mut().zip(d_value).for_each(|(g, d)| *g += d);
         self.value.bias_mut(grads)[0] += d_bias;
         self.first.backward_bias(c.d_hidden.rows(), grads);
-        self.first.backward_part((0, self.features), c.chosen_features.rows(), c.d_hidden.rows(), grads);
+        self.first.backward_part((0, self.features), c.features.rows(), c.d_hidden.rows(), grads);
         for (part, &rows) in context.iter().enumerate() {
             self.first.backward_part((self.features + part * HIDDEN, HIDDEN), rows, c.d_context.rows(), grads);
         }
@@ -178,11 +237,14 @@ const LANES: usize = 16;
 /// Adds the context to a hidden row, and applies ReLU.
 #[inline(always)]
 fn activate<'a, T: Real>(hidden: &'a mut [T; HIDDEN], context: &[T; HIDDEN]) -> &'a [T; HIDDEN] {
-    for (hidden, &context) in hidden.iter_mut().zip(context) {
-        let x = *hidden + context;
-        *hidden = if x > T::ZERO { x } else { T::ZERO };
-    }
+    hidden.iter_mut().zip(context).for_each(|(hidden, &context)| *hidden = relu_of_sum(*hidden, context));
     hidden
+}
+
+#[inline(always)]
+fn relu_of_sum<T: Real>(a: T, b: T) -> T {
+    let sum = a + b;
+    if sum > T::ZERO { sum } else { T::ZERO }
 }
 
 /// The product of two rows, lane by lane. Its sum is left to another loop: a compiler that sees both computes the lanes one by one.

@@ -240,6 +240,7 @@ impl LearnedPolicy {
         let inputs = Inputs {
             geometry: &b.geometry,
             goals: &b.goals,
+            needed: None,
             last: &b.last,
             identity_token: &b.identity_token,
             position: &b.position,

@@ -1,11 +1,8 @@
 //! The ground that a UAV has not searched, in blocks.
 
-use std::sync::LazyLock;
-
 use super::super::fleet_profile::{Place, direction};
 use super::super::memory::{GRID, UavMemory};
 use super::{BLOCKS, MAX_BLOCKS};
-use crate::env::Point;
 
 /// Cells along each side of a block.
 const SIDE: usize = GRID / BLOCKS;
@@ -13,24 +10,28 @@ const SIDE: usize = GRID / BLOCKS;
 const FAR: f64 = 1e9;
 
 /// The ground that was not searched, by block.
+#[derive(Clone, Debug)]
 pub(super) struct Ground {
+    /// The searched cells of each row of cells.
+    searched: [u32; GRID],
     /// Unsearched cells per block.
     pub(super) cells: [u32; MAX_BLOCKS],
     /// Mean x and mean y of these cells; far away without any.
     pub(super) centers: [[f64; MAX_BLOCKS]; 2],
+    /// Direction of that place.
+    directions: [f64; MAX_BLOCKS],
     /// Unsearched cells of all blocks.
     pub(super) unsearched: u32,
 }
 
 impl Ground {
-    pub(super) fn new(memory: UavMemory<'_>) -> Self {
-        let mut ground = Self { cells: [0; _], centers: [[FAR; _]; _], unsearched: 0 };
+    fn new(searched: [u32; GRID]) -> Self {
+        let mut ground = Self { searched, cells: [0; _], centers: [[FAR; _]; _], directions: [0.0; _], unsearched: 0 };
         for row in 0..BLOCKS {
-            let cells: [u32; SIDE] = std::array::from_fn(|r| !memory.searched(SIDE * row + r));
             for column in 0..BLOCKS {
                 let (mut count, mut columns, mut rows) = (0, 0, 0);
-                for (r, cells) in cells.iter().enumerate() {
-                    let side = (cells >> (SIDE * column)) as usize % (1 << SIDE);
+                for (r, searched) in searched[SIDE * row..][..SIDE].iter().enumerate() {
+                    let side = (!searched >> (SIDE * column)) as usize % (1 << SIDE);
                     count += BITS[side][0];
                     columns += BITS[side][1];
                     rows += r as u32 * BITS[side][0];
@@ -39,8 +40,12 @@ impl Ground {
                     let block = row * BLOCKS + column;
                     ground.cells[block] = count;
                     ground.unsearched += count;
-                    ground.centers[0][block] = center(columns + (SIDE * column) as u32 * count, count);
-                    ground.centers[1][block] = center(rows + (SIDE * row) as u32 * count, count);
+                    let at = [
+                        center(columns + (SIDE * column) as u32 * count, count),
+                        center(rows + (SIDE * row) as u32 * count, count),
+                    ];
+                    [ground.centers[0][block], ground.centers[1][block]] = at;
+                    ground.directions[block] = direction(at);
                 }
             }
         }
@@ -54,17 +59,33 @@ impl Ground {
 
     /// Whether the centre of a block is in the sector of this UAV.
     pub(super) fn is_owned(&self, block: usize, place: &Place) -> bool {
-        /// Directions of the centres of blocks without a searched cell.
-        static WHOLE: LazyLock<[f64; MAX_BLOCKS]> = LazyLock::new(|| {
-            let whole = Ground::new(UavMemory::EMPTY);
-            std::array::from_fn(|block| direction(whole.center(block)))
-        });
-        let whole = self.cells[block] == (SIDE * SIDE) as u32;
-        place.owns_direction(if whole { WHOLE[block] } else { direction(self.center(block)) })
+        place.owns_direction(self.directions[block])
     }
+}
 
-    fn center(&self, block: usize) -> Point {
-        self.centers.map(|centers| centers[block])
+/// Places in [`RecentGround`].
+const RECENT: usize = 64;
+
+/// The ground of recent rows. What a UAV has searched changes in few slots.
+#[derive(Clone, Debug)]
+pub(super) struct RecentGround(Vec<Ground>);
+
+impl Default for RecentGround {
+    fn default() -> Self {
+        Self(vec![Ground::new([0; _]); RECENT])
+    }
+}
+
+impl RecentGround {
+    /// The ground of a UAV.
+    pub(super) fn of(&mut self, memory: UavMemory<'_>) -> &Ground {
+        let searched: [u32; GRID] = std::array::from_fn(|row| memory.searched(row));
+        let mix = |hash: u64, &row: &u32| (hash ^ u64::from(row)).wrapping_mul(0x9E37_79B9_7F4A_7C15).rotate_left(29);
+        let ground = &mut self.0[searched.iter().fold(0, mix) as usize % RECENT];
+        if ground.searched != searched {
+            *ground = Ground::new(searched);
+        }
+        ground
     }
 }
 

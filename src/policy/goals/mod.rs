@@ -8,7 +8,7 @@ mod ground;
 use std::sync::LazyLock;
 
 use columns::Columns;
-use ground::Ground;
+use ground::RecentGround;
 
 use super::env_params::EnvParams;
 use super::fleet_profile::{FleetProfile, Place};
@@ -43,6 +43,7 @@ pub struct Goals {
     users: Vec<RememberedUser>,
     others: Vec<Point>,
     columns: Columns,
+    recent: RecentGround,
 }
 
 impl Goals {
@@ -133,12 +134,12 @@ impl Goals {
     }
 
     fn push_row(&mut self, view: &View<'_>, memory: UavMemory<'_>) {
-        let Self { users, others, columns, .. } = self;
+        let Self { users, others, columns, recent, .. } = self;
         users.clear();
         users.extend(memory.users().flatten());
         let unknown = memory.unknown_users(view.open);
         let all = users.len() + unknown;
-        let ground = Ground::new(memory);
+        let ground = recent.of(memory);
         let common = [
             ln1(ground.unsearched as f64 * CELL_SHARE * unknown as f64),
             unknown as f64 / all.max(1) as f64,
@@ -147,10 +148,10 @@ impl Goals {
         ];
         self.load.push(users.len() as f32 / view.uavs as f32);
         view.keep_best(users);
-        columns.begin(view, users, &ground);
+        columns.begin(view, users, ground);
         simd(
             #[inline(always)]
-            || columns.compute(view, (&ground, unknown), others),
+            || columns.compute(view, (ground, unknown), others),
         );
         self.headings.extend_from_slice(columns.headings());
         self.features.reserve(FEATURES * columns.headings().len());
