@@ -107,6 +107,11 @@ impl<R: Rule> Policy for Baseline<R> {
         self.rule.work(uavs, users, detections)
     }
 
+    fn is_cheap(&self) -> bool {
+        // With the full scene, a rule plans whole flights.
+        R::NEEDS != RequiredInput::FullScene
+    }
+
     fn memory_len(&self, uavs: usize, users: usize) -> usize {
         self.rule.memory_len(uavs, users)
     }

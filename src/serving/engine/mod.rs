@@ -183,15 +183,14 @@ impl EngineState {
         output
     }
 
-    /// Computes a batch on this thread, if the next light task is small and fewer than `threads` light computations run. Returns
-    /// whether it did.
-    fn run_batch_inline(&self) -> bool {
+    /// Computes a batch on this thread, if the next light task is small and fewer than `threads` light computations run.
+    fn run_batch_inline(&self) -> InlineBatch {
         let mut batch = {
             let mut state = self.lock();
-            let next = state.queue.lane(Lane::Light).front();
-            let small = next.is_some_and(|next| matches!(&next.job, Job::Fleet { task, .. } if is_small(task)));
+            let Some(next) = state.queue.lane(Lane::Light).front() else { return InlineBatch::NothingWaits };
+            let small = matches!(&next.job, Job::Fleet { task, .. } if is_small(task));
             if !small || !state.may_run_inline(self.config.threads) {
-                return false;
+                return InlineBatch::NeedsThread;
             }
             let mut batch = state.spare_batches.pop().unwrap_or_default();
             state.queue.take(Lane::Light, self.config.max_batch, MAX_INLINE_WORK, &mut batch.queued);
@@ -207,7 +206,7 @@ impl EngineState {
         let mut state = self.lock();
         state.inline_running -= 1;
         state.spare_batches.push(batch);
-        true
+        InlineBatch::Computed
     }
 
     /// Whether a small task should yield so that others can join its batch: after a recent batch of several tasks, and at regular
@@ -226,6 +225,15 @@ impl EngineState {
         }
         Ok(())
     }
+}
+
+/// What [`EngineState::run_batch_inline`] did.
+enum InlineBatch {
+    Computed,
+    /// The caller's task, too, has been taken by another thread.
+    NothingWaits,
+    /// A thread of the engine has to compute what waits.
+    NeedsThread,
 }
 
 /// Whether a task may be computed inline.
@@ -325,6 +333,7 @@ impl Engine {
         shared.enqueue(Queued::new(Job::Fleet { task, reply }, work, owner, deadline)).inspect_err(|_| {
             shared.metrics.record_failure(&policy, Duration::ZERO);
         })?;
+        let mut needs_thread = true;
         if small {
             if expects_batch {
                 // Lets other callers that are ready enqueue their tasks before the first of them computes all.
@@ -337,13 +346,20 @@ impl Engine {
                         return result;
                     }
                     Err(TryRecvError::Closed) => return Err(lost_request()),
-                    Err(TryRecvError::Empty) if shared.run_batch_inline() => {}
-                    Err(TryRecvError::Empty) => break,
+                    Err(TryRecvError::Empty) => match shared.run_batch_inline() {
+                        InlineBatch::Computed => {}
+                        InlineBatch::NothingWaits => {
+                            needs_thread = false;
+                            break;
+                        }
+                        InlineBatch::NeedsThread => break,
+                    },
                 }
             }
         }
-        // Only now is a thread needed.
-        shared.queued(lane).notify_one();
+        if needs_thread {
+            shared.queued(lane).notify_one();
+        }
         let result = reply_of(receiver, deadline).await;
         guard.replied = !matches!(result, Err(Error::Deadline(_)));
         result
