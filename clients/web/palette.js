@@ -6,8 +6,8 @@ const DARK = ['#4aa8e8', '#f0803c', '#2cc49a', '#f0b840', '#dd94bd', '#8fd0f5', 
 
 /** The place of an algorithm or baseline in the palette. */
 const PLACES = {
-  qedgix: 0, qmix: 1, vdn: 2, iql: 3, agggnn: 4, rgcn: 5,
-  'greedy-global': 6, tour: 7, sweep: 2, 'sweep-shared': 3, nearest: 4, 'max-aoi': 5, random: 7, persistent: 6,
+  qedgix: 0, qmix: 1, vdn: 2, iql: 3, agggnn: 4, rgcn: 6,
+  'greedy-global': 5, tour: 7, sweep: 2, 'sweep-shared': 3, nearest: 4, 'max-aoi': 5, random: 7, persistent: 6,
 };
 
 const DASHES = [[], [7, 4], [2, 3], [10, 3, 2, 3]];

@@ -31,8 +31,8 @@ pub(super) const PLACES: [(&str, usize); 14] = [
     ("vdn", 2),
     ("iql", 3),
     ("agggnn", 4),
-    ("rgcn", 5),
-    ("greedy-global", 6),
+    ("rgcn", 6),
+    ("greedy-global", 5),
     ("tour", 7),
     ("sweep-shared", 3),
     ("sweep", 2),
@@ -122,7 +122,7 @@ mod tests {
     #[test]
     fn an_algorithm_has_its_colour_in_every_plot() {
         let place = |names: &[&str]| looks(names.iter().copied()).iter().map(|look| look.place).collect::<Vec<_>>();
-        assert_eq!(place(&["sweep", "Qedgix", "Algorithm 4 (RGCN)"]), [2, 0, 5]);
+        assert_eq!(place(&["sweep", "Qedgix", "Algorithm 4 (RGCN)"]), [2, 0, 6]);
         assert_eq!(place(&["QMIX", "runs/qedgix.safetensors", "sweep-shared"]), [1, 0, 3]);
         let twice = looks(["QMIX", "QMIX, 3 hops", "Qedgix"]);
         assert_eq!(twice[0].place, twice[1].place);

@@ -205,6 +205,13 @@ struct SoakCaller {
     sessions: u64,
 }
 
+/// The request for slot `step` of session `id`.
+fn slot(id: &str, run: Option<&str>, step: u64, observation: &WireObservation) -> v1::ActRequest {
+    let request = in_session(id, Some(step), v1::Scene::default());
+    let (observation, run_id) = (Some(observation.clone()), run.map(str::to_owned));
+    v1::ActRequest { observation, run_id, return_q_values: true, ..request }
+}
+
 fn code(status: &Status) -> &str {
     status.metadata().get("qedgix-code").and_then(|code| code.to_str().ok()).unwrap_or("")
 }
@@ -321,12 +328,9 @@ impl SoakCaller {
         reference: &mut Reference,
         run: Option<&str>,
     ) -> CheckResult {
-        let mut last = None;
         for step in 0..slots {
             let observation = self.observe(size);
-            let mut request = in_session(id, Some(step), v1::Scene::default());
-            (request.observation, request.return_q_values) = (Some(observation.clone()), true);
-            request.run_id = run.map(str::to_owned);
+            let request = slot(id, run, step, &observation);
             if self.chance(3) {
                 let wrong = v1::ActRequest { step: Some(step + 7), ..request.clone() };
                 match self.client.act(wrong).await {
@@ -368,14 +372,12 @@ impl SoakCaller {
                 Err(status) => return Err(unexpected("a slot")(status)),
             }
             self.counts.add("responses in sessions");
-            last = Some((request, expected));
-            if let Some((request, expected)) = last.clone().filter(|_| self.chance(5)) {
+            if self.chance(5) {
                 let again = self.client.act(request).await.map_err(unexpected("a repeated step"))?;
                 check(again.get_ref(), &expected, &reference.digest, step)?;
                 self.counts.add("repeated steps");
             }
         }
-        drop(last);
         Ok(())
     }
 
@@ -391,10 +393,7 @@ impl SoakCaller {
         let requests: Vec<(v1::ActRequest, _)> = (0..slots)
             .map(|step| {
                 let observation = self.observe(size);
-                let mut request = in_session(id, Some(step), v1::Scene::default());
-                (request.observation, request.return_q_values) = (Some(observation.clone()), true);
-                request.run_id = run.map(str::to_owned);
-                (request, reference.decide(&observation))
+                (slot(id, run, step, &observation), reference.decide(&observation))
             })
             .collect();
         let received = if self.chance(30) { self.rng.random_range(0..slots) } else { slots };
