@@ -91,9 +91,11 @@ impl GoalHead {
             c.tile.clear();
             c.ends.clear();
             while row < goals.rows() && (row == first || c.tile.len() + goals.of_row(row).len() <= TILE) {
-                let needed = needed.map(|needed| needed[row]);
-                let is_needed = |&g: &usize| needed.is_none_or(|heading| goals.headings()[g] == heading);
-                c.tile.extend(goals.of_row(row).filter(is_needed).map(|g| g as u32));
+                let of_row = goals.of_row(row);
+                match needed.map(|needed| needed[row]) {
+                    None => c.tile.extend(of_row.map(|g| g as u32)),
+                    Some(heading) => c.tile.extend(of_row.filter(|&g| goals.headings()[g] == heading).map(|g| g as u32)),
+                }
                 c.ends.push(c.tile.len());
                 row += 1;
             }
@@ -104,10 +106,11 @@ impl GoalHead {
     /// Adds the best score per heading of the goals in the tile to the Q-values of its rows.
     fn score<T: Real>(&self, w: Weights<'_, T>, (goals, rows): (&Goals, Range<usize>), c: &mut GoalCache<T>, q: &mut Batch<T>) {
         c.features.resize(self.features, c.tile.len());
+        let mut features = c.features.as_mut_slice().chunks_exact_mut(self.features);
         let mut begin = 0;
         for (r, &end) in rows.clone().zip(&c.ends) {
-            for i in begin..end {
-                self.write_features(goals, (r, c.tile[i] as usize), c.features.row_mut(i));
+            for (&g, features) in c.tile[begin..end].iter().zip(&mut features) {
+                self.write_features(goals, (r, g as usize), features);
             }
             begin = end;
         }
@@ -189,8 +192,8 @@ impl GoalHead {
             }
         }
         c.features.resize(self.features, c.chosen.len());
-        for (i, &(r, g, _)) in c.chosen.iter().enumerate() {
-            self.write_features(goals, (r as usize, g as usize), c.features.row_mut(i));
+        for (&(r, g, _), features) in c.chosen.iter().zip(c.features.as_mut_slice().chunks_exact_mut(self.features)) {
+            self.write_features(goals, (r as usize, g as usize), features);
         }
         c.hidden.resize(HIDDEN, c.chosen.len());
         self.hidden_of_features(w, c.features.rows(), c.hidden.rows_mut());
