@@ -147,7 +147,10 @@ pub fn remember(sight: &Sight<'_>, range: f64, slot: u64, sharing: Sharing, memo
 fn observe(sight: &Sight<'_>, i: usize, range: f64, slot: f32, memory: &mut [f32]) {
     let at = sight.positions[i];
     let (ground, users) = memory.split_at_mut(GRID);
-    search(at, range, ground);
+    simd(
+        #[inline(always)]
+        || search(at, range, ground),
+    );
     // A user that should be detected and is not has moved away. The margin allows for rounding.
     let near = (0.99 * range).powi(2);
     for user in users.chunks_exact_mut(USER).filter(|user| user[0] == KNOWN) {
@@ -161,6 +164,7 @@ fn observe(sight: &Sight<'_>, i: usize, range: f64, slot: f32, memory: &mut [f32
 }
 
 /// Marks the cells whose centres are within `range` of `at` as searched.
+#[inline(always)]
 fn search(at: Point, range: f64, ground: &mut [f32]) {
     let cells = GRID as f64;
     let first = ((at[1] - range) * cells - 0.5).ceil().max(0.0) as usize;
