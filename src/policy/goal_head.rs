@@ -261,3 +261,83 @@ fn product<T: Real>(hidden: &[T; HIDDEN], value: &[T; HIDDEN]) -> [T; LANES] {
     }
     lanes
 }
+
+#[cfg(test)]
+mod tests {
+    use rand::RngExt;
+
+    use super::super::memory::{GRID, memories, uav_memory_len};
+    use super::super::{EnvParams, FleetGraph};
+    use super::*;
+    use crate::nn::argmax;
+    use crate::rng;
+
+    const ACTIONS: usize = 8;
+
+    /// The goals of fleets that remember more and more users, so that a tile has one row or several.
+    fn goals() -> Goals {
+        let mut goals = Goals::default();
+        goals.clear();
+        let mut rng = rng::stream(3, "goals", 0);
+        for users in [0, 2, 5, 30, 90, 200] {
+            let mut memory = vec![0.0; 3 * uav_memory_len(users)];
+            for uav in memory.chunks_exact_mut(uav_memory_len(users)) {
+                uav[..GRID].fill_with(|| rng.random_range(0..1 << GRID) as f32);
+                uav[GRID..]
+                    .chunks_exact_mut(5)
+                    .for_each(|user| user.copy_from_slice(&[1.0, rng.random(), rng.random(), 3.0, 5.0]));
+            }
+            let uavs = [[0.1, 0.2], [0.6, 0.5], [0.9, 0.9]];
+            let graph = FleetGraph::from_scene(&uavs, &vec![[0.5, 0.5]; users], &vec![1.0; users], 0.28);
+            let slot = (&EnvParams::default(), &graph.sight().unwrap(), 7);
+            goals.push_fleet(slot, memories(&memory, users), (&[0, 3, 5], None));
+        }
+        goals
+    }
+
+    #[test]
+    fn the_best_goal_of_each_heading_counts_and_only_of_headings_that_are_needed() {
+        let mut layout = ParameterLayout::default();
+        let head = GoalHead::new(&mut layout, "goals", HIDDEN, false);
+        let params: Vec<f64> = layout.initialise(&mut rng::stream(4, "test", 0));
+        let mut prepared = vec![0.0; params.len()];
+        head.prepare(&params, &mut prepared);
+        let w = Weights { params: &params, prepared: &prepared };
+        let goals = goals();
+        let mut rng = rng::stream(5, "context", 0);
+        let context: Vec<f64> = (0..goals.rows() * HIDDEN).map(|_| rng.random_range(-1.0..1.0)).collect();
+        let context_rows = [Rows { data: &context, stride: HIDDEN, len: goals.rows() }];
+        let forward = |needed: Option<&[u8]>| {
+            let mut q = Batch::default();
+            q.resize_zero(ACTIONS, goals.rows());
+            head.forward(w, (&goals, needed), &context_rows, &mut GoalCache::default(), &mut q);
+            q
+        };
+        let all = forward(None);
+        let (weight, bias) = (head.first.weight(&params), head.first.bias(w));
+        for r in 0..goals.rows() {
+            let mut best = [f64::NEG_INFINITY; ACTIONS];
+            for g in goals.of_row(r) {
+                let features = goals.features()[g * FEATURES..][..FEATURES].iter().map(|&f| f64::from(f));
+                let input: Vec<f64> = features.chain(context[r * HIDDEN..][..HIDDEN].iter().copied()).collect();
+                let hidden = weight
+                    .chunks_exact(input.len())
+                    .zip(bias)
+                    .map(|(row, b)| (row.iter().zip(&input).map(|(w, x)| w * x).sum::<f64>() + b).max(0.0));
+                let score = hidden.zip(head.value(&params)).map(|(x, v)| x * v).sum::<f64>() + head.value.bias(w)[0];
+                let h = usize::from(goals.headings()[g]);
+                best[h] = best[h].max(score);
+            }
+            for (q, best) in all.row(r).iter().zip(best) {
+                let expected = if best.is_finite() { best } else { params[head.none] };
+                assert!((q - expected).abs() < 1e-12, "row {r}: {q}, {expected}");
+            }
+        }
+        let needed: Vec<u8> = (0..goals.rows()).map(|r| argmax(all.row(r)) as u8).collect();
+        let some = forward(Some(&needed));
+        for (r, &h) in needed.iter().enumerate() {
+            assert_eq!(some.row(r)[usize::from(h)].to_bits(), all.row(r)[usize::from(h)].to_bits(), "row {r}");
+        }
+        assert_ne!(some.as_slice(), all.as_slice());
+    }
+}

@@ -107,3 +107,30 @@ const BITS: [[u32; 2]; 1 << SIDE] = {
     }
     bits
 };
+
+#[cfg(test)]
+mod tests {
+    use rand::RngExt;
+
+    use super::*;
+
+    #[test]
+    fn recent_ground_is_that_of_the_memory_and_counts_its_cells() {
+        let mut rng = crate::rng::stream(6, "ground", 0);
+        let memories: Vec<[f32; GRID]> =
+            (0..3 * RECENT).map(|_| std::array::from_fn(|_| rng.random_range(0..1_u32 << GRID) as f32)).collect();
+        let mut recent = RecentGround::default();
+        // The second time, most places hold the ground of another memory.
+        for memory in memories.iter().chain(&memories) {
+            let ground = recent.of(UavMemory::new(memory));
+            let unsearched = |x: usize, y: usize| memory[y] as u32 >> x & 1 == 0;
+            for block in 0..MAX_BLOCKS {
+                let [left, bottom] = [block % BLOCKS, block / BLOCKS].map(|k| k * SIDE);
+                let cells = (left..left + SIDE).flat_map(|x| (bottom..bottom + SIDE).map(move |y| (x, y)));
+                let count = cells.filter(|&(x, y)| unsearched(x, y)).count();
+                assert_eq!(ground.cells[block], count as u32);
+            }
+            assert_eq!(ground.unsearched, ground.cells.iter().sum::<u32>());
+        }
+    }
+}
