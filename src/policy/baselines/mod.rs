@@ -69,7 +69,8 @@ struct Baseline<R> {
     env: EnvParams,
 }
 
-/// Maximum M * N that baselines accept: their work and memory grow with it.
+/// Limits of rules that plan with the full scene: their work grows with M * N and with the square of M.
+const MAX_UAVS: usize = 4096;
 const MAX_PAIRS: usize = 1 << 20;
 
 impl<R: Rule> Policy for Baseline<R> {
@@ -86,7 +87,13 @@ impl<R: Rule> Policy for Baseline<R> {
     }
 
     fn check_fleet(&self, uavs: usize, users: usize) -> Result<(), Invalid> {
-        in_range("uavs", uavs, 1..=4096)?;
+        if uavs == 0 {
+            return Err(Invalid::new("uavs", uavs, "at least 1"));
+        }
+        if R::NEEDS != RequiredInput::FullScene {
+            return Ok(());
+        }
+        in_range("uavs", uavs, 1..=MAX_UAVS)?;
         in_range("users", users, 0..=MAX_PAIRS / uavs)
     }
 
