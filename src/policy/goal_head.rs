@@ -110,7 +110,7 @@ impl GoalHead {
         let mut begin = 0;
         for (r, &end) in rows.clone().zip(&c.ends) {
             for (&g, features) in c.tile[begin..end].iter().zip(&mut features) {
-                self.write_features(goals, (r, g as usize), features);
+                write_features(goals, (r, g as usize), features);
             }
             begin = end;
         }
@@ -150,16 +150,6 @@ impl GoalHead {
         );
     }
 
-    /// Writes the inputs of the first layer, without the context, for goal `g` of row `r`.
-    fn write_features<T: Real>(&self, goals: &Goals, (r, g): (usize, usize), out: &mut [T]) {
-        let (own, advised) = out.split_at_mut(FEATURES);
-        let features = goals.features().as_chunks::<FEATURES>().0[g];
-        own.copy_from_slice(&features.map(|f| T::from_f64(f.into())));
-        if let ([advised], Some(heading)) = (advised, goals.advice().get(r)) {
-            *advised = if goals.headings()[g] == *heading { T::ONE } else { T::ZERO };
-        }
-    }
-
     /// What the features contribute to the first layer.
     fn hidden_of_features<T: Real>(&self, w: Weights<'_, T>, features: Rows<'_, T>, hidden: RowsMut<'_, T>) {
         self.first.forward_part(w, (0, self.features), features, hidden, InitialValue::Bias(self.first.bias(w)));
@@ -193,7 +183,7 @@ impl GoalHead {
         }
         c.features.resize(self.features, c.chosen.len());
         for (&(r, g, _), features) in c.chosen.iter().zip(c.features.as_mut_slice().chunks_exact_mut(self.features)) {
-            self.write_features(goals, (r as usize, g as usize), features);
+            write_features(goals, (r as usize, g as usize), features);
         }
         c.hidden.resize(HIDDEN, c.chosen.len());
         self.hidden_of_features(w, c.features.rows(), c.hidden.rows_mut());
@@ -236,6 +226,16 @@ impl GoalHead {
 
 /// Lanes of a sum over hidden units, which have a fixed order for any vector unit.
 const LANES: usize = 16;
+
+/// Writes the inputs of the first layer, without the context, for goal `g` of row `r`.
+fn write_features<T: Real>(goals: &Goals, (r, g): (usize, usize), out: &mut [T]) {
+    let (own, advised) = out.split_at_mut(FEATURES);
+    let features = goals.features().as_chunks::<FEATURES>().0[g];
+    own.copy_from_slice(&features.map(|f| T::from_f64(f.into())));
+    if let ([advised], Some(heading)) = (advised, goals.advice().get(r)) {
+        *advised = if goals.headings()[g] == *heading { T::ONE } else { T::ZERO };
+    }
+}
 
 /// Adds the context to a hidden row, and applies ReLU.
 #[inline(always)]
