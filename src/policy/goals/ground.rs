@@ -1,5 +1,7 @@
 //! The ground that a UAV has not searched, in blocks.
 
+use std::sync::LazyLock;
+
 use super::super::fleet_profile::{Place, direction};
 use super::super::memory::{GRID, UavMemory};
 use super::{BLOCKS, MAX_BLOCKS};
@@ -40,12 +42,13 @@ impl Ground {
                     let block = row * BLOCKS + column;
                     ground.cells[block] = count;
                     ground.unsearched += count;
+                    let whole = count == (SIDE * SIDE) as u32;
                     let at = [
                         center(columns + (SIDE * column) as u32 * count, count),
                         center(rows + (SIDE * row) as u32 * count, count),
                     ];
                     [ground.centers[0][block], ground.centers[1][block]] = at;
-                    ground.directions[block] = direction(at);
+                    ground.directions[block] = if whole { WHOLE[block] } else { direction(at) };
                 }
             }
         }
@@ -94,6 +97,12 @@ fn center(sum: u32, count: u32) -> f64 {
     (f64::from(sum) / f64::from(count) + 0.5) / GRID as f64
 }
 
+/// Directions of the centres of blocks without a searched cell.
+static WHOLE: LazyLock<[f64; MAX_BLOCKS]> = LazyLock::new(|| {
+    let middle = |k: usize| (k as f64 + 0.5) / BLOCKS as f64;
+    std::array::from_fn(|block| direction([middle(block % BLOCKS), middle(block / BLOCKS)]))
+});
+
 /// For each set of cells in a row of a block: their number, and the sum of their indices.
 const BITS: [[u32; 2]; 1 << SIDE] = {
     let mut bits = [[0; 2]; 1 << SIDE];
@@ -119,6 +128,7 @@ mod tests {
         let mut rng = crate::rng::stream(6, "ground", 0);
         let memories: Vec<[f32; GRID]> =
             (0..3 * RECENT).map(|_| std::array::from_fn(|_| rng.random_range(0..1_u32 << GRID) as f32)).collect();
+        let memories: Vec<_> = memories.into_iter().chain([[0.0; GRID]]).collect();
         let mut recent = RecentGround::default();
         // The second time, most places hold the ground of another memory.
         for memory in memories.iter().chain(&memories) {
@@ -129,6 +139,10 @@ mod tests {
                 let cells = (left..left + SIDE).flat_map(|x| (bottom..bottom + SIDE).map(move |y| (x, y)));
                 let count = cells.filter(|&(x, y)| unsearched(x, y)).count();
                 assert_eq!(ground.cells[block], count as u32);
+                if count > 0 {
+                    let at = ground.centers.map(|centers| centers[block]);
+                    assert_eq!(ground.directions[block].to_bits(), direction(at).to_bits());
+                }
             }
             assert_eq!(ground.unsearched, ground.cells.iter().sum::<u32>());
         }
