@@ -22,6 +22,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::http::Request;
+use futures::future::BoxFuture;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tower::ServiceExt;
@@ -233,7 +234,12 @@ impl DataDir {
 /// # Errors
 /// [`Error::Config`] when a setting is invalid, [`Error::Store`], [`Error::Keys`] or [`Error::Policies`] when the database or a
 /// policy in it cannot be read.
-pub async fn open(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<App>, Error> {
+pub fn open<'a>(config: &'a Config, data: &'a DataDir, clock: Clock) -> BoxFuture<'a, Result<Arc<App>, Error>> {
+    // Every crate that awaits the body of an async fn compiles it again, but not that of a boxed future.
+    Box::pin(open_app(config, data, clock))
+}
+
+async fn open_app(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<App>, Error> {
     config.validate()?;
     // The recorder must exist before anything creates a metric.
     telemetry::install_metrics();
@@ -307,12 +313,22 @@ fn executor(config: &Config, data: &DataDir) -> Result<Arc<dyn Executor>, Error>
 /// # Errors
 /// [`Error::Listener`] when the address of a listener cannot be read, [`Error::Background`] when a thread cannot be started,
 /// [`Error::Follow`] when the client of the primary cannot be made.
-pub async fn run(
+pub fn run<'a>(
+    config: &'a Config,
+    data: &'a DataDir,
+    app: Arc<App>,
+    listeners: Listeners,
+    shutdown: impl Future<Output = ()> + Send + 'a,
+) -> BoxFuture<'a, Result<(), Error>> {
+    Box::pin(serve(config, data, app, listeners, Box::pin(shutdown)))
+}
+
+async fn serve(
     config: &Config,
     data: &DataDir,
     app: Arc<App>,
     listeners: Listeners,
-    shutdown: impl Future<Output = ()>,
+    shutdown: BoxFuture<'_, ()>,
 ) -> Result<(), Error> {
     let endpoints = listeners.endpoints().map_err(Error::Listener)?;
     let workers = match &config.worker_addr {

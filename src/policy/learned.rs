@@ -12,14 +12,14 @@ use super::config::{AgentConfig, Identity, TOKEN};
 use super::features::{Inputs, NO_ACTION};
 use super::geometry::Geometry;
 use super::goals::{self, Goals};
-use super::memory::{self, Exchange, uav_memory_len};
+use super::memory::{self, Exchange, MAX_REMEMBERED, uav_memory_len};
 use super::{Carry, EnvParams, FleetStep, Policy, Reach, RequiredInput};
 use crate::invalid::{Invalid, in_range};
 use crate::nn::{HIDDEN, Weights, argmax};
 use crate::rng;
 
-/// Maximum M * N of a fleet with memories, which are vectors of fixed length.
-const MAX_REMEMBERED: usize = 1 << 24;
+/// Maximum entries of users in the memories of a fleet, which are vectors of fixed length.
+const MAX_ENTRIES: usize = 1 << 24;
 /// Buffers of a batch that costs more (see [`Policy::work`]) are not kept: they are large, and to allocate them costs little by
 /// comparison.
 const MAX_KEPT_WORK: usize = 1 << 16;
@@ -116,7 +116,8 @@ impl Policy for LearnedPolicy {
 
     fn check_fleet(&self, uavs: usize, users: usize) -> Result<(), Invalid> {
         self.agent.check_fleet(uavs, users)?;
-        if self.remembers_users() { in_range("users", users, 0..=MAX_REMEMBERED / uavs) } else { Ok(()) }
+        let fits = !self.remembers_users() || uavs * users.min(MAX_REMEMBERED) <= MAX_ENTRIES;
+        if fits { Ok(()) } else { in_range("users", users, 0..=MAX_ENTRIES / uavs) }
     }
 
     fn work(&self, uavs: usize, users: usize, detections: usize) -> usize {
@@ -124,11 +125,12 @@ impl Policy for LearnedPolicy {
         if !self.remembers_users() {
             return alone;
         }
-        // Each UAV looks at every user and scores its goals; then it may receive as many memories as it detects UAVs.
+        // Each UAV looks at every user that it remembers and scores its goals; then it may receive as many memories as it detects UAVs.
+        let remembered = users.min(MAX_REMEMBERED);
         let goals = goals::MAX_USERS.min(users) + goals::MAX_BLOCKS;
         // As many of all detections as are among UAVs when nodes of both kinds are spread alike.
         let received = (detections as f64 * (uavs as f64 / (uavs + users) as f64).powi(2)) as usize;
-        alone + uavs * (goals + users / 4) + received * (users / 8 + goals / 32)
+        alone + uavs * (goals + remembered / 4) + received * (remembered / 8 + goals / 32)
     }
 
     fn observers(&self, uavs: usize, users: usize) -> usize {

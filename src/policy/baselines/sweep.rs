@@ -4,7 +4,7 @@
 //! A UAV knows the square, its place among the UAVs, and what it remembers (`policy::memory`). `policy::sweep_plan` is where it flies.
 
 use super::rule::{Rule, Slot};
-use crate::policy::memory::{self, Exchange, Sharing, memories, remember, uav_memory_len};
+use crate::policy::memory::{self, Exchange, MAX_REMEMBERED, Sharing, memories, remember, uav_memory_len};
 use crate::policy::sweep_plan::sweep_headings;
 use crate::policy::{Carry, Reach, RequiredInput};
 
@@ -27,9 +27,11 @@ impl<const SHARED: bool> Rule for Sweep<SHARED> {
     }
 
     fn work(&self, uavs: usize, users: usize, detections: usize) -> usize {
-        // Each UAV compares its blocks of ground with each other and looks at every user; then it may receive as many memories.
+        // Each UAV compares its blocks of ground with each other and looks at every user that it remembers; then it may receive as many
+        // memories.
+        let remembered = users.min(MAX_REMEMBERED);
         let received = if SHARED { detections * uavs / (uavs + users) } else { 0 };
-        uavs * (256 + users / 4) + detections + received * users / 8
+        uavs * (256 + remembered / 4) + detections + received * remembered / 8
     }
 
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}

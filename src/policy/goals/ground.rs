@@ -132,7 +132,7 @@ mod tests {
         let mut recent = RecentGround::default();
         // The second time, most places hold the ground of another memory.
         for memory in memories.iter().chain(&memories) {
-            let ground = recent.of(UavMemory::new(memory));
+            let ground = recent.of(UavMemory::new(memory, 0));
             let unsearched = |x: usize, y: usize| memory[y] as u32 >> x & 1 == 0;
             for block in 0..MAX_BLOCKS {
                 let [left, bottom] = [block % BLOCKS, block / BLOCKS].map(|k| k * SIDE);

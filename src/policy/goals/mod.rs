@@ -137,16 +137,15 @@ impl Goals {
         let Self { users, others, columns, recent, .. } = self;
         users.clear();
         users.extend(memory.users().flatten());
-        let unknown = memory.unknown_users(view.open);
-        let all = users.len() + unknown;
+        let (known, unknown) = (users.len() + memory.users_left_out(), memory.unknown_users(view.open));
         let ground = recent.of(memory);
         let common = [
             ln1(ground.unsearched as f64 * CELL_SHARE * unknown as f64),
-            unknown as f64 / all.max(1) as f64,
+            unknown as f64 / (known + unknown).max(1) as f64,
             ground.unsearched as f64 * CELL_SHARE,
-            ln1(users.len() as f64 / view.uavs as f64),
+            ln1(known as f64 / view.uavs as f64),
         ];
-        self.load.push(users.len() as f32 / view.uavs as f32);
+        self.load.push(known as f32 / view.uavs as f32);
         view.keep_best(users);
         columns.begin(view, users, ground);
         simd(

@@ -1,7 +1,5 @@
 //! Compares hand-derived gradients with central differences, in f64: of every layer, and of the whole loss.
 
-mod sample;
-
 use qedgix::learner::loss::{Loss, TdLambda};
 use qedgix::nn::{
     Batch, Graph, GraphLayer, Gru, HIDDEN, LayerCache, LayerScratch, Linear, Mlp, MlpCache, ParameterLayout, Weights,
@@ -10,7 +8,8 @@ use qedgix::policy::mixer::MixerKind;
 use qedgix::policy::{Advice, AgentConfig, Aggregation, Dims, EnvParams, Gnn, Identity, Memory, ObservationKind};
 use qedgix::rng;
 use rand::RngExt;
-use sample::{AGENT, episodes};
+
+use crate::sample::{AGENT, episodes};
 
 /// Tolerance, relative to the largest gradient of the tensor.
 const TOLERANCE: f64 = 1e-6;

@@ -1,6 +1,8 @@
 //! Properties of agents, mixers and updates that hold for all parameters (docs/model.md, "Observations", "Agents", "Mixers",
-//! "Learner").
+//! "Learner"), and their gradients.
 
+mod gradients;
+#[path = "../sample/mod.rs"]
 mod sample;
 
 use qedgix::env::Point;

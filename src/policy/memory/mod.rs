@@ -5,8 +5,14 @@
 //! The memory has a fixed size, whatever the number of slots, and its content does not fade.
 //!
 //! Encoding of one UAV: [`GRID`] rows of the ground, each an integer with one bit per cell; then per user [`USER`] numbers. All are
-//! integers or f32 positions, which f32 holds exactly.
+//! integers or f32 positions, which f32 holds exactly. With more than [`MAX_REMEMBERED`] users, the memory has entries of some of them
+//! (`nearest`).
 
+mod all_users;
+mod nearest;
+
+use self::all_users::AllUsers;
+use self::nearest::{Carrier, NearestUsers};
 use super::{Carry, EnvParams, Sight};
 use crate::env::Point;
 use crate::nn::simd;
@@ -16,13 +22,16 @@ pub const GRID: usize = 20;
 /// Numbers per user: state, x, y, slot of the last known collection, slot of the observation.
 const USER: usize = 5;
 
+/// Users that a UAV remembers at most: of more, those nearest to it.
+pub const MAX_REMEMBERED: usize = 256;
+
 /// Values of a user's state.
 const UNKNOWN: f32 = 0.0;
 const KNOWN: f32 = 1.0;
 
 /// Length of the memory of one UAV that may know `users` users.
 pub const fn uav_memory_len(users: usize) -> usize {
-    GRID + USER * users
+    GRID + USER * if users < MAX_REMEMBERED { users } else { MAX_REMEMBERED }
 }
 
 /// A user that a UAV remembers.
@@ -40,17 +49,19 @@ pub struct RememberedUser {
 #[derive(Clone, Copy, Debug)]
 pub struct UavMemory<'a> {
     ground: &'a [f32],
-    users: &'a [f32],
+    entries: &'a [f32],
+    /// N.
+    users: usize,
 }
 
 impl<'a> UavMemory<'a> {
     /// The memory of a UAV that knows nothing.
-    pub const EMPTY: UavMemory<'static> = UavMemory { ground: &[0.0; GRID], users: &[] };
+    pub const EMPTY: UavMemory<'static> = UavMemory { ground: &[0.0; GRID], entries: &[], users: 0 };
 
-    /// The memory in `numbers`, of length [`uav_memory_len`].
-    pub fn new(numbers: &'a [f32]) -> Self {
-        let (ground, users) = numbers.split_at(GRID);
-        Self { ground, users }
+    /// The memory in `numbers`, of length [`uav_memory_len`]`(users)`.
+    pub fn new(numbers: &'a [f32], users: usize) -> Self {
+        let (ground, entries) = numbers.split_at(GRID);
+        Self { ground, entries, users }
     }
 
     /// The cells of row `row` that were searched: bit c stands for the cell in column c.
@@ -58,40 +69,57 @@ impl<'a> UavMemory<'a> {
         self.ground[row] as u32 & ALL
     }
 
-    /// The users, with `None` for those that are not known.
+    /// The users that the memory has room for, with `None` for those that are not known.
     pub fn users(&self) -> impl ExactSizeIterator<Item = Option<RememberedUser>> + 'a {
-        self.users.chunks_exact(USER).map(|user| {
-            (user[0] == KNOWN).then(|| RememberedUser {
+        self.entries.chunks_exact(USER).map(|user| {
+            (user[0] > UNKNOWN).then(|| RememberedUser {
                 position: [user[1].into(), user[2].into()],
                 collected: user[3],
                 observed: user[4],
             })
         })
     }
-}
 
-impl UavMemory<'_> {
-    /// Number of users that the UAV does not know. `open`: there may be more users than the memory has room for; their number is
-    /// estimated from the known users per searched ground.
+    /// Number of users that are not known. `open`: there may be more users than N; their number is estimated from the known users per
+    /// searched ground.
     pub fn unknown_users(&self, open: bool) -> usize {
-        let listed = self.users().filter(Option::is_none).count();
+        let (known, left_out) = (self.users().flatten().count(), self.users_left_out());
+        let unknown = self.users - known - left_out;
         if !open {
-            return listed;
+            return unknown;
         }
-        let searched: u32 = (0..GRID).map(|row| self.searched(row).count_ones()).sum();
+        let searched = self.searched_cells();
         let left = (GRID * GRID) as u32 - searched;
-        let known = self.users().flatten().count();
-        let expected = (known + 1) as f64 * f64::from(left) / f64::from(searched.max(1));
-        listed.max(expected.round() as usize)
+        let expected = (known + left_out + 1) as f64 * f64::from(left) / f64::from(searched.max(1));
+        unknown.max(expected.round() as usize)
+    }
+
+    /// Number of known users that the memory has no room for, if the users are spread evenly; 0 for at most [`MAX_REMEMBERED`] users.
+    pub fn users_left_out(&self) -> usize {
+        if self.users <= MAX_REMEMBERED {
+            return 0;
+        }
+        let known = self.users * self.searched_cells() as usize / (GRID * GRID);
+        known.saturating_sub(self.users().flatten().count())
+    }
+
+    fn searched_cells(&self) -> u32 {
+        (0..GRID).map(|row| self.searched(row).count_ones()).sum()
     }
 }
 
 /// Copies the memories of UAVs to those of another fleet (see `Policy::carry`).
 pub fn carry(from: &[f32], to: &mut [f32], carry: &Carry<'_>) {
-    let (len_from, len_to) = (uav_memory_len(carry.from.1), uav_memory_len(carry.to.1));
+    let (users_from, users_to) = (carry.from.1, carry.to.1);
+    let (len_from, len_to) = (uav_memory_len(users_from), uav_memory_len(users_to));
+    let carrier = (users_from.max(users_to) > MAX_REMEMBERED).then(|| Carrier::new((users_from, users_to), carry.users));
     for &(a, b) in carry.uavs {
         let (from, to) = (&from[a as usize * len_from..][..len_from], &mut to[b as usize * len_to..][..len_to]);
         to[..GRID].copy_from_slice(&from[..GRID]);
+        if let Some(carrier) = &carrier {
+            carrier.carry(from, to);
+            continue;
+        }
         for &(a, b) in carry.users {
             to[GRID + b as usize * USER..][..USER].copy_from_slice(&from[GRID + a as usize * USER..][..USER]);
         }
@@ -100,7 +128,7 @@ pub fn carry(from: &[f32], to: &mut [f32], carry: &Carry<'_>) {
 
 /// The memories of a fleet in `numbers`, one per UAV.
 pub fn memories(numbers: &[f32], users: usize) -> impl Iterator<Item = UavMemory<'_>> {
-    numbers.chunks_exact(uav_memory_len(users)).map(UavMemory::new)
+    numbers.chunks_exact(uav_memory_len(users)).map(move |numbers| UavMemory::new(numbers, users))
 }
 
 /// All cells of a row.
@@ -132,34 +160,59 @@ pub fn exclude_outside(env: &EnvParams, users: usize, memories: &mut [f32]) {
     }
 }
 
+/// Buffers for the memories of a fleet, kept between slots.
+#[derive(Clone, Debug, Default)]
+pub struct Exchange {
+    all: AllUsers,
+    nearest: NearestUsers,
+}
+
 /// Advances the memories of a fleet, one after another in `memories`, to slot `slot`.
 pub fn remember(sight: &Sight<'_>, range: f64, slot: u64, sharing: Sharing, memories: &mut [f32], exchange: &mut Exchange) {
+    let Exchange { all, nearest } = exchange;
     let len = uav_memory_len(sight.users());
+    let listed = sight.users() > MAX_REMEMBERED;
+    // A user that should be detected and is not has moved away. The margin allows for rounding.
+    let near = 0.99 * range;
     for (i, memory) in memories.chunks_exact_mut(len).enumerate() {
-        observe(sight, i, range, slot as f32, memory);
+        simd(
+            #[inline(always)]
+            || search(sight.positions[i], range, &mut memory[..GRID]),
+        );
+        if listed {
+            nearest.observe(sight, i, near, slot as f32, memory);
+        } else {
+            observe(sight, i, near, slot as f32, memory);
+        }
     }
     if sharing == Sharing::Shared && sight.uavs() > 1 {
-        exchange.run(sight, memories);
+        if listed {
+            nearest.exchange(sight, memories);
+        } else {
+            all.exchange(sight, memories);
+        }
     }
 }
 
-/// Writes what UAV `i` detects into its memory.
-fn observe(sight: &Sight<'_>, i: usize, range: f64, slot: f32, memory: &mut [f32]) {
+/// Writes the users that UAV `i` detects into its memory, which has an entry for every user. Users remembered within `near` that it does
+/// not detect have gone.
+fn observe(sight: &Sight<'_>, i: usize, near: f64, slot: f32, memory: &mut [f32]) {
     let at = sight.positions[i];
-    let (ground, users) = memory.split_at_mut(GRID);
-    simd(
-        #[inline(always)]
-        || search(at, range, ground),
-    );
-    // A user that should be detected and is not has moved away. The margin allows for rounding.
-    let near = (0.99 * range).powi(2);
+    let users = &mut memory[GRID..];
     for user in users.chunks_exact_mut(USER).filter(|user| user[0] == KNOWN) {
-        if (f64::from(user[1]) - at[0]).powi(2) + (f64::from(user[2]) - at[1]).powi(2) < near {
+        if (f64::from(user[1]) - at[0]).powi(2) + (f64::from(user[2]) - at[1]).powi(2) < near.powi(2) {
             (user[0], user[4]) = (UNKNOWN, slot);
         }
     }
     for (j, [x, y]) in sight.detected_users(i) {
         users[j * USER..][..USER].copy_from_slice(&[KNOWN, x as f32, y as f32, slot - sight.aoi[j], slot]);
+    }
+}
+
+/// Adds the ground of another memory to that of `memory`.
+fn merge_ground(memory: &mut [f32], other: &[f32]) {
+    for (bits, &other) in memory[..GRID].iter_mut().zip(other) {
+        *bits = ((*bits as u32 | other as u32) & ALL) as f32;
     }
 }
 
@@ -177,99 +230,6 @@ fn search(at: Point, range: f64, ground: &mut [f32]) {
         if left < right {
             let seen = (ALL >> (GRID as u32 - (right - left))) << left;
             *bits = ((*bits as u32 & ALL) | seen) as f32;
-        }
-    }
-}
-
-/// The exchange of memories in one slot; kept between slots for its buffers.
-///
-/// Of two entries for a user, the newer one wins. Most entries that a UAV hears of are not newer than its own, so the times of all
-/// entries are compared first, in a matrix of their own.
-#[derive(Clone, Debug, Default)]
-pub struct Exchange {
-    /// (M, N, filled up to whole vectors) when each entry was observed, plus 1; 0 if nothing is known.
-    times: Vec<f32>,
-    /// (M, [`GRID`]) the ground that the UAVs knew before.
-    ground: Vec<f32>,
-    /// For each user, the newest time that one UAV hears of.
-    newest: Vec<f32>,
-    /// Whose entry that is, or [`OWN`].
-    source: Vec<u32>,
-    /// Where the entries that change are in the memories, and what they become.
-    received: Vec<(usize, [f32; USER])>,
-}
-
-/// Entries that are compared at once.
-const LANES: usize = 16;
-/// The source of an entry that does not change.
-const OWN: u32 = u32::MAX;
-
-impl Exchange {
-    /// Lets all UAVs of a fleet receive the memories of the UAVs that they detect.
-    fn run(&mut self, sight: &Sight<'_>, memories: &mut [f32]) {
-        let len = uav_memory_len(sight.users());
-        self.list_times(sight.users(), memories);
-        self.received.clear();
-        for i in 0..sight.uavs() {
-            let others = sight.detected_uavs(i).map(|(j, _)| j);
-            for j in others.clone() {
-                for (bits, &other) in memories[i * len..][..GRID].iter_mut().zip(&self.ground[j * GRID..]) {
-                    *bits = ((*bits as u32 | other as u32) & ALL) as f32;
-                }
-            }
-            self.choose_sources(i, sight.users(), others);
-            for (user, &j) in self.source.iter().enumerate().filter(|(_, j)| **j != OWN) {
-                let [from, to] = [j as usize, i].map(|uav| uav * len + GRID + user * USER);
-                let entry = std::array::from_fn(|k| memories[from + k]);
-                self.received.push((to, entry));
-            }
-        }
-        for (at, entry) in &self.received {
-            memories[*at..][..USER].copy_from_slice(entry);
-        }
-    }
-
-    /// Fills `times` and `ground`.
-    fn list_times(&mut self, users: usize, memories: &[f32]) {
-        self.times.clear();
-        self.ground.clear();
-        for memory in memories.chunks_exact(uav_memory_len(users)) {
-            let (ground, entries) = memory.split_at(GRID);
-            self.ground.extend_from_slice(ground);
-            let time = |user: &[f32]| if user[0] == KNOWN || user[4] > 0.0 { user[4] + 1.0 } else { 0.0 };
-            self.times.extend(entries.chunks_exact(USER).map(time));
-            self.times.resize(self.times.len().next_multiple_of(LANES), 0.0);
-        }
-    }
-
-    /// Fills `source` for UAV `i`.
-    fn choose_sources(&mut self, i: usize, users: usize, others: impl Iterator<Item = usize>) {
-        let width = users.next_multiple_of(LANES);
-        self.newest.clear();
-        self.newest.extend_from_slice(&self.times[i * width..][..width]);
-        self.source.clear();
-        self.source.resize(width, OWN);
-        let (newest, sources) = (self.newest.as_chunks_mut::<LANES>().0, self.source.as_chunks_mut::<LANES>().0);
-        for j in others {
-            let times = self.times[j * width..][..width].as_chunks::<LANES>().0;
-            simd(
-                #[inline(always)]
-                || {
-                    for ((newest, source), times) in newest.iter_mut().zip(&mut *sources).zip(times) {
-                        let mut newer = false;
-                        for l in 0..LANES {
-                            newer |= times[l] > newest[l];
-                        }
-                        if newer {
-                            for l in 0..LANES {
-                                let newer = times[l] > newest[l];
-                                newest[l] = if newer { times[l] } else { newest[l] };
-                                source[l] = if newer { j as u32 } else { source[l] };
-                            }
-                        }
-                    }
-                },
-            );
         }
     }
 }
@@ -300,7 +260,7 @@ mod tests {
 
         fn of(&self, uav: usize) -> UavMemory<'_> {
             let len = uav_memory_len(self.users);
-            UavMemory::new(&self.memory[uav * len..][..len])
+            UavMemory::new(&self.memory[uav * len..][..len], self.users)
         }
 
         fn user(&self, uav: usize, j: usize) -> Option<RememberedUser> {
@@ -379,54 +339,5 @@ mod tests {
         let mut fleet = Fleet::new(2, 1);
         fleet.see(1, &uavs, &users, &[1.0], Sharing::Own, Ranges { communication: 2.0, ..RANGES });
         assert_eq!(fleet.user(1, 0), None);
-    }
-
-    /// The exchange as docs/model.md defines it, entry by entry.
-    fn exchange_one_by_one(sight: &Sight<'_>, before: &[f32]) -> Vec<f32> {
-        let len = uav_memory_len(sight.users());
-        let mut after = before.to_vec();
-        for (i, memory) in after.chunks_exact_mut(len).enumerate() {
-            for (j, _) in sight.detected_uavs(i) {
-                let (ground, users) = memory.split_at_mut(GRID);
-                let (other_ground, others) = before[j * len..][..len].split_at(GRID);
-                ground.iter_mut().zip(other_ground).for_each(|(bits, &other)| *bits = (*bits as u32 | other as u32) as f32);
-                for (user, other) in users.chunks_exact_mut(USER).zip(others.chunks_exact(USER)) {
-                    let nothing = user[0] == UNKNOWN && user[4] == 0.0;
-                    if other[4] > user[4] || (nothing && other[0] == KNOWN) {
-                        user.copy_from_slice(other);
-                    }
-                }
-            }
-        }
-        after
-    }
-
-    #[test]
-    fn exchanges_of_many_users_are_those_of_single_entries() {
-        use rand::RngExt;
-        let mut rng = crate::rng::stream(7, "exchange", 0);
-        let mut exchange = Exchange::default();
-        for users in [1, 15, 16, 17, 40] {
-            let uavs: Vec<Point> = (0..6).map(|_| [rng.random(), rng.random()]).collect();
-            let graph = FleetGraph::from_scene(&uavs, &vec![[0.5, 0.5]; users], &vec![1.0; users], 0.5);
-            let sight = graph.sight().unwrap();
-            let mut memory = vec![0.0; uavs.len() * uav_memory_len(users)];
-            for uav in memory.chunks_exact_mut(uav_memory_len(users)) {
-                uav[..GRID].fill_with(|| rng.random_range(0..1 << GRID) as f32);
-                for user in uav[GRID..].chunks_exact_mut(USER) {
-                    if rng.random_bool(0.4) {
-                        continue;
-                    }
-                    let observed = rng.random_range(0..6) as f32;
-                    // Slot 0 leaves nothing but users that were seen in it.
-                    let state = if observed == 0.0 || rng.random_bool(0.8) { KNOWN } else { UNKNOWN };
-                    user.copy_from_slice(&[state, rng.random(), rng.random(), observed - 2.0, observed]);
-                }
-            }
-            let expected = exchange_one_by_one(&sight, &memory);
-            assert_ne!(expected, memory, "something is received");
-            exchange.run(&sight, &mut memory);
-            assert_eq!(memory, expected, "{users} users");
-        }
     }
 }
