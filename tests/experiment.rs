@@ -233,7 +233,18 @@ fn the_experiments_of_the_repository_are_valid() {
         found.push(name);
     }
     found.sort();
-    let expected = ["communication", "convergence", "information", "memory", "practical", "range", "scale", "trajectories"];
+    let expected = [
+        "communication",
+        "convergence",
+        "information",
+        "memory",
+        "practical",
+        "range-memory",
+        "range",
+        "scale-memory",
+        "scale",
+        "trajectories",
+    ];
     assert_eq!(found, expected.map(|name| format!("{name}.toml")));
     let part = run_successfully(dir, &["range.toml", "--dry-run", "--series", "QMIX", "--point", "9 xi", "--point", "4 xi"]);
     assert!(part.contains(": 6 runs") && !part.contains("Qedgix") && !part.contains("5 xi"), "{part}");
