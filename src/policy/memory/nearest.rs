@@ -6,7 +6,6 @@
 use super::{GRID, KNOWN, MAX_REMEMBERED, UNKNOWN, USER, merge_ground, uav_memory_len};
 use crate::env::Point;
 use crate::policy::Sight;
-use crate::policy::flight::distance;
 
 type Entry = [f32; USER];
 
@@ -21,11 +20,10 @@ fn entries(memory: &[f32], users: usize) -> impl Iterator<Item = Entry> {
     entries.iter().copied().filter(move |entry: &Entry| entry[0].abs() >= 1.0 && entry[0].abs() < (users + 1) as f32)
 }
 
-/// Writes at most [`MAX_REMEMBERED`] entries to the memory of one UAV.
-fn write(memory: &mut [f32], entries: &mut [Entry]) {
-    entries.sort_unstable_by_key(user);
+/// Writes at most [`MAX_REMEMBERED`] entries, in ascending order of user, to the memory of one UAV.
+fn write<'a>(memory: &mut [f32], entries: impl ExactSizeIterator<Item = &'a Entry>) {
     let (own, rest) = memory[GRID..].split_at_mut(USER * entries.len());
-    own.copy_from_slice(entries.as_flattened());
+    own.as_chunks_mut().0.iter_mut().zip(entries).for_each(|(own, entry)| *own = *entry);
     rest.fill(0.0);
 }
 
@@ -63,7 +61,8 @@ impl Carrier {
                 kept.select_nth_unstable_by(MAX_REMEMBERED, |a, b| b[4].total_cmp(&a[4]).then_with(|| user(a).cmp(&user(b))));
                 kept.truncate(MAX_REMEMBERED);
             }
-            write(to, &mut kept);
+            kept.sort_unstable_by_key(user);
+            write(to, kept.iter());
             return;
         }
         to[GRID..].fill(0.0);
@@ -94,16 +93,27 @@ pub(super) struct NearestUsers {
     entries: Vec<Entry>,
     /// For each user, 1 + the place of its entry; 0 without an entry.
     places: Vec<u32>,
+    /// The entries from which the nearest are chosen.
+    kept: Vec<Kept>,
     /// The memories before an exchange.
     before: Vec<f32>,
+}
+
+/// An entry of which it is decided whether it is kept: first those that are near, then those of a small index.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Kept {
+    apart: u64,
+    user: u32,
+    /// In the list of entries.
+    place: u32,
 }
 
 impl NearestUsers {
     /// Writes what UAV `i` detects into its memory. Users remembered within `near` that it does not detect have gone.
     pub(super) fn observe(&mut self, sight: &Sight<'_>, i: usize, near: f64, slot: f32, memory: &mut [f32]) {
-        let at = sight.positions[i];
+        let (at, near) = (sight.positions[i], near.powi(2).to_bits());
         self.add(memory, sight.users());
-        for entry in self.entries.iter_mut().filter(|entry| entry[0] > 0.0 && distance(position(entry), at) < near) {
+        for entry in self.entries.iter_mut().filter(|entry| entry[0] > 0.0 && apart(entry, at) < near) {
             (entry[0], entry[4]) = (-entry[0], slot);
         }
         for (j, [x, y]) in sight.detected_users(i) {
@@ -155,21 +165,25 @@ impl NearestUsers {
     /// Moves the entries nearest to `at` to the memory of a UAV.
     fn keep_nearest(&mut self, at: Point, memory: &mut [f32]) {
         self.entries.iter().for_each(|entry| self.places[user(entry)] = 0);
-        if self.entries.len() > MAX_REMEMBERED {
-            let key = |entry: &Entry| (distance(position(entry), at), user(entry));
-            self.entries.select_nth_unstable_by(MAX_REMEMBERED, |a, b| {
-                let (a, b) = (key(a), key(b));
-                a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))
-            });
-            self.entries.truncate(MAX_REMEMBERED);
+        self.kept.clear();
+        self.kept.extend(self.entries.iter().zip(0..).map(|(entry, place)| Kept {
+            apart: apart(entry, at),
+            user: user(entry) as u32,
+            place,
+        }));
+        if self.kept.len() > MAX_REMEMBERED {
+            self.kept.select_nth_unstable(MAX_REMEMBERED);
+            self.kept.truncate(MAX_REMEMBERED);
         }
-        write(memory, &mut self.entries);
+        self.kept.sort_unstable_by_key(|kept| kept.user);
+        write(memory, self.kept.iter().map(|kept| &self.entries[kept.place as usize]));
         self.entries.clear();
     }
 }
 
-fn position(entry: &Entry) -> Point {
-    [entry[1].into(), entry[2].into()]
+/// The squared distance of an entry from a point, as an integer of the same order.
+fn apart(entry: &Entry, at: Point) -> u64 {
+    ((f64::from(entry[1]) - at[0]).powi(2) + (f64::from(entry[2]) - at[1]).powi(2)).to_bits()
 }
 
 #[cfg(test)]
@@ -272,7 +286,7 @@ mod tests {
         let user = |j: usize, seen: f32| [(1 + j) as f32, 0.5, j as f32 / 1024.0, 3.0, seen];
         let (large, small) = ((1, 1000), (2, 3));
         let mut from = vec![0.0; uav_memory_len(large.1)];
-        write(&mut from, &mut [user(7, 4.0), user(700, 5.0), user(900, 6.0)]);
+        write(&mut from, [user(7, 4.0), user(700, 5.0), user(900, 6.0)].iter());
         from[0] = 5.0;
         let mut to = vec![0.0; 2 * uav_memory_len(small.1)];
         carry(&from, &mut to, &Carry { from: large, to: small, uavs: &[(0, 1)], users: &[(900, 0), (3, 1), (7, 2)] });
@@ -282,7 +296,7 @@ mod tests {
         assert_eq!(seen, [Some(6.0), None, Some(4.0)]);
         // And back, to a memory that has another user and knows that one of these has gone.
         let mut back = vec![0.0; uav_memory_len(large.1)];
-        write(&mut back, &mut [user(1, 2.0), user(5, 2.0), [-801.0, 0.0, 0.0, 1.0, 2.0]]);
+        write(&mut back, [user(1, 2.0), user(5, 2.0), [-801.0, 0.0, 0.0, 1.0, 2.0]].iter());
         carry(&to, &mut back, &Carry { from: small, to: large, uavs: &[(1, 0)], users: &[(0, 800), (1, 5), (2, 2)] });
         let back: Vec<_> = entries(&back, large.1).map(|entry| (entry[0], entry[4])).collect();
         assert_eq!(back, [(2.0, 2.0), (3.0, 4.0), (801.0, 6.0)]);
