@@ -46,7 +46,7 @@ fn job() -> Value {
         "algorithm": "vdn",
         "seed": 3,
         "environment": {"slots": 20, "uavs": 2, "users": 3},
-        "training": {"steps": 24_000, "envs": 4, "batch": 16, "buffer": 200, "eval_every": 2_000, "eval_episodes": 8},
+        "training": {"steps": 8_000, "envs": 4, "batch": 16, "buffer": 200, "eval_every": 1_000, "eval_episodes": 8},
     })
 }
 
@@ -119,7 +119,7 @@ async fn worker_runs_a_job_to_its_end() {
     let rest = &server.rest;
     let id = rest.submit(&job()).await;
     let done = rest.reaches(&id, "succeeded").await;
-    assert_eq!((&done["attempts"], &done["failures"], &done["progress"]["step"]), (&json!(1), &json!(0), &json!(24_000)));
+    assert_eq!((&done["attempts"], &done["failures"], &done["progress"]["step"]), (&json!(1), &json!(0), &json!(8_000)));
     let (expected, best) = uninterrupted(&job());
     assert_same(&rest.rows(&id).await, &expected);
 
@@ -130,7 +130,7 @@ async fn worker_runs_a_job_to_its_end() {
     assert_eq!(found["sha256"], hex::encode(Sha256::digest(&bytes)));
     assert_eq!(Checkpoint::from_bytes(&bytes).unwrap(), best);
     assert_eq!(found["metrics"]["eval/mean_aoi"], json!(best.metrics().unwrap().mean_aoi));
-    assert!(list.iter().any(|c| c["kind"] == "last" && c["step"] == 24_000));
+    assert!(list.iter().any(|c| c["kind"] == "last" && c["step"] == 8_000));
     let policy = format!("job-{}:1", &id[id.len() - 8..]);
     assert_eq!(done["policy"], policy);
     let policy = rest.get(&format!("/v1/policies/{policy}")).await;
@@ -143,7 +143,7 @@ async fn killed_worker_is_replaced_without_lost_or_duplicate_metrics() {
     let dir = tempfile::tempdir().unwrap();
     let server = Process::start(dir.path()).await;
     let id = server.rest.submit(&job()).await;
-    passes(&server.rest, &id, 6_000).await;
+    passes(&server.rest, &id, 2_000).await;
     for worker in workers(&id) {
         assert!(signal("KILL", worker));
     }
@@ -162,7 +162,7 @@ async fn killed_server_resumes_its_jobs() {
     let mut server = Process::start(dir.path()).await;
     let id = server.rest.submit(&job()).await;
     let waiting = server.rest.submit(&tiny()).await;
-    passes(&server.rest, &id, 6_000).await;
+    passes(&server.rest, &id, 2_000).await;
     server.kill();
     // The worker ends by itself.
     no_worker(&id).await;
@@ -182,7 +182,7 @@ async fn terminated_server_snapshots_its_jobs() {
     let dir = tempfile::tempdir().unwrap();
     let mut server = Process::start(dir.path()).await;
     let id = server.rest.submit(&job()).await;
-    passes(&server.rest, &id, 4_000).await;
+    passes(&server.rest, &id, 2_000).await;
     assert!(server.process.terminate().await.success());
     assert!(workers(&id).is_empty());
 
@@ -199,7 +199,7 @@ async fn paused_job_resumes_exactly_and_cancelled_job_stops() {
     let server = Process::start(dir.path()).await;
     let rest = &server.rest;
     let id = rest.submit(&job()).await;
-    passes(rest, &id, 2_000).await;
+    passes(rest, &id, 1_000).await;
     rest.post(&format!("/v1/jobs/{id}/pause")).await;
     rest.reaches(&id, "paused").await;
     no_worker(&id).await;

@@ -15,7 +15,7 @@ use serde_json::Value;
 pub const PROGRAM: &str = env!("CARGO_BIN_EXE_qedgix");
 
 /// Longest time that a single step of a test may take. Only failures wait that long.
-pub const TIMEOUT: Duration = Duration::from_secs(60);
+pub const TIMEOUT: Duration = Duration::from_secs(180);
 
 /// Time between two looks at a condition.
 pub const POLL: Duration = Duration::from_millis(5);
