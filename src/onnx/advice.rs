@@ -20,7 +20,11 @@ pub(super) struct Advice {
     /// The advised headings, (M).
     pub(super) headings: Tensor,
     /// What is added to their Q-values, (M, 1).
-    trust: Tensor,
+    bias: Tensor,
+    /// What a better heading has to gain, (M, 1).
+    margin: Tensor,
+    /// Whether the fleet has more UAVs than those of the training, ().
+    untrained: Tensor,
 }
 
 impl Network<'_> {
@@ -71,15 +75,26 @@ impl Network<'_> {
         let load = g.cast(&load, DataType::Float);
         let margin = g.float(self.advice_margin);
         let margin = g.with("Mul", &load, &margin);
-        Advice { headings, trust: g.with("Add", &margin, &bias) }
+        let most = g.double(self.most_uavs as f64);
+        let untrained = g.with("Greater", &uavs, &most);
+        Advice { headings, bias, margin, untrained }
     }
 
-    /// The Q-values with what the advised headings gain.
+    /// The Q-values with what the advised headings gain: in a fleet that was not trained, at least as much as any other has.
     pub(super) fn trust(&mut self, q: &Tensor, advice: &Advice) -> Tensor {
         let actions = self.agent.dims().env.actions;
         let advised = self.g.one_hot(&advice.headings, actions);
-        let gain = self.g.with("Mul", &advised, &advice.trust);
-        self.g.with("Add", q, &gain)
+        let g = &mut self.g;
+        let gain = g.with("Mul", &advised, &advice.bias);
+        let q = g.with("Add", q, &gain);
+        let own = g.with("Mul", &advised, &q);
+        let own = g.sum(&own, &[1], true);
+        let highest = g.max(&q, 1, true);
+        let base = g.select(&advice.untrained, &highest, &own);
+        let gain = g.with("Sub", &base, &own);
+        let gain = g.with("Add", &gain, &advice.margin);
+        let gain = g.with("Mul", &advised, &gain);
+        g.with("Add", &q, &gain)
     }
 }
 

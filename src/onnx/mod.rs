@@ -43,7 +43,8 @@ pub fn export(checkpoint: &Checkpoint, name: &str) -> Result<Vec<u8>, Invalid> {
         return Err(Invalid::new("training.hops", config.hops, expected));
     }
     let (params, advice_margin) = (policy.parameters(), policy.advice_margin());
-    let mut network = Network { g: Graph::default(), agent, params, advice_margin };
+    let most_uavs = policy.trained().most_uavs;
+    let mut network = Network { g: Graph::default(), agent, params, advice_margin, most_uavs };
     slot(&mut network, &config);
     let metadata = vec![
         ("policy", name.to_owned()),

@@ -11,6 +11,8 @@ pub(super) struct Network<'a> {
     pub(super) agent: &'a Agent,
     pub(super) params: &'a [f32],
     pub(super) advice_margin: f32,
+    /// The largest fleet of the training.
+    pub(super) most_uavs: usize,
 }
 
 /// Detections as lists of edges, and what follows from the sizes of the fleet.

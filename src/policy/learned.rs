@@ -31,8 +31,28 @@ pub struct LearnedPolicy {
     params: Vec<f32>,
     prepared: Vec<f32>,
     advice_margin: f32,
+    trained: Trained,
     /// Buffers of finished calls, for the next calls.
     buffers: Mutex<Vec<Buffers>>,
+}
+
+/// The fleets and ranges of the training, as far as advised policies need them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Trained {
+    /// The largest M.
+    pub most_uavs: usize,
+    /// The smallest d.
+    pub least_detection_range: f64,
+}
+
+impl Trained {
+    /// Any fleet and any range.
+    pub const ANY: Self = Self { most_uavs: usize::MAX, least_detection_range: 0.0 };
+
+    /// Ranges that a caller gave in metres are rounded.
+    fn contains(&self, uavs: usize, env: &EnvParams) -> bool {
+        uavs <= self.most_uavs && env.detection_range >= 0.99 * self.least_detection_range
+    }
 }
 
 #[derive(Debug, Default)]
@@ -62,7 +82,7 @@ impl LearnedPolicy {
         }
         let mut prepared = vec![0.0; len];
         agent.prepare(&params, &mut prepared);
-        Ok(Self { agent, params, prepared, advice_margin: 0.0, buffers: Mutex::default() })
+        Ok(Self { agent, params, prepared, advice_margin: 0.0, trained: Trained::ANY, buffers: Mutex::default() })
     }
 
     /// The policy that leaves the advised heading only for one whose Q-value is higher by `margin` times the users per UAV that it
@@ -70,6 +90,13 @@ impl LearnedPolicy {
     #[must_use]
     pub fn with_advice_margin(self, margin: f32) -> Self {
         Self { advice_margin: margin, ..self }
+    }
+
+    /// The policy that always flies the advised heading where it was not trained (docs/model.md, "Advice"). Without advice it stays as
+    /// it is.
+    #[must_use]
+    pub fn with_trained(self, trained: Trained) -> Self {
+        Self { trained, ..self }
     }
 
     /// The architecture.
@@ -80,6 +107,11 @@ impl LearnedPolicy {
     /// The margin of [`LearnedPolicy::with_advice_margin`].
     pub fn advice_margin(&self) -> f32 {
         self.advice_margin
+    }
+
+    /// The fleets and ranges of [`LearnedPolicy::with_trained`].
+    pub fn trained(&self) -> Trained {
+        self.trained
     }
 
     /// The parameters, in the order of the agent's layout.
@@ -249,9 +281,17 @@ impl LearnedPolicy {
         };
         let weights = Weights { params: &self.params, prepared: &self.prepared };
         self.agent.forward(weights, &inputs, 1, &mut b.cache);
+        let trained = fleets.iter().flat_map(|fleet| {
+            let uavs = fleet.graph.uavs();
+            std::iter::repeat_n(self.trained.contains(uavs, &fleet.env), uavs)
+        });
         let advice = b.goals.advice().iter().zip(b.goals.load());
-        for (q, (&heading, &load)) in b.cache.q.as_mut_slice().chunks_exact_mut(self.actions()).zip(advice) {
-            q[usize::from(heading)] += self.advice_margin * load.max(1.0);
+        for ((q, (&heading, &load)), trained) in
+            b.cache.q.as_mut_slice().chunks_exact_mut(self.actions()).zip(advice).zip(trained)
+        {
+            let heading = usize::from(heading);
+            let base = if trained { q[heading] } else { q.iter().copied().fold(f32::MIN, f32::max) };
+            q[heading] = base + self.advice_margin * load.max(1.0);
         }
         let mut after = b.cache.last_hidden(rows).chunks_exact(HIDDEN).zip(b.cache.q.as_slice().chunks_exact(self.actions()));
         for fleet in fleets {

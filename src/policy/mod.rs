@@ -32,7 +32,7 @@ pub use fleet_profile::{Carry, FleetProfile, Place};
 pub use geometry::{FleetSpan, Geometry, GeometryConfig, NodeView};
 pub use goals::Goals;
 pub use hop_search::HopSearch;
-pub use learned::LearnedPolicy;
+pub use learned::{LearnedPolicy, Trained};
 pub use neighbor_search::{Detection, DetectionEstimate, estimate_detections};
 pub use sight::Sight;
 

@@ -18,7 +18,7 @@ pub use self::vary::Vary;
 use crate::env::EnvConfig;
 use crate::invalid::Invalid;
 use crate::policy::mixer::MixerKind;
-use crate::policy::{Advice, AgentConfig, Aggregation, Dims, Gnn, Identity, LearnedPolicy, Memory, ObservationKind};
+use crate::policy::{Advice, AgentConfig, Aggregation, Dims, Gnn, Identity, LearnedPolicy, Memory, ObservationKind, Trained};
 
 /// The algorithms of the paper, and common baselines.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -230,7 +230,12 @@ impl TrainConfig {
     /// [`Invalid`] if the number of parameters does not fit the architecture, or one is not finite.
     pub fn policy(&self, parameters: Vec<f32>) -> Result<LearnedPolicy, Invalid> {
         let policy = LearnedPolicy::new(self.agent(), self.dims(), parameters)?;
-        Ok(policy.with_advice_margin(self.training.advice_margin as f32))
+        let t = &self.training;
+        let trained = Trained {
+            most_uavs: t.vary.largest(&self.environment).uavs,
+            least_detection_range: t.vary.detection_range.map_or(self.environment.detection_range, |[least, _]| least),
+        };
+        Ok(policy.with_advice_margin(t.advice_margin as f32).with_trained(trained))
     }
 
     /// The sizes of the agents.

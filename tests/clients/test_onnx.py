@@ -15,7 +15,7 @@ from world import HTTP
 BINARY = os.environ["QEDGIX_BIN"]
 LAYOUTS = int(os.environ.get("QEDGIX_ONNX_LAYOUTS", "6"))
 # Fleets that are flown in turn: most as trained, others of any size.
-SIZES = [(3, 5), (3, 5), (2, 4), (3, 5), (5, 12), (1, 3), (6, 20), (3, 1)]
+SIZES = [(3, 5), (3, 5), (2, 4), (3, 5), (5, 12), (1, 3), (6, 20), (3, 1), (8, 10)]
 # Architectures that no bundled policy has, trained for a moment, and fleets that they fit.
 TRAINED = {
     "agggnn": ["--algorithm", "agggnn", "--set", "training.advice=none"],

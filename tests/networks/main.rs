@@ -13,7 +13,7 @@ use qedgix::policy::baselines;
 use qedgix::policy::mixer::{Mixer, MixerCache, MixerKind};
 use qedgix::policy::{
     Advice, Agent, AgentConfig, BatchedAgent, Dims, EnvParams, FleetGraph, FleetStep, Geometry, GeometryConfig, Gnn, HopSearch,
-    Identity, LearnedPolicy, Memory, ObservationKind, Policy, RequiredInput, StepInput, TOKEN,
+    Identity, LearnedPolicy, Memory, ObservationKind, Policy, RequiredInput, StepInput, TOKEN, Trained,
 };
 use qedgix::rng;
 use rand::RngExt;
@@ -131,6 +131,12 @@ fn a_policy_follows_advice_unless_another_heading_is_better_by_the_margin() {
         let (advised, _) = fly(&*rule, seed);
         let (bound, _) = fly(&loud().with_advice_margin(1e3), seed);
         assert_eq!(bound, advised);
+        for trained in [Trained { most_uavs: 2, ..Trained::ANY }, Trained { least_detection_range: 0.3, ..Trained::ANY }] {
+            let (elsewhere, _) = fly(&loud().with_advice_margin(0.01).with_trained(trained), seed);
+            assert_eq!(elsewhere, advised, "{trained:?}");
+        }
+        let here = Trained { most_uavs: 3, least_detection_range: 0.28 };
+        assert_eq!(fly(&loud().with_trained(here), seed), (free.clone(), q.clone()));
         let (_, shifted) = fly(&loud().with_advice_margin(0.5), seed);
         let actions = q.len() / advised.len();
         for (i, &heading) in advised.iter().enumerate() {
