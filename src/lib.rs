@@ -19,7 +19,7 @@
 //! | [`plot`] | numbers to SVG |
 //! | [`nn`], [`env`] | neural network layers; the simulated environment |
 //! | [`clock`], [`draining`], [`inflight`] | wall and monotonic time; the shutdown flag; the budget of bytes in flight |
-//! | [`invalid`], [`error_code`], [`rng`], [`files`] | errors of invalid input; error codes; seeded random streams; atomic writes of files |
+//! | [`invalid`], [`error_code`], [`rng`], [`files`], [`threads`] | errors of invalid input; error codes; seeded random streams; atomic writes of files; loops on several threads |
 //!
 //! Reading order: `env`, `policy`, `learner`; then `service` and the layers that it calls.
 
@@ -47,5 +47,6 @@ pub mod service;
 pub mod serving;
 pub mod store;
 pub mod telemetry;
+pub mod threads;
 pub mod train_config;
 pub mod wire;

@@ -15,10 +15,11 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("rng", &[]),
     ("files", &[]),
     ("wire", &[]),
-    ("nn", &["invalid", "rng"]),
+    ("threads", &[]),
+    ("nn", &["invalid", "rng", "threads"]),
     ("env", &["invalid", "rng"]),
     ("plot", &["env", "invalid"]),
-    ("policy", &["env", "nn", "invalid", "rng"]),
+    ("policy", &["env", "nn", "invalid", "rng", "threads"]),
     ("train_config", &["policy", "env", "invalid"]),
     ("checkpoint", &["train_config", "policy", "env", "nn", "invalid"]),
     ("onnx", &["wire", "checkpoint", "policy", "env", "nn", "invalid"]),
@@ -44,7 +45,7 @@ const LAYERS: &[(&str, &[&str])] = &[
             "wire",
         ],
     ),
-    ("serving", &["clock", "checkpoint", "train_config", "learner", "policy", "env", "invalid", "error_code", "rng"]),
+    ("serving", &["clock", "checkpoint", "train_config", "learner", "policy", "env", "invalid", "error_code", "rng", "threads"]),
     (
         "service",
         &[

@@ -43,11 +43,26 @@ pub struct RowsMut<'a, T> {
     pub len: usize,
 }
 
-impl<T> Rows<'_, T> {
+impl<'a, T> Rows<'a, T> {
+    /// The rows in parts of `len` rows; the last part may be shorter.
+    pub fn parts(self, len: usize) -> impl Iterator<Item = Rows<'a, T>> {
+        let Self { data, stride, len: rows } = self;
+        (0..rows).step_by(len).map(move |first| Rows { data: &data[first * stride..], stride, len: len.min(rows - first) })
+    }
+
     /// The same rows without their first `from` numbers.
     #[must_use]
     pub fn from_column(self, from: usize) -> Self {
         Self { data: &self.data[from.min(self.data.len())..], ..self }
+    }
+}
+
+impl<'a, T> RowsMut<'a, T> {
+    /// The rows in parts of `len` rows; the last part may be shorter.
+    pub fn parts(self, len: usize) -> impl Iterator<Item = RowsMut<'a, T>> {
+        let Self { data, stride, len: rows } = self;
+        let data = data.chunks_mut(len * stride.max(1));
+        data.zip((0..rows).step_by(len)).map(move |(data, first)| RowsMut { data, stride, len: len.min(rows - first) })
     }
 }
 

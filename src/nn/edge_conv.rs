@@ -23,6 +23,7 @@ use super::matmul::{InitialValue, Lhs, Out, Rhs, matmul};
 use super::params::{ParameterLayout, Weights};
 use super::real::Real;
 use super::simd::simd;
+use crate::threads;
 
 /// Second half of f's input.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -104,27 +105,41 @@ impl EdgeNet {
         cache.a.resize(W, nodes);
         cache.stats.resize(graph.offsets[nodes] as usize, [T::ZERO; 2]);
         let (own, neighbour) = self.first.weight_transposed(w).split_at(H * W);
-        let lhs = Lhs::rows(x.data, x.stride);
-        let out = Out { data: cache.u.as_mut_slice(), stride: W };
-        matmul((nodes, H, W), lhs, Rhs { data: own, stride: W }, out, InitialValue::Bias(self.first.bias(w)));
-        let out = Out { data: cache.v.as_mut_slice(), stride: W };
-        matmul((x.len, H, W), lhs, Rhs { data: neighbour, stride: W }, out, InitialValue::Zero);
-        let affine = self.norm.affine(w.params);
+        let (own, neighbour) = (Rhs { data: own, stride: W }, Rhs { data: neighbour, stride: W });
         let EdgeCache { u, v, a, stats } = cache;
-        let (u, v) = (u.as_slice().as_chunks().0, v.as_slice().as_chunks().0);
-        let sums = a.as_mut_slice().as_chunks_mut().0;
-        with_rows(Aggregate { graph, mean: self.mean, affine: &affine, u, v, stats, a: sums });
-        let stride = y.stride;
-        self.last.forward(w, a.rows(), RowsMut { data: &mut *y.data, ..y });
+        let part = threads::part(x.len);
+        threads::for_each(x.parts(part).zip(v.rows_mut().parts(part)), |(x, v)| {
+            let out = Out { data: v.data, stride: W };
+            matmul((x.len, H, W), Lhs::rows(x.data, x.stride), neighbour, out, InitialValue::Zero);
+        });
+        let (affine, bias) = (self.norm.affine(w.params), self.first.bias(w));
+        let v = v.as_slice().as_chunks().0;
+        let part = threads::part(nodes);
+        let rows = Rows { len: nodes, ..x }.parts(part).zip(u.rows_mut().parts(part)).zip(a.rows_mut().parts(part));
+        let rows = rows.zip(y.parts(part)).zip(graph.edge_parts(stats, part));
+        threads::for_each(rows.enumerate(), |(k, ((((x, u), a), mut y), stats))| {
+            let first = k * part;
+            let out = Out { data: &mut *u.data, stride: W };
+            matmul((x.len, H, W), Lhs::rows(x.data, x.stride), own, out, InitialValue::Bias(bias));
+            let (u, sums) = (u.data.as_chunks().0, a.data.as_chunks_mut().0);
+            with_rows(Aggregate { graph, first, mean: self.mean, affine: &affine, u, v, stats, a: sums });
+            let sums = Rows { data: a.data, stride: W, len: a.len };
+            self.last.forward(w, sums, RowsMut { data: &mut *y.data, ..y });
+            self.correct_bias(w, (graph, first), &mut y);
+        });
+    }
+
+    /// Corrects the last product, which added one bias per node. A sum has one bias per neighbour, and a node without neighbours has
+    /// none. `y` are the rows of the nodes from `first` on.
+    fn correct_bias<T: Real>(&self, w: Weights<'_, T>, (graph, first): (&Graph, usize), y: &mut RowsMut<'_, T>) {
         let bias = self.last.bias(w);
-        for i in 0..nodes {
-            // The product added one bias per node. A sum has one bias per neighbour, and a node without neighbours has none.
-            let degree = graph.degree(i);
+        for (i, y) in y.data.chunks_mut(y.stride).take(y.len).enumerate() {
+            let degree = graph.degree(first + i);
             if degree == 0 {
-                y.data[i * stride..][..H].fill(T::ZERO);
+                y[..H].fill(T::ZERO);
             } else if !self.mean {
                 let more = T::from_f64((degree - 1) as f64);
-                y.data[i * stride..][..H].iter_mut().zip(bias).for_each(|(y, &b)| *y += more * b);
+                y[..H].iter_mut().zip(bias).for_each(|(y, &b)| *y += more * b);
             }
         }
     }
@@ -193,9 +208,10 @@ fn last_bias_back<T: Real>(graph: &Graph, mean: bool, dy: &mut [[T; H]], bias: &
     }
 }
 
-/// a_i = agg_j relu(LayerNorm(u_i + v_j)).
+/// a_i = agg_j relu(LayerNorm(u_i + v_j)) for the nodes from `first` on.
 struct Aggregate<'a, T> {
     graph: &'a Graph,
+    first: usize,
     mean: bool,
     affine: &'a Affine<T, W>,
     u: &'a [[T; W]],
@@ -211,7 +227,7 @@ impl<T: Real> WithRows<T> for Aggregate<'_, T> {
         for (i, (u, a)) in self.u.iter().zip(self.a).enumerate() {
             let u = edge_norm::load::<T, S, N>(simd, u);
             let mut sum = [T::splat(simd, T::ZERO); N];
-            let neighbours = self.graph.neighbours(i);
+            let neighbours = self.graph.neighbours(self.first + i);
             for (&j, stats) in neighbours.iter().zip(&mut stats) {
                 let x = edge_norm::add::<T, S, N>(simd, u, &edge_norm::load(simd, &self.v[j as usize]));
                 let s = edge_norm::stats::<T, S, N>(simd, &x);

@@ -28,6 +28,15 @@ impl Graph {
         (self.offsets[i + 1] - self.offsets[i]) as usize
     }
 
+    /// Values of edges in parts: those of the edges of `nodes` nodes each.
+    pub fn edge_parts<'a, V>(&'a self, mut values: &'a mut [V], nodes: usize) -> impl Iterator<Item = &'a mut [V]> {
+        let last = self.offsets.len() - 1;
+        (0..last).step_by(nodes).map(move |first| {
+            let edges = self.offsets[last.min(first + nodes)] - self.offsets[first];
+            values.split_off_mut(..values.len().min(edges as usize)).expect("at most all")
+        })
+    }
+
     /// Number of nodes of the first kind.
     pub fn first_kind_count(&self) -> usize {
         self.reach[0]

@@ -24,6 +24,7 @@ use crate::nn::{
     Batch, GraphLayer, Gru, HIDDEN, Init, LayerCache, LayerScratch, Linear, Mlp, MlpCache, ParameterLayout, Real, Rows, Weights,
     leaky_relu, leaky_relu_back, relu, relu_back,
 };
+use crate::threads;
 
 /// Sizes of the fleet and parameters of the environment that an agent is made for.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -302,13 +303,18 @@ impl Agent {
             Body::Graph { w1, w2, layers, head } => {
                 let graph = inputs.geometry.graph();
                 c.user_obs.resize(self.observation_width, rows - uavs);
-                let out = (c.user_obs.as_mut_slice(), self.observation_width);
-                self.observe(w, (inputs.geometry, uavs), &mut c.search, out);
                 c.y.resize_with(layers.len() + 1, Batch::default);
                 c.layers.resize_with(layers.len(), LayerCache::default);
                 c.y[0].resize(HIDDEN, rows);
                 w1.forward(w, h, c.y[0].range_mut(0..uavs));
-                w2.forward(w, c.user_obs.rows(), c.y[0].range_mut(uavs..rows));
+                let part = threads::part(rows - uavs);
+                let parts = c.user_obs.rows_mut().parts(part).zip(c.y[0].range_mut(uavs..rows).parts(part));
+                threads::for_each(parts.enumerate(), |(k, (observations, y))| {
+                    let out = (&mut *observations.data, self.observation_width);
+                    // Agents with a graph observe over one link, without a search.
+                    self.observe(w, (inputs.geometry, uavs + k * part), &mut HopSearch::default(), out);
+                    w2.forward(w, Rows { data: observations.data, stride: self.observation_width, len: y.len }, y);
+                });
                 leaky_relu(c.y[0].as_mut_slice());
                 for (l, layer) in layers.iter().enumerate() {
                     let [x, y] = &mut c.y[l..l + 2] else { unreachable!("one batch more than layers") };

@@ -12,6 +12,7 @@ use super::memory::{GRID, RememberedUser, UavMemory};
 use super::{EnvParams, FleetProfile, Place, Sight};
 use crate::env::Point;
 use crate::nn::simd;
+use crate::threads;
 
 /// Blocks of cells along each side of the square.
 pub(crate) const BLOCKS: usize = 10;
@@ -33,23 +34,26 @@ pub(crate) struct Weights {
 
 pub(crate) const WEIGHTS: Weights = Weights { foreign_sector: 0.02, search: 2.0, contested: 0.3, time_power: 1.25 };
 
-/// Calls `advise` with the index of each UAV of a fleet and the heading that it would fly in slot `slot`. `memories` are those of this
-/// slot.
+/// Writes the heading that each UAV of a fleet would fly in slot `slot`. `memories` are those of this slot.
 pub(super) fn sweep_headings<'a>(
     (env, sight, slot): (&EnvParams, &Sight<'_>, u64),
-    memories: impl Iterator<Item = UavMemory<'a>>,
+    memories: impl Iterator<Item = UavMemory<'a>> + Clone + Sync,
     profile: Option<&FleetProfile>,
-    mut advise: impl FnMut(usize, u8),
+    headings: &mut [u8],
 ) {
-    for (i, memory) in memories.enumerate() {
-        let place = FleetProfile::place(profile, i, sight.uavs());
-        let own = FleetProfile::env(profile, env, i);
-        let uav = Uav { env: &own, place, at: sight.positions[i], now: slot as f64 };
-        let serving = uav.best_user(memory.users().flatten(), sight.detected_uavs(i).map(|(_, at)| at));
-        let searching = uav.best_block(memory, memory.unknown_users(FleetProfile::is_open(profile)));
-        let best = if serving.score >= searching.score { serving } else { searching };
-        advise(i, Headings::new(env, uav.at).toward(best.position));
-    }
+    let part = threads::part(headings.len());
+    threads::for_each(headings.chunks_mut(part).enumerate(), |(k, headings)| {
+        let first = k * part;
+        for ((i, heading), memory) in (first..).zip(headings).zip(memories.clone().skip(first)) {
+            let place = FleetProfile::place(profile, i, sight.uavs());
+            let own = FleetProfile::env(profile, env, i);
+            let uav = Uav { env: &own, place, at: sight.positions[i], now: slot as f64 };
+            let serving = uav.best_user(memory.users().flatten(), sight.detected_uavs(i).map(|(_, at)| at));
+            let searching = uav.best_block(memory, memory.unknown_users(FleetProfile::is_open(profile)));
+            let best = if serving.score >= searching.score { serving } else { searching };
+            *heading = Headings::new(env, uav.at).toward(best.position);
+        }
+    });
 }
 
 /// A place to fly to.

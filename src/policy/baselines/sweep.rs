@@ -50,6 +50,6 @@ impl<const SHARED: bool> Rule for Sweep<SHARED> {
         let sharing = if SHARED { Sharing::Shared } else { Sharing::Own };
         memory::exclude_outside(env, sight.users(), memory);
         remember(&sight, env.detection_range, step, sharing, memory, &mut Exchange::default());
-        sweep_headings((env, &sight, step), memories(memory, graph.users()), profile, |i, heading| headings[i] = heading);
+        sweep_headings((env, &sight, step), memories(memory, graph.users()), profile, headings);
     }
 }

@@ -18,6 +18,7 @@ use super::sight::Sight;
 use super::sweep_plan::sweep_headings;
 use crate::env::Point;
 use crate::nn::simd;
+use crate::threads;
 
 /// Number of features of a goal.
 pub const FEATURES: usize = 16;
@@ -106,21 +107,52 @@ impl Goals {
     pub(super) fn push_advice<'a>(
         &mut self,
         slot: (&EnvParams, &Sight<'_>, u64),
-        memories: impl Iterator<Item = UavMemory<'a>>,
+        memories: impl Iterator<Item = UavMemory<'a>> + Clone + Sync,
         profile: Option<&FleetProfile>,
     ) {
-        sweep_headings(slot, memories, profile, |_, heading| self.advice.push(heading));
+        let first = self.advice.len();
+        self.advice.resize(first + slot.1.uavs(), 0);
+        sweep_headings(slot, memories, profile, &mut self.advice[first..]);
     }
 
     /// Adds one row per UAV of a fleet in slot `slot`. `memories` holds their memories, `last` their last
     /// headings.
     pub(super) fn push_fleet<'a>(
         &mut self,
-        (env, sight, slot): (&EnvParams, &Sight<'_>, u64),
-        memories: impl Iterator<Item = UavMemory<'a>>,
+        slot: (&EnvParams, &Sight<'_>, u64),
+        memories: impl Iterator<Item = UavMemory<'a>> + Clone + Sync,
         (last, profile): (&[u8], Option<&FleetProfile>),
     ) {
-        for ((i, memory), &last) in memories.enumerate().zip(last) {
+        let part = threads::part(last.len());
+        if part >= last.len() {
+            self.push_uavs(slot, (0, memories), (last, profile));
+            return;
+        }
+        let mut parts = vec![Self::default(); last.len().div_ceil(part)];
+        threads::for_each(parts.iter_mut().zip(last.chunks(part)).enumerate(), |(k, (goals, last))| {
+            goals.clear();
+            goals.push_uavs(slot, (k * part, memories.clone().skip(k * part)), (last, profile));
+        });
+        parts.iter().for_each(|part| self.append(part));
+    }
+
+    /// Adds the rows of other goals, without their advice.
+    fn append(&mut self, other: &Self) {
+        let first = self.headings.len() as u32;
+        self.offsets.extend(other.offsets[1..].iter().map(|end| first + end));
+        self.headings.extend_from_slice(&other.headings);
+        self.features.extend_from_slice(&other.features);
+        self.load.extend_from_slice(&other.load);
+    }
+
+    /// Adds one row for each UAV from `first` on, as many as `last` has headings.
+    fn push_uavs<'a>(
+        &mut self,
+        (env, sight, slot): (&EnvParams, &Sight<'_>, u64),
+        (first, memories): (usize, impl Iterator<Item = UavMemory<'a>>),
+        (last, profile): (&[u8], Option<&FleetProfile>),
+    ) {
+        for ((i, &last), memory) in (first..).zip(last).zip(memories) {
             let at = sight.positions[i];
             let place = FleetProfile::place(profile, i, sight.uavs());
             let open = FleetProfile::is_open(profile);

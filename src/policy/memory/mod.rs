@@ -16,6 +16,7 @@ use self::nearest::{Carrier, NearestUsers};
 use super::{Carry, EnvParams, Sight};
 use crate::env::Point;
 use crate::nn::simd;
+use crate::threads;
 
 /// Cells along each side of the unit square. A row of cells is an integer below 2^GRID, which f32 holds exactly.
 pub const GRID: usize = 20;
@@ -127,7 +128,7 @@ pub fn carry(from: &[f32], to: &mut [f32], carry: &Carry<'_>) {
 }
 
 /// The memories of a fleet in `numbers`, one per UAV.
-pub fn memories(numbers: &[f32], users: usize) -> impl Iterator<Item = UavMemory<'_>> {
+pub fn memories(numbers: &[f32], users: usize) -> impl Iterator<Item = UavMemory<'_>> + Clone {
     numbers.chunks_exact(uav_memory_len(users)).map(move |numbers| UavMemory::new(numbers, users))
 }
 
@@ -164,34 +165,50 @@ pub fn exclude_outside(env: &EnvParams, users: usize, memories: &mut [f32]) {
 #[derive(Clone, Debug, Default)]
 pub struct Exchange {
     all: AllUsers,
-    nearest: NearestUsers,
+    /// One per part of a fleet.
+    nearest: Vec<NearestUsers>,
+    /// The memories before the UAVs receive those of others.
+    before: Vec<f32>,
 }
 
 /// Advances the memories of a fleet, one after another in `memories`, to slot `slot`.
 pub fn remember(sight: &Sight<'_>, range: f64, slot: u64, sharing: Sharing, memories: &mut [f32], exchange: &mut Exchange) {
-    let Exchange { all, nearest } = exchange;
+    let Exchange { all, nearest, before } = exchange;
     let len = uav_memory_len(sight.users());
     let listed = sight.users() > MAX_REMEMBERED;
     // A user that should be detected and is not has moved away. The margin allows for rounding.
     let near = 0.99 * range;
-    for (i, memory) in memories.chunks_exact_mut(len).enumerate() {
-        simd(
-            #[inline(always)]
-            || search(sight.positions[i], range, &mut memory[..GRID]),
-        );
-        if listed {
-            nearest.observe(sight, i, near, slot as f32, memory);
-        } else {
-            observe(sight, i, near, slot as f32, memory);
+    let part = threads::part(sight.uavs());
+    nearest.resize_with(sight.uavs().div_ceil(part), NearestUsers::default);
+    let parts = nearest.iter_mut().zip(memories.chunks_mut(part * len)).enumerate();
+    threads::for_each(parts, |(k, (nearest, memories))| {
+        for (i, memory) in (k * part..).zip(memories.chunks_exact_mut(len)) {
+            simd(
+                #[inline(always)]
+                || search(sight.positions[i], range, &mut memory[..GRID]),
+            );
+            if listed {
+                nearest.observe(sight, i, near, slot as f32, memory);
+            } else {
+                observe(sight, i, near, slot as f32, memory);
+            }
         }
+    });
+    if sharing == Sharing::Own || sight.uavs() == 1 {
+        return;
     }
-    if sharing == Sharing::Shared && sight.uavs() > 1 {
-        if listed {
-            nearest.exchange(sight, memories);
-        } else {
-            all.exchange(sight, memories);
+    if !listed {
+        all.exchange(sight, memories);
+        return;
+    }
+    before.clear();
+    before.extend_from_slice(memories);
+    let parts = nearest.iter_mut().zip(memories.chunks_mut(part * len)).enumerate();
+    threads::for_each(parts, |(k, (nearest, memories))| {
+        for (i, memory) in (k * part..).zip(memories.chunks_exact_mut(len)) {
+            nearest.receive(sight, i, before, memory);
         }
-    }
+    });
 }
 
 /// Writes the users that UAV `i` detects into its memory, which has an entry for every user. Users remembered within `near` that it does

@@ -95,8 +95,6 @@ pub(super) struct NearestUsers {
     places: Vec<u32>,
     /// The entries from which the nearest are chosen.
     kept: Vec<Kept>,
-    /// The memories before an exchange.
-    before: Vec<f32>,
 }
 
 /// An entry of which it is decided whether it is kept: first those that are near, then those of a small index.
@@ -122,22 +120,17 @@ impl NearestUsers {
         self.keep_nearest(at, memory);
     }
 
-    /// Lets all UAVs of a fleet receive the memories of the UAVs that they detect. Of two entries for a user, the newer one wins.
-    pub(super) fn exchange(&mut self, sight: &Sight<'_>, memories: &mut [f32]) {
+    /// Lets UAV `i` receive the memories of the UAVs that it detects, from `before`, the memories of all. Of two entries for a user, the
+    /// newer one wins.
+    pub(super) fn receive(&mut self, sight: &Sight<'_>, i: usize, before: &[f32], memory: &mut [f32]) {
         let len = uav_memory_len(sight.users());
-        let mut before = std::mem::take(&mut self.before);
-        before.clear();
-        before.extend_from_slice(memories);
-        for (i, memory) in memories.chunks_exact_mut(len).enumerate() {
-            self.add(memory, sight.users());
-            for (j, _) in sight.detected_uavs(i) {
-                let other = &before[j * len..][..len];
-                merge_ground(memory, other);
-                self.add(other, sight.users());
-            }
-            self.keep_nearest(sight.positions[i], memory);
+        self.add(memory, sight.users());
+        for (j, _) in sight.detected_uavs(i) {
+            let other = &before[j * len..][..len];
+            merge_ground(memory, other);
+            self.add(other, sight.users());
         }
-        self.before = before;
+        self.keep_nearest(sight.positions[i], memory);
     }
 
     /// Adds the entries of a memory, except those that are not newer than the entry of the same user.

@@ -3,7 +3,8 @@
 //! A thread takes the next task (`queue` owns the order: fair by work, among callers and among sizes of fleets), adds waiting tasks of
 //! the same policy version, and computes them in one forward pass; results are bit-identical to computing each alone. By default a
 //! batch consists of the tasks that arrived while the threads were busy; no task waits for others to join. Heavy tasks have threads of
-//! their own, as many, with a lower priority: while they compute, others are served as fast as before.
+//! their own, as many, with a lower priority: while they compute, others are served as fast as before. A heavy task splits its large
+//! loops over as many threads again, which exist only as long as a loop.
 //!
 //! Handing a task to another thread and its result back takes longer than the forward pass of a small fleet. Small fleets are
 //! therefore computed inline, on the thread of the first caller among them, as long as no more than `threads`
@@ -34,6 +35,7 @@ use tokio::sync::oneshot;
 use tokio::sync::oneshot::error::TryRecvError;
 
 use super::{Error, Owner, Statistics};
+use crate::threads;
 
 /// Maximum work of a batch. A higher limit would delay small fleets that share a batch with large ones.
 const MAX_BATCH_WORK: usize = 1 << 17;
@@ -150,7 +152,9 @@ impl EngineState {
             let huge = batch.queued.iter().any(|queued| matches!(&queued.job, Job::Fleet { task, .. } if is_huge(task)));
             let alone = huge.then(|| self.huge.lock().unwrap_or_else(PoisonError::into_inner));
             let started = Instant::now();
-            batch.run(&self.metrics);
+            // What is light is shorter than it takes to start a thread.
+            let threads = if lane == Lane::Heavy { self.config.threads } else { 1 };
+            threads::allow(threads, || batch.run(&self.metrics));
             drop(alone);
             let mut state = self.lock();
             match lane {

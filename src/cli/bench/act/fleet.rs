@@ -11,10 +11,8 @@ pub(super) struct FleetConfig {
     policy: String,
     env: EnvConfig,
     observation: ObservationForm,
-    /// Detection range of the policy.
-    range: f64,
-    /// Factor of all lengths in requests.
-    scale: f64,
+    /// The world of the sessions, if it is not that of the policy.
+    world: Option<v1::World>,
 }
 
 impl FleetConfig {
@@ -24,11 +22,25 @@ impl FleetConfig {
     /// The number of UAVs or users is out of range.
     pub(super) fn new(args: &ActArgs, policy: &v1::Policy) -> anyhow::Result<Self> {
         let hover = policy.headings as usize > EnvConfig::COMPASS;
-        let env = EnvConfig { uavs: args.uavs, users: args.users, hover, start: Start::Random, ..EnvConfig::default() };
+        let default = EnvConfig::default();
+        let detection_range = args.range.unwrap_or(policy.detection_range);
+        let transmission_range = default.transmission_range * detection_range / default.detection_range;
+        let env = EnvConfig {
+            uavs: args.uavs,
+            users: args.users,
+            detection_range,
+            transmission_range,
+            hover,
+            start: Start::Random,
+            ..default
+        };
         env.validate()?;
-        let range = policy.detection_range;
-        let scale = args.range.map_or(1.0, |requested| range / requested);
-        Ok(Self { policy: args.policy.clone(), env, observation: args.observation, range, scale })
+        let world = args.range.map(|_| v1::World {
+            detection_range: Some(detection_range),
+            transmission_range: Some(transmission_range),
+            ..Default::default()
+        });
+        Ok(Self { policy: args.policy.clone(), env, observation: args.observation, world })
     }
 }
 
@@ -39,7 +51,6 @@ pub(super) struct SimulatedFleet {
     session: String,
     observation: ObservationForm,
     range: f64,
-    scale: f64,
     graph: FleetGraph,
     uavs: Vec<String>,
     users: Vec<String>,
@@ -56,8 +67,7 @@ impl SimulatedFleet {
             run: 0,
             session,
             observation: config.observation,
-            range: config.range,
-            scale: config.scale,
+            range: config.env.detection_range,
             graph: FleetGraph::default(),
             uavs: (0..config.env.uavs).map(|i| format!("uav-{i}")).collect(),
             users: (0..config.env.users).map(|i| format!("user-{i}")).collect(),
@@ -77,6 +87,7 @@ impl SimulatedFleet {
             session_id,
             run_id: Some(self.run_id()),
             seed: Some(self.episode.seed()),
+            world: config.world,
             ..Default::default()
         }
     }
@@ -87,8 +98,7 @@ impl SimulatedFleet {
 
     /// The request of the current slot.
     pub(super) fn request(&mut self) -> v1::ActRequest {
-        let scaled = |points: Vec<Point>| -> Vec<Point> { points.into_iter().map(|p| p.map(|x| x * self.scale)).collect() };
-        let (uavs, users) = (scaled(self.episode.uavs()), scaled(self.episode.users()));
+        let (uavs, users) = (self.episode.uavs(), self.episode.users());
         let observation = match self.observation {
             ObservationForm::Scene => Sent::Scene(self.scene(&uavs, &users)),
             ObservationForm::Graph => Sent::Graph(self.graph(&uavs, &users)),
@@ -143,7 +153,19 @@ impl SimulatedFleet {
     /// # Errors
     /// `response` does not have one heading per UAV.
     pub(super) fn step(&mut self, response: &v1::ActResponse) -> anyhow::Result<()> {
-        let headings: Vec<u8> = response.actions.iter().map(|a| a.heading_index as u8).collect();
+        self.fly(response.actions.iter().map(|action| action.heading_index as u8).collect())
+    }
+
+    /// Moves the UAVs in circles: they stay apart, so the requests keep about their size.
+    ///
+    /// # Errors
+    /// Never.
+    pub(super) fn circle(&mut self) -> anyhow::Result<()> {
+        let slot = self.episode.slot();
+        self.fly((0..self.uavs.len()).map(|uav| ((uav + slot) % EnvConfig::COMPASS) as u8).collect())
+    }
+
+    fn fly(&mut self, headings: Vec<u8>) -> anyhow::Result<()> {
         self.episode.step(&headings)?;
         if self.episode.done() {
             self.next_episode();
@@ -162,15 +184,15 @@ impl SimulatedFleet {
 mod tests {
     use super::*;
 
-    fn fleet(observation: ObservationForm, scale: f64) -> SimulatedFleet {
-        let env = EnvConfig { slots: 2, start: Start::Random, ..EnvConfig::default() };
-        let config = FleetConfig { policy: "qedgix".into(), env, observation, range: 0.28, scale };
+    fn fleet(observation: ObservationForm, detection_range: f64) -> SimulatedFleet {
+        let env = EnvConfig { slots: 2, start: Start::Random, detection_range, ..EnvConfig::default() };
+        let config = FleetConfig { policy: "qedgix".into(), env, observation, world: None };
         SimulatedFleet::new(&config, "s".into(), 1).expect("a small fleet")
     }
 
     #[test]
     fn each_episode_has_its_own_run_id() {
-        let mut fleet = fleet(ObservationForm::Scene, 1.0);
+        let mut fleet = fleet(ObservationForm::Scene, 0.28);
         let response = v1::ActResponse { actions: vec![v1::Action::default(); 3], ..Default::default() };
         let sent: Vec<_> = (0..5)
             .map(|_| {
@@ -185,18 +207,27 @@ mod tests {
     }
 
     #[test]
-    fn scaling_changes_positions_and_detections() {
-        let nodes = |scale| match fleet(ObservationForm::Graph, scale).request().observation {
+    fn detections_follow_the_range_and_users_have_none_of_their_own() {
+        let nodes = |range| match fleet(ObservationForm::Graph, range).request().observation {
             Some(Sent::Graph(graph)) => graph.nodes,
             _ => unreachable!("the observation is a graph"),
         };
-        let (near, far) = (nodes(0.5), nodes(20.0));
+        let (near, far) = (nodes(0.12), nodes(1.0));
         assert_eq!((near.len(), far.len()), (8, 8));
         let detections = |nodes: &[v1::Node]| nodes.iter().map(|n| n.detections.len()).sum::<usize>();
-        assert!(detections(&near) > detections(&far));
-        let at = |nodes: &[v1::Node]| nodes[0].position.expect("UAVs have a position").x;
-        assert_eq!(at(&near) * 40.0, at(&far));
-        assert!(near.iter().flat_map(|n| &n.detections).all(|d| d.rel_x.hypot(d.rel_y) <= 0.28 * (1.0 + 1e-6)));
-        assert!(near[3..].iter().all(|n| n.detections.is_empty() && n.aoi.is_some()));
+        assert!(detections(&near) < detections(&far));
+        assert_eq!(near[0].position, far[0].position);
+        assert!(far.iter().flat_map(|n| &n.detections).all(|d| d.rel_x.hypot(d.rel_y) <= 1.0 + 1e-6));
+        assert!(far[3..].iter().all(|n| n.detections.is_empty() && n.aoi.is_some()));
+    }
+
+    #[test]
+    fn a_fleet_that_circles_is_after_eight_slots_where_it_was() {
+        let env = EnvConfig { speed: 0.001, start: Start::Random, ..EnvConfig::default() };
+        let config = FleetConfig { policy: "qedgix".into(), env, observation: ObservationForm::Scene, world: None };
+        let mut fleet = SimulatedFleet::new(&config, "s".into(), 1).expect("a small fleet");
+        let before = fleet.episode.uavs();
+        (0..8).for_each(|_| fleet.circle().expect("as many headings as UAVs"));
+        assert!(before.iter().zip(fleet.episode.uavs()).all(|(a, b)| (a[0] - b[0]).hypot(a[1] - b[1]) < 1e-6));
     }
 }

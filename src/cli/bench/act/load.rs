@@ -35,21 +35,28 @@ pub(super) struct LoadClient {
     fleet: SimulatedFleet,
     server: PolicyClient,
     stream: Option<(mpsc::Sender<v1::ActRequest>, Streaming<v1::ActResult>)>,
+    /// Whether the fleet follows the responses; otherwise it circles.
+    follows: bool,
 }
 
 impl LoadClient {
-    /// Creates a client of an open session. With `stream`, opens an `ActStream`.
+    /// Creates a client of an open session. With `stream`, opens an `ActStream`. `follows`: whether the fleet follows the responses;
+    /// otherwise it circles.
     ///
     /// # Errors
     /// The server refuses the stream.
-    pub(super) async fn new(mut server: PolicyClient, fleet: SimulatedFleet, stream: bool) -> Result<Self, Status> {
+    pub(super) async fn new(
+        mut server: PolicyClient,
+        fleet: SimulatedFleet,
+        (stream, follows): (bool, bool),
+    ) -> Result<Self, Status> {
         let stream = if stream {
             let (sender, requests) = mpsc::channel(1);
             Some((sender, server.act_stream(ReceiverStream::new(requests)).await?.into_inner()))
         } else {
             None
         };
-        Ok(Self { fleet, server, stream })
+        Ok(Self { fleet, server, stream, follows })
     }
 
     /// Closes the session.
@@ -81,7 +88,7 @@ impl LoadClient {
         match self.send(request).await {
             Ok(response) => {
                 samples.latencies.push(begin.elapsed());
-                self.fleet.step(&response)?;
+                if self.follows { self.fleet.step(&response)? } else { self.fleet.circle()? }
             }
             Err(code) => {
                 samples.fail(code_name(code));

@@ -60,8 +60,8 @@ pub struct ActArgs {
     /// Form of the observations
     #[arg(long, env = "QEDGIX_OBSERVATION", default_value = "scene", value_enum)]
     observation: ObservationForm,
-    /// Detection range in units of the square's side: lengths in requests are scaled so that the policy's range corresponds to
-    /// this one [default: the policy's range, unscaled]
+    /// Detection range of the sessions' world, in sides of the square; the transmission range is 3/7 of it [default: the world of
+    /// the policy]
     #[arg(long, env = "QEDGIX_RANGE")]
     range: Option<f64>,
     /// Open loop: Acts per second of all sessions together, with latencies from the time at which each is due [default: closed
@@ -284,7 +284,7 @@ async fn clients(args: &ActArgs, address: &str, config: &FleetConfig, is_server:
         if is_server {
             server.open_session(fleet.open_request(config)).await.map_err(status_error)?;
         }
-        clients.push(LoadClient::new(server, fleet, args.stream).await.map_err(status_error)?);
+        clients.push(LoadClient::new(server, fleet, (args.stream, is_server)).await.map_err(status_error)?);
     }
     Ok(clients)
 }
