@@ -3,10 +3,14 @@
 //! `api::convert` builds a [`FleetInput`] and checks everything that does not depend on the policy. This file applies the
 //! policy's detection range and needs: it computes the detections of a scene, and completes a graph.
 
+use std::ops::Range;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
 use super::FleetIds;
 use crate::env::{Point, Ranges};
 use crate::invalid::Invalid;
 use crate::policy::{Detection, FleetGraph, Policy, RequiredInput, estimate_detections};
+use crate::threads;
 
 /// Maximum number of nodes of one fleet.
 pub const MAX_NODES: usize = 20_000;
@@ -386,27 +390,45 @@ impl ReportedGraph {
     /// Example: UAV 0 detects users 1 and 2 at (0.1, 0) and (0.3, 0). With a range of 0.25, user 1 detects user 2 at (0.2, 0),
     /// and user 2 detects user 1 at (-0.2, 0).
     fn derive_user_detections(&self, range: f64) -> Result<Vec<Vec<Detection>>, Invalid> {
-        let (uavs, users) = (self.positions.len(), self.aoi.len());
-        let mut total: usize = self.detections.iter().map(Vec::len).sum();
-        if total > MAX_DETECTIONS {
-            return Err(too_many_detections("graph"));
-        }
+        let users = self.aoi.len();
+        let total = AtomicUsize::new(self.detections.iter().map(Vec::len).sum());
         let mut derived = vec![Vec::new(); users];
-        if !self.without_detections.contains(&true) {
-            return Ok(derived);
+        if self.without_detections.contains(&true) {
+            let part = threads::part(users);
+            let mut parts = vec![Vec::new(); users.div_ceil(part)];
+            let of_uavs = self.detections[..self.positions.len()].iter();
+            let by_uav: Vec<DetectedUsers> = of_uavs.map(|list| DetectedUsers::new(list, self.positions.len(), users)).collect();
+            threads::for_each(parts.iter_mut().enumerate(), |(k, pairs)| {
+                self.derive_pairs((k * part..users.min((k + 1) * part), &by_uav), range, &total, pairs);
+            });
+            let node = |user: u32| self.positions.len() as u32 + user;
+            for UserPair { users: [j, k], rel } in parts.into_iter().flatten() {
+                derived[j as usize].push(Detection { target: node(k), rel });
+                derived[k as usize].push(Detection { target: node(j), rel: rel.map(|x| 0.0 - x) });
+            }
         }
-        // Bit set of the users without detections. A pair of two such users is examined once, for the first of the two.
+        if total.into_inner() > MAX_DETECTIONS { Err(too_many_detections("graph")) } else { Ok(derived) }
+    }
+
+    /// Adds the pairs of users of which the first, among `first_users`, is one without detections. A pair of two such users is found
+    /// once, for the first of the two. Stops when `total`, the number of detections, is more than [`MAX_DETECTIONS`].
+    fn derive_pairs(
+        &self,
+        (first_users, by_uav): (Range<usize>, &[DetectedUsers]),
+        range: f64,
+        total: &AtomicUsize,
+        pairs: &mut Vec<UserPair>,
+    ) {
+        let (uavs, users) = (self.positions.len(), self.aoi.len());
         let mut all_without = vec![0_u64; users.div_ceil(64)];
         for j in (0..users).filter(|&j| self.without_detections[j]) {
             all_without[j / 64] |= 1 << (j % 64);
         }
-        let by_uav: Vec<DetectedUsers> =
-            self.detections[..uavs].iter().map(|list| DetectedUsers::new(list, uavs, users)).collect();
         // Bit sets of users, for each user j: those that need not be examined, and those that j detects.
         let mut skip = vec![0_u64; users.div_ceil(64)];
         let mut detected = vec![0_u64; skip.len()];
         let mut rels = vec![[0.0_f32; 2]; users];
-        for j in (0..users).filter(|&j| self.without_detections[j]) {
+        for j in first_users.filter(|&j| self.without_detections[j]) {
             let reported = &self.detections[uavs + j];
             skip.fill(0);
             detected.fill(0);
@@ -434,22 +456,29 @@ impl ReportedGraph {
                     }
                 }
             }
+            let before = pairs.len();
             for (word, &detected) in detected.iter().enumerate() {
                 let mut rest = detected;
                 while rest != 0 {
                     let k = word * 64 + rest.trailing_zeros() as usize;
                     rest &= rest - 1;
-                    derived[j].push(Detection { target: (uavs + k) as u32, rel: rels[k] });
-                    derived[k].push(Detection { target: (uavs + j) as u32, rel: rels[k].map(|x| 0.0 - x) });
-                    total += 2;
+                    pairs.push(UserPair { users: [j as u32, k as u32], rel: rels[k] });
                 }
             }
-            if total > MAX_DETECTIONS {
-                return Err(too_many_detections("graph"));
+            let added = 2 * (pairs.len() - before);
+            if total.fetch_add(added, Ordering::Relaxed) + added > MAX_DETECTIONS {
+                return;
             }
         }
-        Ok(derived)
     }
+}
+
+/// Two users that detect each other.
+#[derive(Clone, Copy, Debug)]
+struct UserPair {
+    users: [u32; 2],
+    /// Position of the second, relative to the first.
+    rel: [f32; 2],
 }
 
 /// The users that one UAV detects, as a bit set with coordinates.

@@ -16,6 +16,7 @@ use qedgix::policy::{
     Identity, LearnedPolicy, Memory, ObservationKind, Policy, RequiredInput, StepInput, TOKEN, Trained,
 };
 use qedgix::rng;
+use qedgix::threads;
 use rand::RngExt;
 use sample::{AGENT, episodes};
 
@@ -77,7 +78,7 @@ impl Fleet {
 }
 
 #[test]
-fn batching_does_not_change_a_bit_of_the_result() {
+fn neither_batching_nor_threads_change_a_bit_of_the_result() {
     let variants = [
         SET,
         AgentConfig { identity: Identity::Token, self_loops: true, layers: 3, ..SET },
@@ -91,18 +92,21 @@ fn batching_does_not_change_a_bit_of_the_result() {
     ];
     for config in variants {
         let policy = learned(config);
-        let sizes = [(1, 1), (3, 5), (2, 0), (9, 4), (1, 12), (4, 40), (20, 3)];
+        // Users that a memory has no room for are the last size.
+        let sizes = [(1, 1), (3, 5), (2, 0), (9, 4), (1, 12), (4, 40), (20, 3), (5, 300)];
         let fleets =
             || -> Vec<Fleet> { (0..).zip(sizes).map(|(seed, (uavs, users))| Fleet::new(&policy, uavs, users, seed)).collect() };
-        let (mut single, mut batch, mut reversed) = (fleets(), fleets(), fleets());
+        let (mut single, mut batch, mut reversed, mut split) = (fleets(), fleets(), fleets(), fleets());
         for _ in 0..3 {
             single.iter_mut().for_each(|fleet| policy.act(&mut [fleet.turn()]));
             policy.act(&mut batch.iter_mut().map(Fleet::turn).collect::<Vec<_>>());
             policy.act(&mut reversed.iter_mut().rev().map(Fleet::turn).collect::<Vec<_>>());
+            threads::allow(3, || split.iter_mut().for_each(|fleet| policy.act(&mut [fleet.turn()])));
         }
-        for ((a, b), c) in single.iter().zip(&batch).zip(&reversed) {
+        for (((a, b), c), d) in single.iter().zip(&batch).zip(&reversed).zip(&split) {
             assert_eq!(a.bits(), b.bits(), "{config:?}");
             assert_eq!(a.bits(), c.bits(), "{config:?}");
+            assert_eq!(a.bits(), d.bits(), "{config:?}, on three threads");
         }
     }
 }

@@ -3,6 +3,7 @@
 use bytes::Bytes;
 use qedgix::policy::FleetStep;
 use qedgix::serving::{FleetInput, Resolved};
+use qedgix::threads;
 use qedgix::wire::v1;
 
 use super::harness::*;
@@ -32,6 +33,8 @@ async fn thousand_uavs_and_ten_thousand_users_are_answered() {
     let graph = graph(&scene, policy.env().detection_range, false);
     let slot = FleetInput::try_from(graph.clone()).unwrap().into_fleet_graph(&**policy).unwrap();
     let whole = FleetInput::try_from(scene.clone()).unwrap().into_fleet_graph(&**policy).unwrap();
+    let split = threads::allow(3, || FleetInput::try_from(graph.clone()).unwrap().into_fleet_graph(&**policy).unwrap());
+    assert!(slot == split, "as on one thread");
     // UAVs have the same detections in both forms. Users detect the nodes that the detections of UAVs imply.
     for uav in 0..uavs {
         assert_eq!(slot.detections(uav), whole.detections(uav), "UAV {uav}");
