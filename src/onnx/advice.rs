@@ -1,7 +1,7 @@
 //! The headings that the rule `sweep` advises (docs/model.md, "Advice") as ONNX operators. The formulas and the order of their
 //! operations are those of `policy::sweep_plan`, so scores have the same bits, and of equal ones the same is the first.
 
-use super::goals::{distances, headings_toward};
+use super::goals::{distances, headings_toward, owned};
 use super::graph::{Graph, Tensor};
 use super::memory::{Memory, Sight};
 use super::network::Network;
@@ -28,12 +28,14 @@ pub(super) struct Advice {
 }
 
 impl Network<'_> {
-    /// The advice from what the UAVs remember. `place` (M) are rows of the tables of places.
+    /// The advice from what the UAVs remember. `place` (M) are rows of the tables of places, `sectors` (M, 6) the bounds of the UAVs'
+    /// sectors.
     pub(super) fn advice(
         &mut self,
         memory: &Memory,
         sight: &Sight,
-        (positions, slot, place): (&Tensor, &Tensor, &Tensor),
+        (positions, slot): (&Tensor, &Tensor),
+        (place, sectors): (&Tensor, &Tensor),
     ) -> Advice {
         let env = self.agent.dims().env;
         let bias = self.constant("agent.advice");
@@ -49,7 +51,7 @@ impl Network<'_> {
 
         let users = g.slice(&memory.users, 2, 1, 3);
         let users = g.cast(&users, DataType::Double);
-        let serving = user_scores(g, &env, (memory, sight), (&users, &known), (positions, slot));
+        let serving = user_scores(g, &env, (memory, sight), (&users, &known), (positions, slot, sectors));
         let searching = block_scores(g, &env, (&memory.ground, &unknown), (positions, slot, place));
         // Of equal scores, the first is the best; a UAV with nothing to do flies to the centre.
         let nothing = g.times(&unknown, 0.0);
@@ -113,7 +115,7 @@ fn user_scores(
     env: &EnvParams,
     (memory, sight): (&Memory, &Sight),
     (users, known): (&Tensor, &Tensor),
-    (positions, slot): (&Tensor, &Tensor),
+    (positions, slot, sectors): (&Tensor, &Tensor, &Tensor),
 ) -> Tensor {
     let collected = g.column(&memory.users, 3);
     let collected = g.cast(&collected, DataType::Double);
@@ -125,7 +127,12 @@ fn user_scores(
     let time = g.with("Pow", &slots, &power);
     let score = g.with("Div", &age, &time);
     let [mine, nearest] = distances(g, sight, positions, users);
-    let contested = g.with("Less", &nearest, &mine);
+    let nearer = g.with("Less", &nearest, &mine);
+    let foreign = owned(g, users, sectors);
+    let foreign = g.map("Not", &foreign);
+    let as_near = g.with("Equal", &nearest, &mine);
+    let foreign = g.with("And", &as_near, &foreign);
+    let contested = g.with("Or", &nearer, &foreign);
     let (one, less, zero) = (g.double(1.0), g.double(WEIGHTS.contested), g.double(0.0));
     let weight = g.choose(&contested, &less, &one);
     let score = g.with("Mul", &score, &weight);

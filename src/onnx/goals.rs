@@ -241,6 +241,7 @@ impl Ground {
         let rate = g.with("Mul", &expected, &age);
         let rate = g.with("Div", &rate, &slots);
         let own = owned(g, &self.centers, sectors);
+        let own = g.indicator(&own);
         let zeros = g.times(&slots, 0.0);
         let one = g.double(1.0);
         [zeros, g.ln1(&slots), g.with("Div", &one, &slots), g.ln1(&age), g.ln1(&rate), g.ln1(&expected), own]
@@ -248,7 +249,7 @@ impl Ground {
 }
 
 /// Whether points (M, B, 2) are in the sectors of the UAVs (M, 6): directions of the middle, of the end and of the start.
-fn owned(g: &mut Graph, points: &Tensor, sectors: &Tensor) -> Tensor {
+pub(super) fn owned(g: &mut Graph, points: &Tensor, sectors: &Tensor) -> Tensor {
     let middle = g.double(0.5);
     let points = g.with("Sub", points, &middle);
     let [x, y] = g.xy(&points);
@@ -272,8 +273,7 @@ fn owned(g: &mut Graph, points: &Tensor, sectors: &Tensor) -> Tensor {
     let after_start = g.with("GreaterOrEqual", &from_start, &zero);
     let is_right = g.map("Not", &is_left);
     let (left, right) = (g.with("And", &is_left, &before_end), g.with("And", &is_right, &after_start));
-    let owned = g.with("Or", &left, &right);
-    g.indicator(&owned)
+    g.with("Or", &left, &right)
 }
 
 /// The headings towards `targets` (M, G, 2), and the features that follow from heading and distance: (M, G) each.

@@ -178,8 +178,8 @@ fn knowledge(
     let slot = n.g.cast(slot, DataType::Double);
     let sight = n.sight(edges, position);
     let memory = n.remember(before, &sight, (position, aoi, &slot));
-    let advice = (!config.advice.is_none()).then(|| n.advice(&memory, &sight, (position, &slot, place)));
     let sectors = places::sectors(&mut n.g, place);
+    let advice = (!config.advice.is_none()).then(|| n.advice(&memory, &sight, (position, &slot), (place, &sectors)));
     let advised = advice.as_ref().map(|advice| &advice.headings);
     let goals = n.goals(&memory, &sight, (position, &slot, &sectors), (last, advised));
     Some(Knowledge { memory, advice, goals })

@@ -26,7 +26,8 @@ pub(crate) struct Weights {
     /// Weight of the AoI expected in cells that were not searched relative to known AoI: a user that is found can be served many
     /// times.
     pub(crate) search: f64,
-    /// Weight of a user to whom a detected UAV is nearer.
+    /// Weight of a user to whom a detected UAV is nearer, or as near while the user is not in the UAV's own sector: UAVs in one place
+    /// part.
     pub(crate) contested: f64,
     /// AoI is divided by the flight time to this power. Above 1, near users are preferred.
     pub(crate) time_power: f64,
@@ -83,7 +84,8 @@ impl Uav<'_> {
             let to = user.position;
             let slots = travel_slots(self.env, self.at, to, self.env.transmission_range);
             let age = self.now - f64::from(user.collected) + slots;
-            let contested = uavs.clone().any(|r| distance(r, to) < distance(self.at, to));
+            let (own, nearest) = (distance(self.at, to), uavs.clone().map(|r| distance(r, to)).fold(f64::INFINITY, f64::min));
+            let contested = nearest < own || nearest == own && !self.place.owns(to);
             let score = age / time_weight(slots) * if contested { WEIGHTS.contested } else { 1.0 };
             if score > best.score {
                 best = Candidate { score, position: to };
