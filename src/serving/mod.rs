@@ -23,6 +23,7 @@ mod roster;
 mod sessions;
 mod statistics;
 mod table;
+mod user_detections;
 
 pub use engine::{Decision, Engine, EngineConfig, NamedInfluence, OutputBuffers, Task, TaskOutput, Timings};
 pub use environments::{
