@@ -13,11 +13,8 @@ fn policy(name: &str) -> Arc<dyn Policy> {
 }
 
 fn flown(name: &str, env: &EnvConfig, episodes: usize) -> Vec<EpisodeMetrics> {
-    evaluate(&*policy(name), env, &seeds(episodes), 1).unwrap()
-}
-
-fn seeds(episodes: usize) -> Vec<u64> {
-    layout_list("eval-v1").unwrap().seeds(episodes)
+    let policy = baselines::by_name(name, EnvParams::from(env)).unwrap();
+    evaluate(&*policy, env, &layout_list("eval-v1").unwrap().seeds(episodes), 1).unwrap()
 }
 
 fn mean(episodes: &[EpisodeMetrics]) -> f64 {
@@ -65,10 +62,7 @@ fn mean_aoi_for_the_sizes_of_the_paper() {
 #[test]
 fn sweep_serves_better_the_more_it_detects_and_uavs_that_start_together_part() {
     for name in ["sweep", "sweep-shared"] {
-        let with_range = |detection_range: f64| {
-            let env = EnvConfig { detection_range, ..EnvConfig::default() };
-            mean(&evaluate(&*baselines::by_name(name, EnvParams::from(&env)).unwrap(), &env, &seeds(64), 1).unwrap())
-        };
+        let with_range = |detection_range: f64| mean(&flown(name, &EnvConfig { detection_range, ..EnvConfig::default() }, 64));
         let (near, wide, all) = (with_range(0.28), with_range(0.5), with_range(1.5));
         assert!(wide < 0.6 * near && all < 0.6 * near, "{name}: {near}, {wide}, {all}");
     }

@@ -17,40 +17,45 @@ impl ReportedGraph {
     /// Example: UAV 0 detects users 1 and 2 at (0.1, 0) and (0.3, 0). With a range of 0.25, user 1 detects user 2 at (0.2, 0),
     /// and user 2 detects user 1 at (-0.2, 0).
     pub(super) fn derive_user_detections(&self, range: f64) -> Result<Vec<Vec<Detection>>, Invalid> {
-        let users = self.aoi.len();
+        let (uavs, users) = (self.positions.len(), self.aoi.len());
         let total = AtomicUsize::new(self.detections.iter().map(Vec::len).sum());
+        let check = || if total.load(Ordering::Relaxed) > MAX_DETECTIONS { Err(too_many_detections("graph")) } else { Ok(()) };
+        check()?;
         let mut derived = vec![Vec::new(); users];
-        if self.without_detections.contains(&true) {
-            let part = threads::part(users);
-            let mut parts = vec![Vec::new(); users.div_ceil(part)];
-            let of_uavs = self.detections[..self.positions.len()].iter();
-            let by_uav: Vec<DetectedUsers> = of_uavs.map(|list| DetectedUsers::new(list, self.positions.len(), users)).collect();
-            threads::for_each(parts.iter_mut().enumerate(), |(k, pairs)| {
-                self.derive_pairs((k * part..users.min((k + 1) * part), &by_uav), range, &total, pairs);
-            });
-            let node = |user: u32| self.positions.len() as u32 + user;
-            for UserPair { users: [j, k], rel } in parts.into_iter().flatten() {
-                derived[j as usize].push(Detection { target: node(k), rel });
-                derived[k as usize].push(Detection { target: node(j), rel: rel.map(|x| 0.0 - x) });
-            }
+        if !self.without_detections.contains(&true) {
+            return Ok(derived);
         }
-        if total.into_inner() > MAX_DETECTIONS { Err(too_many_detections("graph")) } else { Ok(derived) }
+        // Bit set of the users without detections.
+        let mut all_without = vec![0_u64; users.div_ceil(64)];
+        for j in (0..users).filter(|&j| self.without_detections[j]) {
+            all_without[j / 64] |= 1 << (j % 64);
+        }
+        let by_uav: Vec<DetectedUsers> =
+            self.detections[..uavs].iter().map(|list| DetectedUsers::new(list, uavs, users)).collect();
+        let part = threads::part(users);
+        let mut parts = vec![Vec::new(); users.div_ceil(part)];
+        threads::for_each(parts.iter_mut().enumerate(), |(k, pairs)| {
+            self.derive_pairs(k * part..users.min((k + 1) * part), (&all_without, &by_uav), (range, &total), pairs);
+        });
+        check()?;
+        let node = |user: u32| uavs as u32 + user;
+        for UserPair { users: [j, k], rel } in parts.into_iter().flatten() {
+            derived[j as usize].push(Detection { target: node(k), rel });
+            derived[k as usize].push(Detection { target: node(j), rel: rel.map(|x| 0.0 - x) });
+        }
+        Ok(derived)
     }
 
     /// Adds the pairs of users of which the first, among `first_users`, is one without detections. A pair of two such users is found
     /// once, for the first of the two. Stops when `total`, the number of detections, is more than [`MAX_DETECTIONS`].
     fn derive_pairs(
         &self,
-        (first_users, by_uav): (Range<usize>, &[DetectedUsers]),
-        range: f64,
-        total: &AtomicUsize,
+        first_users: Range<usize>,
+        (all_without, by_uav): (&[u64], &[DetectedUsers]),
+        (range, total): (f64, &AtomicUsize),
         pairs: &mut Vec<UserPair>,
     ) {
         let (uavs, users) = (self.positions.len(), self.aoi.len());
-        let mut all_without = vec![0_u64; users.div_ceil(64)];
-        for j in (0..users).filter(|&j| self.without_detections[j]) {
-            all_without[j / 64] |= 1 << (j % 64);
-        }
         // Bit sets of users, for each user j: those that need not be examined, and those that j detects.
         let mut skip = vec![0_u64; users.div_ceil(64)];
         let mut detected = vec![0_u64; skip.len()];

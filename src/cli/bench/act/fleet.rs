@@ -50,7 +50,6 @@ pub(super) struct SimulatedFleet {
     run: u64,
     session: String,
     observation: ObservationForm,
-    range: f64,
     graph: FleetGraph,
     uavs: Vec<String>,
     users: Vec<String>,
@@ -67,7 +66,6 @@ impl SimulatedFleet {
             run: 0,
             session,
             observation: config.observation,
-            range: config.env.detection_range,
             graph: FleetGraph::default(),
             uavs: (0..config.env.uavs).map(|i| format!("uav-{i}")).collect(),
             users: (0..config.env.users).map(|i| format!("user-{i}")).collect(),
@@ -123,7 +121,7 @@ impl SimulatedFleet {
     /// The detections of the UAVs. The server derives those of the users.
     fn graph(&mut self, uavs: &[Point], users: &[Point]) -> v1::Graph {
         let aoi = self.episode.aoi();
-        self.graph.set_scene(uavs, users, aoi, self.range);
+        self.graph.set_scene(uavs, users, aoi, self.episode.config().detection_range);
         let detection = |d: &crate::policy::Detection| {
             let target = d.target as usize;
             let (id, aoi) = match target.checked_sub(uavs.len()) {
