@@ -149,9 +149,8 @@ fn block_scores(
     (positions, slot, place): (&Tensor, &Tensor, &Tensor),
 ) -> Tensor {
     let side = GRID / BLOCKS;
-    let ground = g.cast(ground, DataType::Double);
     let (zero, one) = (g.double(0.0), g.double(1.0));
-    let cells = g.with("Sub", &one, &ground);
+    let cells = g.unsearched(ground);
     let shape = g.list(&[-1, BLOCKS as i64, side as i64, BLOCKS as i64, side as i64]);
     let cells = g.reshape(&cells, &shape);
     let cells = g.sum(&cells, &[2, 4], false);

@@ -184,9 +184,7 @@ struct Ground {
 
 impl Ground {
     fn new(g: &mut Graph, ground: &Tensor) -> Self {
-        let ground = g.cast(ground, DataType::Double);
-        let one = g.double(1.0);
-        let cells = g.with("Sub", &one, &ground);
+        let cells = g.unsearched(ground);
         let (grid, side, blocks) = (GRID as i64, SIDE as i64, BLOCKS as i64);
         let numbers: Vec<f64> = (0..GRID).map(|k| k as f64).collect();
         let (columns, rows) = (g.doubles(&[1, grid], &numbers), g.doubles(&[grid, 1], &numbers));

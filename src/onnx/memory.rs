@@ -3,12 +3,12 @@
 
 use super::graph::{Graph, Tensor};
 use super::network::{Edges, Network};
-use crate::policy::memory::{GRID, Sharing};
+use crate::policy::memory::{GRID, SEARCH_AGAIN_FROM, Sharing};
 use crate::wire::onnx::tensor_proto::DataType;
 
 /// The memory of all UAVs.
 pub(super) struct Memory {
-    /// Whether each cell was searched, as 0 or 1, (M, 20, 20): rows, then columns.
+    /// 0, or 1 + the slot in which the search began that found this cell searched, (M, 20, 20): rows, then columns.
     pub(super) ground: Tensor,
     /// (M, N, 5): state, x, y, slot of the last collection, slot of the observation.
     pub(super) users: Tensor,
@@ -65,15 +65,16 @@ impl Network<'_> {
         (positions, aoi, slot): (&Tensor, &Tensor, &Tensor),
     ) -> Memory {
         let own = Memory {
-            ground: self.search(&before.ground, positions),
+            ground: self.search(before, positions, slot),
             users: self.observe(&before.users, sight, (positions, aoi, slot)),
         };
         if self.agent.config().memory.sharing() == Some(Sharing::Shared) { self.exchange(&own, sight) } else { own }
     }
 
-    /// Marks the cells whose centres are in range.
-    fn search(&mut self, ground: &Tensor, positions: &Tensor) -> Tensor {
+    /// Marks the cells whose centres are in range, in the present search or in a new one.
+    fn search(&mut self, before: &Memory, positions: &Tensor, slot: &Tensor) -> Tensor {
         let range = self.agent.dims().env.detection_range;
+        let again = self.begins_search(before, slot);
         let g = &mut self.g;
         let centers: Vec<f64> = (0..GRID).map(|k| (k as f64 + 0.5) / GRID as f64).collect();
         let (columns, rows) = (g.doubles(&[1, 1, GRID as i64], &centers), g.doubles(&[1, GRID as i64, 1], &centers));
@@ -83,8 +84,34 @@ impl Network<'_> {
         let distance = g.squares(&differences);
         let range = g.double(range * range);
         let near = g.with("LessOrEqual", &distance, &range);
-        let near = g.cast(&near, DataType::Float);
-        g.with("Max", ground, &near)
+        let (zero, one) = (g.float(0.0), g.float(1.0));
+        let (cells, slot) = (g.cells(&before.ground), g.cast(slot, DataType::Float));
+        let began = g.max(&cells, 1, false);
+        let began = g.unsqueeze(&began, &[1, 2]);
+        let (began, now) = (g.with("Max", &began, &one), g.with("Add", &slot, &one));
+        let began = g.select(&again, &now, &began);
+        let kept = g.select(&again, &zero, &before.ground);
+        g.select(&near, &began, &kept)
+    }
+
+    /// Whether each UAV searches the ground again, (M, 1, 1).
+    fn begins_search(&mut self, before: &Memory, slot: &Tensor) -> Tensor {
+        let state = self.g.column(&before.users, 0);
+        let known = self.known(&state);
+        let g = &mut self.g;
+        let cells = g.cells(&before.ground);
+        let least = g.min(&cells, 1);
+        let (zero, from) = (g.float(0.0), g.double(SEARCH_AGAIN_FROM as f64));
+        let complete = g.with("Greater", &least, &zero);
+        let number = g.indicator(&known);
+        let number = g.sum(&number, &[1], false);
+        let all = g.size(&before.users, 1);
+        let all = g.cast(&all, DataType::Double);
+        let misses = g.with("Less", &number, &all);
+        let late = g.with("GreaterOrEqual", slot, &from);
+        let again = g.with("And", &complete, &misses);
+        let again = g.with("And", &again, &late);
+        g.unsqueeze(&again, &[1, 2])
     }
 
     /// Writes what each UAV detects into its users.
@@ -149,9 +176,34 @@ impl Network<'_> {
         let user = g.with("Add", &user, &zeros);
         let indices = g.stack(&[source, user]);
         let users = g.gather_nd(&own.users, &indices);
-        let (theirs, sees) = (g.unsqueeze(&own.ground, &[0]), g.unsqueeze(&sight.sees_uav, &[2, 3]));
-        let theirs = g.select(&sees, &theirs, &zero);
-        let theirs = g.max(&theirs, 1, false);
-        Memory { ground: g.with("Max", &own.ground, &theirs), users }
+        // Of searches, those that began last count.
+        let columns = g.transpose(&rows);
+        let itself = g.with("Equal", &rows, &columns);
+        let sees = g.with("Or", &sight.sees_uav, &itself);
+        let began = g.cells(&own.ground);
+        let began = g.max(&began, 1, false);
+        let began = g.unsqueeze(&began, &[0]);
+        let heard = g.select(&sees, &began, &zero);
+        let latest = g.max(&heard, 1, true);
+        let counts = g.with("Equal", &began, &latest);
+        let counts = g.with("And", &sees, &counts);
+        let (counts, theirs) = (g.unsqueeze(&counts, &[2, 3]), g.unsqueeze(&own.ground, &[0]));
+        let theirs = g.select(&counts, &theirs, &zero);
+        Memory { ground: g.max(&theirs, 1, false), users }
+    }
+}
+
+impl Graph {
+    /// The cells of the ground of each UAV, (M, 400).
+    fn cells(&mut self, ground: &Tensor) -> Tensor {
+        let shape = self.list(&[-1, (GRID * GRID) as i64]);
+        self.reshape(ground, &shape)
+    }
+
+    /// 1 for the cells that were not searched, else 0: f64, (M, 20, 20).
+    pub(super) fn unsearched(&mut self, ground: &Tensor) -> Tensor {
+        let zero = self.float(0.0);
+        let unsearched = self.with("Equal", ground, &zero);
+        self.indicator(&unsearched)
     }
 }

@@ -187,8 +187,8 @@ impl Agent {
         goals: &mut Goals,
     ) {
         let Some(sharing) = self.config.memory.sharing() else { return };
-        let (env, sight, step) = slot;
-        remember(sight, env.detection_range, step, sharing, memory, exchange);
+        remember(slot, (sharing, FleetProfile::is_open(profile)), memory, exchange);
+        let (_, sight, _) = slot;
         goals.push_fleet(slot, memories(memory, sight.users()), (last, profile));
         if self.advice.is_some() {
             goals.push_advice(slot, memories(memory, sight.users()), profile);

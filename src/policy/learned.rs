@@ -256,7 +256,6 @@ impl LearnedPolicy {
             }
             if !self.agent.config().memory.is_none() {
                 let sight = fleet.graph.sight().expect("the caller provides what `needs` requires");
-                memory::exclude_outside(&fleet.env, sight.users(), remembered);
                 let slot = (&fleet.env, &sight, fleet.step);
                 let last = &b.last[b.last.len() - sight.uavs()..];
                 self.agent.remember(slot, (last, fleet.profile), remembered, &mut b.exchange, &mut b.goals);

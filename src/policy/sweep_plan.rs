@@ -50,7 +50,7 @@ pub(super) fn sweep_headings<'a>(
             let own = FleetProfile::env(profile, env, i);
             let uav = Uav { env: &own, place, at: sight.positions[i], now: slot as f64 };
             let serving = uav.best_user(memory.users().flatten(), sight.detected_uavs(i).map(|(_, at)| at));
-            let searching = uav.best_block(memory, memory.unknown_users(FleetProfile::is_open(profile)));
+            let searching = uav.best_block(memory, FleetProfile::is_open(profile));
             let best = if serving.score >= searching.score { serving } else { searching };
             *heading = Headings::new(env, uav.at).toward(best.position);
         }
@@ -95,7 +95,8 @@ impl Uav<'_> {
     }
 
     /// The block with the best score among those that are not searched.
-    fn best_block(&self, memory: UavMemory<'_>, unknown: usize) -> Candidate {
+    fn best_block(&self, memory: UavMemory<'_>, open: bool) -> Candidate {
+        let (unknown, now) = (memory.unknown_users(open), self.now - memory.unknown_since(open));
         let ground = Ground::new(memory, &self.place);
         let range = self.env.detection_range;
         let users_per_block = unknown as f64 / ground.unsearched.max(1.0);
@@ -109,7 +110,7 @@ impl Uav<'_> {
                     let mut scores = [0.0; LANES];
                     for ((score, weight), &x) in scores.iter_mut().zip(weights).zip(&CENTERS) {
                         let slots = travel_slots(self.env, self.at, [x, y], range);
-                        *score = WEIGHTS.search * weight * users_per_block * (self.now + slots) / (slots + 1.0);
+                        *score = WEIGHTS.search * weight * users_per_block * (now + slots) / (slots + 1.0);
                     }
                     scores
                 },

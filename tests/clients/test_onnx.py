@@ -93,8 +93,9 @@ def act(client, session, slot, uavs, users, aoi):
     return np.array([a["heading_index"] for a in actions]), np.array([a["q_values"] for a in actions], np.float32)
 
 
-def fly(client, model, policy, seed, size, slots=80):
-    """An episode, flown as Act decides. Returns the largest difference of a Q-value, and how many headings differ."""
+def fly(client, model, policy, seed, size, slots=80, moves=()):
+    """An episode, flown as Act decides; one user moves in the slots `moves`. Returns the largest difference of a Q-value, and how many headings
+    differ."""
     rng = np.random.default_rng(seed)
     uavs = rng.random((size[0], 2)) if seed % 2 else np.full((size[0], 2), 0.5)
     users, aoi = rng.random((size[1], 2)), np.zeros(size[1])
@@ -102,6 +103,8 @@ def fly(client, model, policy, seed, size, slots=80):
     session = client.post("/v1/sessions", json={"policy": policy, "seed": seed}).json()["session_id"]
     worst, other = 0.0, 0
     for slot in range(slots):
+        if slot in moves:
+            users[0] = rng.random(2)
         headings, values = act(client, session, slot, uavs, users, aoi)
         outputs = model.act(slot, uavs, users, aoi)
         worst = max(worst, np.abs(outputs["q_values"] - values).max())
@@ -132,6 +135,13 @@ def test_the_model_decides_as_act_does(client, policy, tmp_path):
     model = exported(policy, tmp_path)
     worst, other = zip(*(fly(client, model, policy, seed, SIZES[seed % len(SIZES)]) for seed in range(LAYOUTS)))
     print(f"{policy}: {LAYOUTS} layouts, Q-values differ by at most {max(worst):.1e}, {sum(other)} headings differ")
+
+
+@pytest.mark.parametrize("policy", ["qedgix", "qmix"])
+def test_the_model_searches_again_for_a_user_that_moved(client, policy, tmp_path):
+    model = exported(policy, tmp_path)
+    fly(client, model, policy, 3, (3, 5), slots=300, moves=range(0, 300, 20))
+    assert model.state["ground"].max() > 200, "1 + the slot in which the search began"
 
 
 @pytest.mark.parametrize("name", TRAINED)

@@ -6,7 +6,7 @@
 use super::rule::{Rule, Slot};
 use crate::policy::memory::{self, Exchange, MAX_REMEMBERED, Sharing, memories, remember, uav_memory_len};
 use crate::policy::sweep_plan::sweep_headings;
-use crate::policy::{Carry, Reach, RequiredInput};
+use crate::policy::{Carry, FleetProfile, Reach, RequiredInput};
 
 /// With or without shared memories. The memory is that of `policy::memory`.
 #[derive(Default)]
@@ -48,8 +48,7 @@ impl<const SHARED: bool> Rule for Sweep<SHARED> {
         let Slot { env, graph, step, profile } = *slot;
         let sight = graph.sight().expect("the caller provides what `needs` requires");
         let sharing = if SHARED { Sharing::Shared } else { Sharing::Own };
-        memory::exclude_outside(env, sight.users(), memory);
-        remember(&sight, env.detection_range, step, sharing, memory, &mut Exchange::default());
+        remember((env, &sight, step), (sharing, FleetProfile::is_open(profile)), memory, &mut Exchange::default());
         sweep_headings((env, &sight, step), memories(memory, graph.users()), profile, headings);
     }
 }

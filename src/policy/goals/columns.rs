@@ -78,9 +78,9 @@ impl Columns {
         }
     }
 
-    /// Computes all quantities. `unknown` users are expected in the ground; `others` are the positions of the UAVs detected.
+    /// Computes all quantities. `unknown` users are expected in the ground, whose AoI grows since slot `since`; `others` are the positions of the UAVs detected.
     #[inline(always)]
-    pub(super) fn compute(&mut self, view: &View<'_>, (ground, unknown): (&Ground, usize), others: &[Point]) {
+    pub(super) fn compute(&mut self, view: &View<'_>, (ground, unknown, since): (&Ground, usize, f64), others: &[Point]) {
         for v in 0..self.len.div_ceil(LANES).min(VECTORS) {
             let (x, y) = (&self.x[v], &self.y[v]);
             for l in 0..LANES {
@@ -113,7 +113,7 @@ impl Columns {
                 if v * LANES + l >= self.users {
                     let expected = unknown as f64 * cells[l] / f64::from(ground.unsearched.max(1));
                     self.promise[v][l] = expected;
-                    self.age[v][l] = view.slot + self.slots[v][l];
+                    self.age[v][l] = view.slot - since + self.slots[v][l];
                     self.rate[v][l] = expected * self.age[v][l] / self.slots[v][l];
                 }
             }

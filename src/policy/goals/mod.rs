@@ -170,6 +170,7 @@ impl Goals {
         users.clear();
         users.extend(memory.users().flatten());
         let (known, unknown) = (users.len() + memory.users_left_out(), memory.unknown_users(view.open));
+        let since = memory.unknown_since(view.open);
         let ground = recent.of(memory);
         let common = [
             ln1(ground.unsearched as f64 * CELL_SHARE * unknown as f64),
@@ -182,7 +183,7 @@ impl Goals {
         columns.begin(view, users, ground);
         simd(
             #[inline(always)]
-            || columns.compute(view, (ground, unknown), others),
+            || columns.compute(view, (ground, unknown, since), others),
         );
         self.headings.extend_from_slice(columns.headings());
         self.features.reserve(FEATURES * columns.headings().len());

@@ -1,6 +1,6 @@
 //! Memories of fleets with at most [`super::MAX_REMEMBERED`] users: the exchange of memories that have an entry for every user.
 
-use super::{GRID, KNOWN, USER, merge_ground, uav_memory_len};
+use super::{GRID, KNOWN, USER, search, uav_memory_len};
 use crate::nn::simd;
 use crate::policy::Sight;
 
@@ -36,7 +36,7 @@ impl AllUsers {
         for i in 0..sight.uavs() {
             let others = sight.detected_uavs(i).map(|(j, _)| j);
             for j in others.clone() {
-                merge_ground(&mut memories[i * len..], &self.ground[j * GRID..]);
+                search::merge(&self.ground[j * GRID..][..GRID], &mut memories[i * len..][..GRID]);
             }
             self.choose_sources(i, sight.users(), others);
             for (user, &j) in self.source.iter().enumerate().filter(|(_, j)| **j != OWN) {
@@ -110,7 +110,7 @@ mod tests {
             for (j, _) in sight.detected_uavs(i) {
                 let (ground, users) = memory.split_at_mut(GRID);
                 let (other_ground, others) = before[j * len..][..len].split_at(GRID);
-                ground.iter_mut().zip(other_ground).for_each(|(bits, &other)| *bits = (*bits as u32 | other as u32) as f32);
+                search::merge(other_ground, ground);
                 for (user, other) in users.chunks_exact_mut(USER).zip(others.chunks_exact(USER)) {
                     let nothing = user[0] == UNKNOWN && user[4] == 0.0;
                     if other[4] > user[4] || (nothing && other[0] == KNOWN) {
@@ -133,7 +133,8 @@ mod tests {
             let sight = graph.sight().unwrap();
             let mut memory = vec![0.0; uavs.len() * uav_memory_len(users)];
             for uav in memory.chunks_exact_mut(uav_memory_len(users)) {
-                uav[..GRID].fill_with(|| rng.random_range(0..1 << GRID) as f32);
+                search::begin(rng.random_range(0..3), &mut uav[..GRID]);
+                search::mark(&std::array::from_fn(|_| rng.random_range(0..1 << GRID)), &mut uav[..GRID]);
                 for user in uav[GRID..].chunks_exact_mut(USER) {
                     if rng.random_bool(0.4) {
                         continue;

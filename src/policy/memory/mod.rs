@@ -4,12 +4,12 @@
 //! range: in every slot, all UAVs detect first and then exchange their memories once. Of two entries for a user, the newer one wins.
 //! The memory has a fixed size, whatever the number of slots, and its content does not fade.
 //!
-//! Encoding of one UAV: [`GRID`] rows of the ground, each an integer with one bit per cell; then per user [`USER`] numbers. All are
-//! integers or f32 positions, which f32 holds exactly. With more than [`MAX_REMEMBERED`] users, the memory has entries of some of them
-//! (`nearest`).
+//! Encoding of one UAV: [`GRID`] rows of the ground (`search`); then per user [`USER`] numbers. All are integers or f32 positions, which
+//! f32 holds exactly. With more than [`MAX_REMEMBERED`] users, the memory has entries of some of them (`nearest`).
 
 mod all_users;
 mod nearest;
+mod search;
 
 use self::all_users::AllUsers;
 use self::nearest::{Carrier, NearestUsers};
@@ -22,6 +22,8 @@ use crate::threads;
 pub const GRID: usize = 20;
 /// Numbers per user: state, x, y, slot of the last known collection, slot of the observation.
 const USER: usize = 5;
+/// Cells of the square.
+const CELLS: usize = GRID * GRID;
 
 /// Users that a UAV remembers at most: of more, those nearest to it.
 pub const MAX_REMEMBERED: usize = 256;
@@ -65,9 +67,9 @@ impl<'a> UavMemory<'a> {
         Self { ground, entries, users }
     }
 
-    /// The cells of row `row` that were searched: bit c stands for the cell in column c.
+    /// The cells of row `row` that were searched since the present search began: bit c stands for the cell in column c.
     pub fn searched(&self, row: usize) -> u32 {
-        self.ground[row] as u32 & ALL
+        search::cells(self.ground[row])
     }
 
     /// The users that the memory has room for, with `None` for those that are not known.
@@ -81,18 +83,25 @@ impl<'a> UavMemory<'a> {
         })
     }
 
-    /// Number of users that are not known. `open`: there may be more users than N; their number is estimated from the known users per
-    /// searched ground.
+    /// Number of users that are not known. `open`: there may be more users than N. Before all ground was searched, their number is
+    /// estimated from the known users per searched ground; afterwards, one is expected to be new.
     pub fn unknown_users(&self, open: bool) -> usize {
         let (known, left_out) = (self.users().flatten().count(), self.users_left_out());
         let unknown = self.users - known - left_out;
-        if !open {
+        let searched = search::count(self.ground);
+        if !open || searched == CELLS {
             return unknown;
         }
-        let searched = self.searched_cells();
-        let left = (GRID * GRID) as u32 - searched;
-        let expected = (known + left_out + 1) as f64 * f64::from(left) / f64::from(searched.max(1));
-        unknown.max(expected.round() as usize)
+        if search::began(self.ground) > 0 {
+            return unknown.max(1);
+        }
+        let expected = (known + left_out + 1) as f64 * (CELLS - searched) as f64 / searched.max(1) as f64;
+        unknown.max(expected.ceil() as usize)
+    }
+
+    /// Slot since which the AoI of a user that is not known grows, at the latest. `open`: users may be new since the present search began.
+    pub fn unknown_since(&self, open: bool) -> f64 {
+        if open { f64::from(search::began(self.ground)) } else { 0.0 }
     }
 
     /// Number of known users that the memory has no room for, if the users are spread evenly; 0 for at most [`MAX_REMEMBERED`] users.
@@ -100,12 +109,14 @@ impl<'a> UavMemory<'a> {
         if self.users <= MAX_REMEMBERED {
             return 0;
         }
-        let known = self.users * self.searched_cells() as usize / (GRID * GRID);
-        known.saturating_sub(self.users().flatten().count())
+        let searched = if search::began(self.ground) > 0 { CELLS } else { search::count(self.ground) };
+        (self.users * searched / CELLS).saturating_sub(self.users().flatten().count())
     }
 
-    fn searched_cells(&self) -> u32 {
-        (0..GRID).map(|row| self.searched(row).count_ones()).sum()
+    /// Whether the ground has to be searched again in slot `slot`.
+    fn begins_search(&self, open: bool, slot: u64) -> bool {
+        let again = open || slot >= SEARCH_AGAIN_FROM;
+        again && search::is_complete(self.ground) && (open || self.unknown_users(open) > 0)
     }
 }
 
@@ -132,9 +143,6 @@ pub fn memories(numbers: &[f32], users: usize) -> impl Iterator<Item = UavMemory
     numbers.chunks_exact(uav_memory_len(users)).map(move |numbers| UavMemory::new(numbers, users))
 }
 
-/// All cells of a row.
-const ALL: u32 = (1 << GRID) - 1;
-
 /// Whether UAVs exchange memories.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Sharing {
@@ -144,22 +152,9 @@ pub enum Sharing {
     Shared,
 }
 
-/// Marks the ground outside the area as searched, in the memories of a fleet: nothing is there.
-pub fn exclude_outside(env: &EnvParams, users: usize, memories: &mut [f32]) {
-    if env.extent == [1.0; 2] {
-        return;
-    }
-    let center = |k: usize| (k as f64 + 0.5) / GRID as f64;
-    let outside = |row: usize| {
-        (0..GRID).filter(|&column| !env.contains([center(column), center(row)])).fold(0, |bits, c| bits | 1_u32 << c)
-    };
-    let outside: [u32; GRID] = std::array::from_fn(outside);
-    for memory in memories.chunks_exact_mut(uav_memory_len(users)) {
-        for (bits, outside) in memory.iter_mut().zip(outside) {
-            *bits = ((*bits as u32 & ALL) | outside) as f32;
-        }
-    }
-}
+/// From this slot on, a UAV that has searched all ground and does not know all of N users searches the ground again: users move, and a
+/// user may be out of range while the centre of its cell is in range. Training has shorter episodes.
+pub const SEARCH_AGAIN_FROM: u64 = 200;
 
 /// Buffers for the memories of a fleet, kept between slots.
 #[derive(Clone, Debug, Default)]
@@ -171,10 +166,15 @@ pub struct Exchange {
     before: Vec<f32>,
 }
 
-/// Advances the memories of a fleet, one after another in `memories`, to slot `slot`.
-pub fn remember(sight: &Sight<'_>, range: f64, slot: u64, sharing: Sharing, memories: &mut [f32], exchange: &mut Exchange) {
+/// Advances the memories of a fleet, one after another in `memories`, to slot `slot`. `open`: there may be more users than N.
+pub fn remember(
+    (env, sight, slot): (&EnvParams, &Sight<'_>, u64),
+    (sharing, open): (Sharing, bool),
+    memories: &mut [f32],
+    exchange: &mut Exchange,
+) {
     let Exchange { all, nearest, before } = exchange;
-    let len = uav_memory_len(sight.users());
+    let (len, range, outside) = (uav_memory_len(sight.users()), env.detection_range, search::cells_outside(env));
     let listed = sight.users() > MAX_REMEMBERED;
     // A user that should be detected and is not has moved away. The margin allows for rounding.
     let near = 0.99 * range;
@@ -183,9 +183,14 @@ pub fn remember(sight: &Sight<'_>, range: f64, slot: u64, sharing: Sharing, memo
     let parts = nearest.iter_mut().zip(memories.chunks_mut(part * len)).enumerate();
     threads::for_each(parts, |(k, (nearest, memories))| {
         for (i, memory) in (k * part..).zip(memories.chunks_exact_mut(len)) {
+            if UavMemory::new(memory, sight.users()).begins_search(open, slot) {
+                search::begin(slot, &mut memory[..GRID]);
+            }
+            let ground = &mut memory[..GRID];
+            search::mark(&outside, ground);
             simd(
                 #[inline(always)]
-                || search(sight.positions[i], range, &mut memory[..GRID]),
+                || search::search(sight.positions[i], range, ground),
             );
             if listed {
                 nearest.observe(sight, i, near, slot as f32, memory);
@@ -226,31 +231,6 @@ fn observe(sight: &Sight<'_>, i: usize, near: f64, slot: f32, memory: &mut [f32]
     }
 }
 
-/// Adds the ground of another memory to that of `memory`.
-fn merge_ground(memory: &mut [f32], other: &[f32]) {
-    for (bits, &other) in memory[..GRID].iter_mut().zip(other) {
-        *bits = ((*bits as u32 | other as u32) & ALL) as f32;
-    }
-}
-
-/// Marks the cells whose centres are within `range` of `at` as searched.
-#[inline(always)]
-fn search(at: Point, range: f64, ground: &mut [f32]) {
-    let cells = GRID as f64;
-    let first = ((at[1] - range) * cells - 0.5).ceil().max(0.0) as usize;
-    let end = ((at[1] + range) * cells + 0.5).floor().clamp(0.0, cells) as usize;
-    for (row, bits) in ground.iter_mut().enumerate().take(end).skip(first) {
-        let dy = (row as f64 + 0.5) / cells - at[1];
-        let half = (range * range - dy * dy).max(0.0).sqrt();
-        let left = ((at[0] - half) * cells - 0.5).ceil().clamp(0.0, cells) as u32;
-        let right = ((at[0] + half) * cells + 0.5).floor().clamp(0.0, cells) as u32;
-        if left < right {
-            let seen = (ALL >> (GRID as u32 - (right - left))) << left;
-            *bits = ((*bits as u32 & ALL) | seen) as f32;
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::super::FleetGraph;
@@ -272,7 +252,8 @@ mod tests {
 
         fn see(&mut self, slot: u64, uavs: &[Point], users: &[Point], aoi: &[f32], sharing: Sharing, ranges: Ranges) {
             let graph = FleetGraph::from_scene(uavs, users, aoi, ranges);
-            remember(&graph.sight().unwrap(), ranges.detection, slot, sharing, &mut self.memory, &mut self.exchange);
+            let env = EnvParams { detection_range: ranges.detection, ..EnvParams::default() };
+            remember((&env, &graph.sight().unwrap(), slot), (sharing, false), &mut self.memory, &mut self.exchange);
         }
 
         fn of(&self, uav: usize) -> UavMemory<'_> {
@@ -282,28 +263,6 @@ mod tests {
 
         fn user(&self, uav: usize, j: usize) -> Option<RememberedUser> {
             self.of(uav).users().nth(j).unwrap()
-        }
-    }
-
-    #[test]
-    fn cells_are_searched_when_their_centres_are_in_range() {
-        for (at, range) in [
-            ([0.5, 0.5], 0.28),
-            ([0.0, 1.0], 0.28),
-            ([0.013, 0.77], 0.05),
-            ([0.3, 0.3], 0.01),
-            ([0.4, 0.9], 2.0),
-            ([-0.5, 0.5], 0.2),
-        ] {
-            let mut ground = [0.0; GRID];
-            search(at, range, &mut ground);
-            for (row, &bits) in ground.iter().enumerate() {
-                for column in 0..GRID {
-                    let center = [column, row].map(|c| (c as f64 + 0.5) / GRID as f64);
-                    let inside = (center[0] - at[0]).powi(2) + (center[1] - at[1]).powi(2) <= range * range;
-                    assert_eq!(bits as u32 >> column & 1 == 1, inside, "{at:?}, {range}, cell {column}, {row}");
-                }
-            }
         }
     }
 
@@ -321,6 +280,44 @@ mod tests {
         assert_eq!(fleet.user(0, 0), Some(seen));
         fleet.see(5, &[[0.5, 0.5]], &[[0.1, 0.9], [0.9, 0.9]], &[4.0, 5.0], Sharing::Own, RANGES);
         assert_eq!(fleet.user(0, 0), None);
+    }
+
+    /// The slot in which the search began, after slots 0 to `slot` in which all ground was in range, and one user at `user`.
+    fn search_began(slot: u64, user: Point, open: bool) -> f64 {
+        let env = EnvParams { detection_range: 2.0, ..EnvParams::default() };
+        let graph = FleetGraph::from_scene(&[[0.5, 0.5]], &[user], &[1.0], RANGES);
+        let mut fleet = Fleet::new(1, 1);
+        for slot in 0..=slot {
+            let sight = graph.sight().unwrap();
+            remember((&env, &sight, slot), (Sharing::Shared, open), &mut fleet.memory, &mut fleet.exchange);
+        }
+        fleet.of(0).unknown_since(true)
+    }
+
+    #[test]
+    fn the_ground_is_searched_again_for_users_that_are_missing_or_may_be_new() {
+        let (found, missed) = ([0.5, 0.6], [0.9, 0.9]);
+        let late = SEARCH_AGAIN_FROM;
+        assert_eq!([late - 1, late, late + 7].map(|slot| search_began(slot, missed, false)), [0.0, 200.0, 207.0]);
+        assert_eq!(search_began(late + 7, found, false), 0.0);
+        assert_eq!([0, 1, 7].map(|slot| search_began(slot, found, true)), [0.0, 1.0, 7.0]);
+    }
+
+    #[test]
+    fn unknown_users_are_the_rest_of_n_or_an_estimate() {
+        let (users, at) = ([[0.5, 0.6], [0.9, 0.9], [0.1, 0.9]], [0.5, 0.5]);
+        let mut fleet = Fleet::new(1, 3);
+        fleet.see(0, &[at], &users, &[1.0; 3], Sharing::Own, RANGES);
+        let cells: u32 = (0..GRID).map(|row| fleet.of(0).searched(row).count_ones()).sum();
+        let share = f64::from(cells) / 400.0;
+        assert_eq!((fleet.of(0).unknown_users(false), fleet.of(0).unknown_since(false)), (2, 0.0));
+        assert_eq!(fleet.of(0).unknown_users(true), (2.0 * (1.0 - share) / share).ceil() as usize);
+        search::begin(30, &mut fleet.memory[..GRID]);
+        fleet.see(31, &[at], &users[..1].repeat(3), &[1.0; 3], Sharing::Own, RANGES);
+        assert_eq!((fleet.of(0).unknown_users(false), fleet.of(0).unknown_users(true)), (0, 1));
+        assert_eq!((fleet.of(0).unknown_since(false), fleet.of(0).unknown_since(true)), (0.0, 30.0));
+        search::search(at, 2.0, &mut fleet.memory[..GRID]);
+        assert_eq!(fleet.of(0).unknown_users(true), 0);
     }
 
     #[test]

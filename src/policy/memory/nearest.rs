@@ -3,7 +3,7 @@
 //! Encoding: at most [`MAX_REMEMBERED`] entries in ascending order of user, then zeros. The state of an entry is 1 + the index of the
 //! user, and negative for a user that has gone.
 
-use super::{GRID, KNOWN, MAX_REMEMBERED, UNKNOWN, USER, merge_ground, uav_memory_len};
+use super::{GRID, KNOWN, MAX_REMEMBERED, UNKNOWN, USER, search, uav_memory_len};
 use crate::env::Point;
 use crate::policy::Sight;
 
@@ -127,7 +127,7 @@ impl NearestUsers {
         self.add(memory, sight.users());
         for (j, _) in sight.detected_uavs(i) {
             let other = &before[j * len..][..len];
-            merge_ground(memory, other);
+            search::merge(&other[..GRID], &mut memory[..GRID]);
             self.add(other, sight.users());
         }
         self.keep_nearest(sight.positions[i], memory);
@@ -188,7 +188,7 @@ mod tests {
     use super::super::{Exchange, Sharing, carry, memories, remember};
     use super::*;
     use crate::env::Ranges;
-    use crate::policy::{Carry, FleetGraph};
+    use crate::policy::{Carry, EnvParams, FleetGraph};
 
     /// What a UAV knows, as docs/model.md defines it: for each user its entry, of which the first number is 1 if the user is there.
     type Known = BTreeMap<usize, Entry>;
@@ -243,6 +243,7 @@ mod tests {
     #[test]
     fn the_nearest_known_users_are_remembered_and_news_pass_links() {
         let (uavs, users, ranges) = (4, 1000, Ranges { detection: 0.2, communication: 0.4 });
+        let env = EnvParams { detection_range: ranges.detection, ..EnvParams::default() };
         let len = uav_memory_len(users);
         let mut rng = crate::rng::stream(3, "nearest", 0);
         let mut place = |count: usize| -> Vec<Point> { (0..count).map(|_| [rng.random(), rng.random()]).collect() };
@@ -258,7 +259,7 @@ mod tests {
             let aoi: Vec<f32> = (0..users).map(|j| (j % 7) as f32).collect();
             let graph = FleetGraph::from_scene(&place(uavs), &at, &aoi, ranges);
             let sight = graph.sight().unwrap();
-            remember(&sight, ranges.detection, slot, Sharing::Shared, &mut memory, &mut exchange);
+            remember((&env, &sight, slot), (Sharing::Shared, false), &mut memory, &mut exchange);
             expected = next_slot(&sight, ranges.detection, slot as f32, &expected);
             for (memory, expected) in memory.chunks_exact(len).zip(&expected) {
                 assert_eq!(&known(memory, users), expected, "slot {slot}");
@@ -298,13 +299,13 @@ mod tests {
     #[test]
     fn any_numbers_are_a_memory() {
         let mut rng = crate::rng::stream(4, "nearest", 0);
-        let users = 300;
+        let (users, env) = (300, EnvParams { detection_range: 0.5, ..EnvParams::default() });
         for _ in 0..50 {
             let mut number =
                 || [f32::NAN, f32::INFINITY, -1e30, -301.0, 0.5, 1.5, 300.9, 301.0, 0.0, 7.0][rng.random_range(0..10)];
             let mut memory: Vec<f32> = (0..2 * uav_memory_len(users)).map(|_| number()).collect();
             let graph = FleetGraph::from_scene(&[[0.5; 2]; 2], &vec![[0.6; 2]; users], &vec![1.0; users], 0.5);
-            remember(&graph.sight().unwrap(), 0.5, 9, Sharing::Shared, &mut memory, &mut Exchange::default());
+            remember((&env, &graph.sight().unwrap(), 9), (Sharing::Shared, false), &mut memory, &mut Exchange::default());
             for uav in memories(&memory, users) {
                 uav.unknown_users(true);
                 assert_eq!(uav.users().flatten().count(), MAX_REMEMBERED, "all are detected");
