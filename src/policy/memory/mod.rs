@@ -83,13 +83,17 @@ impl<'a> UavMemory<'a> {
         })
     }
 
-    /// Number of users that are not known. `open`: there may be more users than N. Before all ground was searched, their number is
-    /// estimated from the known users per searched ground; afterwards, one is expected to be new.
+    /// Number of users that are not known. `open`: there may be more users than N, and those that have gone may have left. Before all
+    /// ground was searched, their number is estimated from the known users per searched ground; afterwards, one is expected to be new.
     pub fn unknown_users(&self, open: bool) -> usize {
         let (known, left_out) = (self.users().flatten().count(), self.users_left_out());
         let unknown = self.users - known - left_out;
         let searched = search::count(self.ground);
-        if !open || searched == CELLS {
+        if !open {
+            return unknown;
+        }
+        let unknown = unknown.saturating_sub(self.users_gone());
+        if searched == CELLS {
             return unknown;
         }
         if search::began(self.ground) > 0 {
@@ -97,6 +101,11 @@ impl<'a> UavMemory<'a> {
         }
         let expected = (known + left_out + 1) as f64 * (CELLS - searched) as f64 / searched.max(1) as f64;
         unknown.max(expected.ceil() as usize)
+    }
+
+    /// Number of users that were known and have gone.
+    fn users_gone(&self) -> usize {
+        self.entries.chunks_exact(USER).filter(|user| user[0] <= UNKNOWN && user[4] > 0.0).count()
     }
 
     /// Slot since which the AoI of a user that is not known grows, at the latest. `open`: users may be new since the present search began.
@@ -318,6 +327,9 @@ mod tests {
         assert_eq!((fleet.of(0).unknown_since(false), fleet.of(0).unknown_since(true)), (0.0, 30.0));
         search::search(at, 2.0, &mut fleet.memory[..GRID]);
         assert_eq!(fleet.of(0).unknown_users(true), 0);
+        // Two of them move away: in an open fleet, they may have left.
+        fleet.see(32, &[at], &[users[0], users[1], users[1]], &[1.0; 3], Sharing::Own, RANGES);
+        assert_eq!((fleet.of(0).unknown_users(false), fleet.of(0).unknown_users(true)), (2, 0));
     }
 
     #[test]
