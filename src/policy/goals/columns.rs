@@ -78,7 +78,8 @@ impl Columns {
         }
     }
 
-    /// Computes all quantities. `unknown` users are expected in the ground, whose AoI grows since slot `since`; `others` are the positions of the UAVs detected.
+    /// Computes all quantities. `unknown` users are expected in the ground, whose AoI grows since slot `since`; `others` are the positions
+    /// of the UAVs detected.
     #[inline(always)]
     pub(super) fn compute(&mut self, view: &View<'_>, (ground, unknown, since): (&Ground, usize, f64), others: &[Point]) {
         for v in 0..self.len.div_ceil(LANES).min(VECTORS) {
