@@ -4,9 +4,9 @@
     qedgix serve &
     benches/changing.py --server 127.0.0.1:8080 --policy qedgix --policy sweep-shared
 
-Three UAVs start in the middle of the unit square. There are always five users; every `--every` slots the oldest one leaves, and a new
-one begins at a random place (0: all stay). A request lists the UAVs and the users that a UAV detects in this slot; the policy is told
-nothing else. Mean AoI in slots, with a 95 % interval over worlds (1.96 standard errors)."""
+Three UAVs start in the middle of the unit square. There are always five users. After every `--every` slots, the oldest user leaves and a
+new user appears at a random place; with `--every 0`, all users stay. Each request lists the UAVs, and only those users that a UAV detects
+in this slot. Mean AoI in slots, with a 95 % interval over worlds (1.96 standard errors)."""
 
 import argparse
 import http.client
@@ -99,6 +99,8 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=40, help="slots between two changes; 0: none [default: 40]")
     parser.add_argument("--worlds", type=int, default=64, help="number of sessions, each in another world [default: 64]")
     args = parser.parse_args()
+    if args.worlds < 2:
+        parser.error("--worlds: an interval needs at least 2 worlds")
     server = Server(args.server)
     print("| policy | mean AoI | 95 % interval |\n| --- | --- | --- |")
     for policy in args.policy:

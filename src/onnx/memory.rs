@@ -74,7 +74,8 @@ impl Network<'_> {
     /// Marks the cells whose centres are in range, in the present search or in a new one.
     fn search(&mut self, before: &Memory, positions: &Tensor, slot: &Tensor) -> Tensor {
         let range = self.agent.dims().env.detection_range;
-        let again = self.begins_search(before, slot);
+        let cells = self.g.cells(&before.ground);
+        let again = self.begins_search((&cells, &before.users), slot);
         let g = &mut self.g;
         let centers: Vec<f64> = (0..GRID).map(|k| (k as f64 + 0.5) / GRID as f64).collect();
         let (columns, rows) = (g.doubles(&[1, 1, GRID as i64], &centers), g.doubles(&[1, GRID as i64, 1], &centers));
@@ -85,7 +86,7 @@ impl Network<'_> {
         let range = g.double(range * range);
         let near = g.with("LessOrEqual", &distance, &range);
         let (zero, one) = (g.float(0.0), g.float(1.0));
-        let (cells, slot) = (g.cells(&before.ground), g.cast(slot, DataType::Float));
+        let slot = g.cast(slot, DataType::Float);
         let began = g.max(&cells, 1, false);
         let began = g.unsqueeze(&began, &[1, 2]);
         let (began, now) = (g.with("Max", &began, &one), g.with("Add", &slot, &one));
@@ -94,18 +95,17 @@ impl Network<'_> {
         g.select(&near, &began, &kept)
     }
 
-    /// Whether each UAV searches the ground again, (M, 1, 1).
-    fn begins_search(&mut self, before: &Memory, slot: &Tensor) -> Tensor {
-        let state = self.g.column(&before.users, 0);
+    /// Whether each UAV searches the ground again, (M, 1, 1). `cells` (M, 400) and `users` are its memory before.
+    fn begins_search(&mut self, (cells, users): (&Tensor, &Tensor), slot: &Tensor) -> Tensor {
+        let state = self.g.column(users, 0);
         let known = self.known(&state);
         let g = &mut self.g;
-        let cells = g.cells(&before.ground);
-        let least = g.min(&cells, 1);
+        let least = g.min(cells, 1);
         let (zero, from) = (g.float(0.0), g.double(SEARCH_AGAIN_FROM as f64));
         let complete = g.with("Greater", &least, &zero);
         let number = g.indicator(&known);
         let number = g.sum(&number, &[1], false);
-        let all = g.size(&before.users, 1);
+        let all = g.size(users, 1);
         let all = g.cast(&all, DataType::Double);
         let misses = g.with("Less", &number, &all);
         let late = g.with("GreaterOrEqual", slot, &from);

@@ -108,7 +108,8 @@ impl<'a> UavMemory<'a> {
         self.entries.chunks_exact(USER).filter(|user| user[0] <= UNKNOWN && user[4] > 0.0).count()
     }
 
-    /// Slot since which the AoI of a user that is not known grows, at the latest. `open`: users may be new since the present search began.
+    /// Slot from which the AoI of users that are not known is counted: 0, or, if the fleet is `open`, the slot in which the present search
+    /// began.
     pub fn unknown_since(&self, open: bool) -> f64 {
         if open { f64::from(search::began(self.ground)) } else { 0.0 }
     }
@@ -124,8 +125,7 @@ impl<'a> UavMemory<'a> {
 
     /// Whether the ground has to be searched again in slot `slot`.
     fn begins_search(&self, open: bool, slot: u64) -> bool {
-        let again = open || slot >= SEARCH_AGAIN_FROM;
-        again && search::is_complete(self.ground) && (open || self.unknown_users(open) > 0)
+        search::is_complete(self.ground) && (open || slot >= SEARCH_AGAIN_FROM && self.unknown_users(open) > 0)
     }
 }
 

@@ -11,6 +11,7 @@ use crate::policy::EnvParams;
 const ALL: u32 = (1 << GRID) - 1;
 /// Bits of the slot per row, and rows that hold them.
 const SLOT_BITS: usize = 4;
+const SLOT_MASK: u32 = (1 << SLOT_BITS) - 1;
 const SLOT_ROWS: usize = u32::BITS as usize / SLOT_BITS;
 
 /// The cells of a row that were searched: bit c stands for the cell in column c.
@@ -30,7 +31,7 @@ pub(super) fn is_complete(ground: &[f32]) -> bool {
 
 /// Slot in which the search began.
 pub(super) fn began(ground: &[f32]) -> u32 {
-    ground[..SLOT_ROWS].iter().rev().fold(0, |slot, &row| slot << SLOT_BITS | (row as u32 >> GRID) & ((1 << SLOT_BITS) - 1))
+    ground[..SLOT_ROWS].iter().rev().fold(0, |slot, &row| slot << SLOT_BITS | (row as u32 >> GRID) & SLOT_MASK)
 }
 
 /// Begins a new search in slot `slot`.
@@ -38,7 +39,7 @@ pub(super) fn begin(slot: u64, ground: &mut [f32]) {
     let slot = u32::try_from(slot).unwrap_or(u32::MAX);
     ground.fill(0.0);
     for (k, row) in ground[..SLOT_ROWS].iter_mut().enumerate() {
-        *row = ((slot >> (SLOT_BITS * k) & ((1 << SLOT_BITS) - 1)) << GRID) as f32;
+        *row = ((slot >> (SLOT_BITS * k) & SLOT_MASK) << GRID) as f32;
     }
 }
 
