@@ -187,7 +187,7 @@ impl Agent {
         goals: &mut Goals,
     ) {
         let Some(sharing) = self.config.memory.sharing() else { return };
-        remember(slot, (sharing, FleetProfile::is_open(profile)), memory, exchange);
+        remember(slot, (sharing, FleetProfile::users(profile)), memory, exchange);
         let (_, sight, _) = slot;
         goals.push_fleet(slot, memories(memory, sight.users()), (last, profile));
         if self.advice.is_some() {

@@ -73,13 +73,25 @@ fn turn(angle: f64) -> f64 {
     if rest < 0.0 { rest + TAU } else { rest }
 }
 
-/// How a fleet differs from one of equal UAVs that has not changed since slot 0 and whose users are all known.
+/// How many users there are, for a memory that has room for N.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum UserCount {
+    /// N, since slot 0.
+    #[default]
+    Fixed,
+    /// The first so many of the N in the memory: users have come or gone, and the fleet's input lists all that there are.
+    Listed(usize),
+    /// Unknown: the fleet's input may list only some.
+    Unknown,
+}
+
+/// How a fleet differs from one of equal UAVs that has not changed since slot 0.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct FleetProfile {
     /// The place of each UAV. Empty: the UAVs are those of slot 0.
     pub places: Vec<Place>,
-    /// Whether there may be more users than the fleet's input lists.
-    pub open: bool,
+    /// How many users there are.
+    pub users: UserCount,
     /// Speed of each UAV, per slot. Empty: all have that of the environment.
     pub speeds: Vec<f64>,
 }
@@ -95,9 +107,9 @@ impl FleetProfile {
         EnvParams { speed: profile.and_then(|profile| profile.speeds.get(i).copied()).unwrap_or(env.speed), ..*env }
     }
 
-    /// Whether there may be more users than listed.
-    pub fn is_open(profile: Option<&Self>) -> bool {
-        profile.is_some_and(|profile| profile.open)
+    /// How many users there are.
+    pub fn users(profile: Option<&Self>) -> UserCount {
+        profile.map_or(UserCount::Fixed, |profile| profile.users)
     }
 }
 

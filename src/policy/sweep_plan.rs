@@ -9,7 +9,7 @@ use std::sync::LazyLock;
 use super::fleet_profile::direction;
 use super::flight::{Headings, distance, travel_slots};
 use super::memory::{GRID, RememberedUser, UavMemory};
-use super::{EnvParams, FleetProfile, Place, Sight};
+use super::{EnvParams, FleetProfile, Place, Sight, UserCount};
 use crate::env::Point;
 use crate::nn::simd;
 use crate::threads;
@@ -50,9 +50,9 @@ pub(super) fn sweep_headings<'a>(
             let own = FleetProfile::env(profile, env, i);
             let uav = Uav { env: &own, place, at: sight.positions[i], now: slot as f64 };
             let serving = uav.best_user(memory.users().flatten(), sight.detected_uavs(i).map(|(_, at)| at));
-            let searching = uav.best_block(memory, FleetProfile::is_open(profile));
+            let searching = uav.best_block(memory, FleetProfile::users(profile));
             let best = if serving.score >= searching.score { serving } else { searching };
-            *heading = Headings::new(env, uav.at).toward(best.position);
+            *heading = Headings::new(&own, uav.at).toward(best.position);
         }
     });
 }
@@ -95,8 +95,8 @@ impl Uav<'_> {
     }
 
     /// The block with the best score among those that are not searched.
-    fn best_block(&self, memory: UavMemory<'_>, open: bool) -> Candidate {
-        let (unknown, now) = (memory.unknown_users(open), self.now - memory.unknown_since(open));
+    fn best_block(&self, memory: UavMemory<'_>, count: UserCount) -> Candidate {
+        let (unknown, now) = (memory.unknown_users(count), self.now - memory.unknown_since(count));
         let ground = Ground::new(memory, &self.place);
         let range = self.env.detection_range;
         let users_per_block = unknown as f64 / ground.unsearched.max(1.0);

@@ -209,17 +209,30 @@ impl SceneOrGraph {
         }
     }
 
-    /// Whether the caller may list only what a UAV detects: it lists no user, or a graph in which every user is detected.
-    pub fn lists_only_detected(&self) -> bool {
+    /// Which users the caller lists.
+    pub fn listed_users(&self) -> ListedUsers {
         match self {
-            Self::Scene(scene) => scene.users.is_empty(),
+            Self::Scene(scene) if scene.users.is_empty() => ListedUsers::Detected,
+            Self::Scene(_) => ListedUsers::All,
             // What UAVs detect is mirrored, so the first detection of a user that is detected is that of a UAV.
             Self::Graph(graph) => {
                 let uavs = graph.positions.len();
-                graph.detections[uavs..].iter().all(|list| list.first().is_some_and(|d| (d.target as usize) < uavs))
+                let detected = |list: &Vec<ReportedDetection>| list.first().is_some_and(|d| (d.target as usize) < uavs);
+                if graph.detections[uavs..].iter().all(detected) { ListedUsers::Detected } else { ListedUsers::Named }
             }
         }
     }
+}
+
+/// Which users an input lists.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ListedUsers {
+    /// All that there are: it is a scene.
+    All,
+    /// Also users that no UAV detects; perhaps all.
+    Named,
+    /// Perhaps only those that a UAV detects: it is a graph in which every user is detected, or lists no user.
+    Detected,
 }
 
 /// Which nodes detect each other.

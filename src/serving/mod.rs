@@ -33,8 +33,8 @@ pub use environments::{
 pub use error::Error;
 pub use fleet_ids::FleetIds;
 pub use fleet_input::{
-    FleetInput, GraphForm, LARGE_NODES, MAX_DETECTIONS, MAX_NODES, ReportedDetection, ReportedGraph, Scene, SceneOrGraph,
-    Sensing, TaskInput,
+    FleetInput, GraphForm, LARGE_NODES, ListedUsers, MAX_DETECTIONS, MAX_NODES, ReportedDetection, ReportedGraph, Scene,
+    SceneOrGraph, Sensing, TaskInput,
 };
 pub use fleet_memory::FleetMemory;
 pub use flight::{ConstraintOptions, Flight, FlightOptions, Frame, FrameOptions, Warning, WorldOptions};

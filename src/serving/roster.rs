@@ -14,9 +14,9 @@ use std::f64::consts::TAU;
 use rand::RngExt;
 use sha2::{Digest, Sha256};
 
-use super::{FleetIds, LoadedPolicy, MAX_NODES};
+use super::{FleetIds, ListedUsers, LoadedPolicy, MAX_NODES};
 use crate::invalid::Invalid;
-use crate::policy::{Carry, FleetProfile, Place, Policy};
+use crate::policy::{Carry, FleetProfile, Place, Policy, UserCount};
 use crate::rng;
 
 /// Identifies an id.
@@ -96,6 +96,8 @@ pub struct RosterRules<'a> {
     pub absent_after: u64,
     /// Determines the random numbers of new members.
     pub seed: u64,
+    /// Which users the step lists.
+    pub listed: ListedUsers,
 }
 
 /// The members of a fleet.
@@ -106,7 +108,7 @@ pub struct Roster {
     pub(super) turns: Vec<Turn>,
     /// None unless the memory has a place for each.
     pub(super) users: Vec<Member>,
-    /// Whether there may be more users than were ever listed.
+    /// Whether users have come or gone, or only some may have been listed.
     pub(super) open: bool,
 }
 
@@ -185,6 +187,11 @@ impl Roster {
         let stayed = users.kept.iter().filter(|(_, b)| (*b as usize) < fleet.users.len()).count();
         let other_users = stayed < fleet.users.len() || stayed < self.users.len();
         let open = self.open || (memory == UserMemory::Each && other_users);
+        let count = match rules.listed {
+            _ if !open => UserCount::Fixed,
+            ListedUsers::All => UserCount::Listed(fleet.users.len()),
+            ListedUsers::Named | ListedUsers::Detected => UserCount::Unknown,
+        };
         // Those that are listed share the square among them.
         let places = if turns.is_empty() && uavs.members.len() == fleet.uavs.len() {
             Vec::new()
@@ -199,7 +206,7 @@ impl Roster {
             uavs: uavs.kept,
             users: users.kept,
             seed: rng::stream(rules.seed, "joined", step).random(),
-            profile: FleetProfile { places, open, speeds: Vec::new() },
+            profile: FleetProfile { places, users: count, speeds: Vec::new() },
         };
         (Self { uavs: uavs.members, turns, users: users.members, open }, change)
     }

@@ -15,7 +15,9 @@ use qedgix::service::{App, Error, act, sessions};
 use qedgix::serving::{FleetInput, SessionOptions};
 use qedgix::train_config::{Algorithm, Preset};
 use qedgix::wire::v1;
+use qedgix::wire::v1::policy_service_client::PolicyServiceClient;
 use tonic::Code;
+use tonic::transport::Channel;
 
 use super::harness::*;
 
@@ -240,7 +242,7 @@ async fn fly(app: Arc<App>, server: &Server, policy: &str, name: String, events:
                 let (app, caller) = (app.clone(), Caller::default());
                 let held = app.sessions.get(caller.owner(), &id).unwrap();
                 let ids = FleetInput::try_from(scene).unwrap().fleet;
-                let listed = qedgix::serving::Listed { fleet: &ids, only_detected: false };
+                let listed = qedgix::serving::Listed { fleet: &ids, users: qedgix::serving::ListedUsers::All };
                 drop(held.begin_step(listed, Some(model.step), None, ABSENT_AFTER).now_or_never().unwrap().unwrap());
             }
             Event::Expire => {
@@ -282,6 +284,77 @@ fn changing_fleets_are_those_of_the_model_and_of_a_replay() {
             Ok(())
         })
         .unwrap();
+}
+
+/// A session in the unit square, whose scenes list all users.
+struct SceneFlight {
+    client: PolicyServiceClient<Channel>,
+    session: &'static str,
+    uavs: BTreeMap<&'static str, [f64; 2]>,
+    /// Position and AoI.
+    users: BTreeMap<&'static str, ([f64; 2], f64)>,
+    slot: u64,
+}
+
+impl SceneFlight {
+    async fn open(server: &Server, policy: &'static str, uavs: &[&'static str], users: &[(&'static str, [f64; 2])]) -> Self {
+        let mut client = server.grpc().await;
+        client.open_session(open(policy, policy)).await.unwrap();
+        let uavs = uavs.iter().map(|&id| (id, [0.5, 0.5])).collect();
+        let users = users.iter().map(|&(id, at)| (id, (at, 0.0))).collect();
+        Self { client, session: policy, uavs, users, slot: 0 }
+    }
+
+    /// Flies `slots` slots. Returns the highest AoI of any user in these.
+    async fn fly(&mut self, slots: u64) -> f64 {
+        let mut highest = 0.0_f64;
+        for _ in 0..slots {
+            let uavs =
+                self.uavs.iter().map(|(&id, &[x, y])| v1::SceneUav { id: id.into(), x, y, ..Default::default() }).collect();
+            let users =
+                self.users.iter().map(|(&id, &([x, y], aoi))| v1::SceneUser { id: id.into(), x, y, aoi, z: None }).collect();
+            let request = in_session(self.session, Some(self.slot), v1::Scene { uavs, users });
+            let answer = self.client.act(request).await.unwrap().into_inner();
+            for (at, action) in self.uavs.values_mut().zip(&answer.actions) {
+                let heading = action.heading_deg.unwrap().to_radians();
+                *at = [at[0] + 0.04 * heading.cos(), at[1] + 0.04 * heading.sin()].map(|x| x.clamp(0.0, 1.0));
+            }
+            for (at, aoi) in self.users.values_mut() {
+                let collected = self.uavs.values().any(|uav| (uav[0] - at[0]).hypot(uav[1] - at[1]) <= 0.12);
+                *aoi = if collected { 0.0 } else { *aoi + 1.0 };
+                highest = highest.max(*aoi);
+            }
+            self.slot += 1;
+        }
+        highest
+    }
+}
+
+#[tokio::test]
+async fn uavs_search_while_a_scene_lists_users_that_they_do_not_know() {
+    let server = Server::start().await;
+    let corner = [0.05, 0.05];
+    let mut flight = SceneFlight::open(&server, "sweep", &["uav"], &[("near", [0.5, 0.6]), ("left", corner)]).await;
+    flight.fly(120).await;
+    flight.users.remove("left");
+    flight.users.insert("new", (corner, 0.0));
+    flight.fly(120).await;
+    assert!(flight.users["new"].1 < 60.0);
+    flight.users.remove("new");
+    flight.fly(90).await;
+    assert!(flight.fly(60).await <= 1.0, "the UAV knows all users and leaves them");
+}
+
+#[tokio::test]
+async fn a_tour_that_is_planned_late_in_an_episode_visits_all_users() {
+    let server = Server::start().await;
+    let users = [("a", [0.1, 0.9]), ("b", [0.9, 0.9]), ("c", [0.9, 0.1]), ("d", [0.1, 0.1]), ("e", [0.5, 0.95])];
+    let mut flight = SceneFlight::open(&server, "tour", &["uav-0", "uav-1", "uav-2"], &users).await;
+    flight.fly(70).await;
+    flight.uavs.remove("uav-1");
+    flight.fly(100).await;
+    let highest = flight.fly(200).await;
+    assert!(highest < 60.0, "{highest}");
 }
 
 /// A graph that lists what a UAV detects.

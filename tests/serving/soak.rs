@@ -12,8 +12,8 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use qedgix::checkpoint::{Checkpoint, digest, parameter_layout};
-use qedgix::policy::{FleetProfile, FleetStep, LearnedPolicy, Policy};
-use qedgix::serving::FleetInput;
+use qedgix::policy::{FleetProfile, FleetStep, LearnedPolicy, Policy, UserCount};
+use qedgix::serving::{FleetInput, ListedUsers};
 use qedgix::train_config::{Algorithm, Preset, TrainConfig};
 use qedgix::wire::v1;
 use qedgix::wire::v1::act_request::Observation as WireObservation;
@@ -136,8 +136,8 @@ struct Reference {
     policy: Arc<LearnedPolicy>,
     digest: String,
     step: u64,
-    /// Users may be missing: the first graph listed only users that a UAV detected.
-    profile: Option<FleetProfile>,
+    /// The first graph listed only users that a UAV detected.
+    open: bool,
     memory: Vec<f32>,
 }
 
@@ -146,7 +146,7 @@ impl Reference {
         let policy = policies.by_digest[digest].clone();
         let mut memory = vec![0.0; policy.memory_len(uavs, users)];
         policy.start(uavs, users, seed, &mut memory);
-        Self { policy, digest: digest.to_owned(), step: 0, profile: None, memory }
+        Self { policy, digest: digest.to_owned(), step: 0, open: false, memory }
     }
 
     /// The expected heading and Q-values of every UAV in the next slot.
@@ -155,9 +155,16 @@ impl Reference {
             WireObservation::Scene(scene) => FleetInput::try_from(scene).unwrap(),
             WireObservation::Graph(graph) => FleetInput::try_from(graph).unwrap(),
         };
-        if self.step == 0 && observation.content.lists_only_detected() {
-            self.profile = Some(FleetProfile { open: true, ..FleetProfile::default() });
+        let listed = observation.content.listed_users();
+        if self.step == 0 {
+            self.open = listed == ListedUsers::Detected;
         }
+        let users = match listed {
+            _ if !self.open => UserCount::Fixed,
+            ListedUsers::All => UserCount::Listed(observation.fleet.users.len()),
+            _ => UserCount::Unknown,
+        };
+        let profile = FleetProfile { users, ..FleetProfile::default() };
         let ids = observation.fleet.uavs.clone();
         let slot = observation.into_fleet_graph(&*self.policy).unwrap();
         let actions = self.policy.actions();
@@ -166,7 +173,7 @@ impl Reference {
         self.policy.act(&mut [FleetStep {
             env: self.policy.env(),
             graph: &slot,
-            profile: self.profile.as_ref(),
+            profile: Some(&profile),
             step: self.step,
             memory,
             headings: headings_out,

@@ -50,8 +50,9 @@ impl Rule for GreedyGlobal {
         for &(_, i, j) in &pairs {
             target[i].get_or_insert(j);
         }
-        for ((heading, &at), target) in headings.iter_mut().zip(uavs).zip(target) {
-            *heading = target.map_or(0, |j| Headings::new(env, at).toward(users[j]));
+        for (i, ((heading, &at), target)) in headings.iter_mut().zip(uavs).zip(target).enumerate() {
+            let own = FleetProfile::env(slot.profile, env, i);
+            *heading = target.map_or(0, |j| Headings::new(&own, at).toward(users[j]));
         }
     }
 }

@@ -48,7 +48,7 @@ impl<const SHARED: bool> Rule for Sweep<SHARED> {
         let Slot { env, graph, step, profile } = *slot;
         let sight = graph.sight().expect("the caller provides what `needs` requires");
         let sharing = if SHARED { Sharing::Shared } else { Sharing::Own };
-        remember((env, &sight, step), (sharing, FleetProfile::is_open(profile)), memory, &mut Exchange::default());
+        remember((env, &sight, step), (sharing, FleetProfile::users(profile)), memory, &mut Exchange::default());
         sweep_headings((env, &sight, step), memories(memory, graph.users()), profile, headings);
     }
 }

@@ -11,7 +11,7 @@ use columns::Columns;
 use ground::RecentGround;
 
 use super::env_params::EnvParams;
-use super::fleet_profile::{FleetProfile, Place};
+use super::fleet_profile::{FleetProfile, Place, UserCount};
 use super::flight::{Headings, travel_slots};
 use super::memory::{GRID, RememberedUser, UavMemory};
 use super::sight::Sight;
@@ -155,10 +155,10 @@ impl Goals {
         for ((i, &last), memory) in (first..).zip(last).zip(memories) {
             let at = sight.positions[i];
             let place = FleetProfile::place(profile, i, sight.uavs());
-            let open = FleetProfile::is_open(profile);
+            let count = FleetProfile::users(profile);
             let own = FleetProfile::env(profile, env, i);
             let headings = Headings::new(&own, at);
-            let view = View { env: &own, place, open, uavs: sight.uavs(), at, headings, slot: slot as f64, last };
+            let view = View { env: &own, place, count, uavs: sight.uavs(), at, headings, slot: slot as f64, last };
             self.others.clear();
             self.others.extend(sight.detected_uavs(i).map(|(_, at)| at));
             self.push_row(&view, memory);
@@ -169,8 +169,8 @@ impl Goals {
         let Self { users, others, columns, recent, .. } = self;
         users.clear();
         users.extend(memory.users().flatten());
-        let (known, unknown) = (users.len() + memory.users_left_out(), memory.unknown_users(view.open));
-        let since = memory.unknown_since(view.open);
+        let (known, unknown) = (users.len() + memory.users_left_out(), memory.unknown_users(view.count));
+        let since = memory.unknown_since(view.count);
         let ground = recent.of(memory);
         let common = [
             ln1(ground.unsearched as f64 * CELL_SHARE * unknown as f64),
@@ -210,7 +210,7 @@ fn ln1(x: f64) -> f64 {
 struct View<'a> {
     env: &'a EnvParams,
     place: Place,
-    open: bool,
+    count: UserCount,
     uavs: usize,
     at: Point,
     headings: Headings,

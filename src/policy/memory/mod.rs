@@ -13,7 +13,7 @@ mod search;
 
 use self::all_users::AllUsers;
 use self::nearest::{Carrier, NearestUsers};
-use super::{Carry, EnvParams, Sight};
+use super::{Carry, EnvParams, Sight, UserCount};
 use crate::env::Point;
 use crate::nn::simd;
 use crate::threads;
@@ -58,9 +58,6 @@ pub struct UavMemory<'a> {
 }
 
 impl<'a> UavMemory<'a> {
-    /// The memory of a UAV that knows nothing.
-    pub const EMPTY: UavMemory<'static> = UavMemory { ground: &[0.0; GRID], entries: &[], users: 0 };
-
     /// The memory in `numbers`, of length [`uav_memory_len`]`(users)`.
     pub fn new(numbers: &'a [f32], users: usize) -> Self {
         let (ground, entries) = numbers.split_at(GRID);
@@ -83,16 +80,19 @@ impl<'a> UavMemory<'a> {
         })
     }
 
-    /// Number of users that are not known. `open`: there may be more users than N, and those that have gone may have left. Before all
-    /// ground was searched, their number is estimated from the known users per searched ground; afterwards, one is expected to be new.
-    pub fn unknown_users(&self, open: bool) -> usize {
+    /// Number of users that are not known. If their number is unknown, those that have gone may have left; before all ground was searched,
+    /// the number is estimated from the known users per searched ground, and afterwards one is expected to be new.
+    pub fn unknown_users(&self, count: UserCount) -> usize {
         let (known, left_out) = (self.users().flatten().count(), self.users_left_out());
-        let unknown = self.users - known - left_out;
+        let unknown = match count {
+            UserCount::Fixed => return self.users - known - left_out,
+            UserCount::Listed(listed) if self.users <= MAX_REMEMBERED => {
+                return self.users().take(listed).filter(Option::is_none).count();
+            }
+            UserCount::Listed(listed) => return listed.saturating_sub(known + left_out),
+            UserCount::Unknown => (self.users - known - left_out).saturating_sub(self.users_gone()),
+        };
         let searched = search::count(self.ground);
-        if !open {
-            return unknown;
-        }
-        let unknown = unknown.saturating_sub(self.users_gone());
         if searched == CELLS {
             return unknown;
         }
@@ -108,10 +108,10 @@ impl<'a> UavMemory<'a> {
         self.entries.chunks_exact(USER).filter(|user| user[0] <= UNKNOWN && user[4] > 0.0).count()
     }
 
-    /// Slot from which the AoI of users that are not known is counted: 0, or, if the fleet is `open`, the slot in which the present search
+    /// Slot from which the AoI of users that are not known is counted: 0, or, if users come and go, the slot in which the present search
     /// began.
-    pub fn unknown_since(&self, open: bool) -> f64 {
-        if open { f64::from(search::began(self.ground)) } else { 0.0 }
+    pub fn unknown_since(&self, count: UserCount) -> f64 {
+        if count == UserCount::Fixed { 0.0 } else { f64::from(search::began(self.ground)) }
     }
 
     /// Number of known users that the memory has no room for, if the users are spread evenly; 0 for at most [`MAX_REMEMBERED`] users.
@@ -124,8 +124,13 @@ impl<'a> UavMemory<'a> {
     }
 
     /// Whether the ground has to be searched again in slot `slot`.
-    fn begins_search(&self, open: bool, slot: u64) -> bool {
-        search::is_complete(self.ground) && (open || slot >= SEARCH_AGAIN_FROM && self.unknown_users(open) > 0)
+    fn begins_search(&self, count: UserCount, slot: u64) -> bool {
+        let has_reason = || match count {
+            UserCount::Fixed => slot >= SEARCH_AGAIN_FROM && self.unknown_users(count) > 0,
+            UserCount::Listed(_) => self.unknown_users(count) > 0,
+            UserCount::Unknown => true,
+        };
+        search::is_complete(self.ground) && has_reason()
     }
 }
 
@@ -161,8 +166,8 @@ pub enum Sharing {
     Shared,
 }
 
-/// From this slot on, a UAV that has searched all ground and does not know all of N users searches the ground again: users move, and a
-/// user may be out of range while the centre of its cell is in range. Training has shorter episodes.
+/// From this slot on, a UAV of a fixed fleet that has searched all ground and does not know all of N users searches the ground again: users
+/// move, and a user may be out of range while the centre of its cell is in range. Training has shorter episodes.
 pub const SEARCH_AGAIN_FROM: u64 = 200;
 
 /// Buffers for the memories of a fleet, kept between slots.
@@ -175,10 +180,10 @@ pub struct Exchange {
     before: Vec<f32>,
 }
 
-/// Advances the memories of a fleet, one after another in `memories`, to slot `slot`. `open`: there may be more users than N.
+/// Advances the memories of a fleet, one after another in `memories`, to slot `slot`. `count`: how many users there are.
 pub fn remember(
     (env, sight, slot): (&EnvParams, &Sight<'_>, u64),
-    (sharing, open): (Sharing, bool),
+    (sharing, count): (Sharing, UserCount),
     memories: &mut [f32],
     exchange: &mut Exchange,
 ) {
@@ -192,7 +197,7 @@ pub fn remember(
     let parts = nearest.iter_mut().zip(memories.chunks_mut(part * len)).enumerate();
     threads::for_each(parts, |(k, (nearest, memories))| {
         for (i, memory) in (k * part..).zip(memories.chunks_exact_mut(len)) {
-            if UavMemory::new(memory, sight.users()).begins_search(open, slot) {
+            if UavMemory::new(memory, sight.users()).begins_search(count, slot) {
                 search::begin(slot, &mut memory[..GRID]);
             }
             let ground = &mut memory[..GRID];
@@ -262,7 +267,7 @@ mod tests {
         fn see(&mut self, slot: u64, uavs: &[Point], users: &[Point], aoi: &[f32], sharing: Sharing, ranges: Ranges) {
             let graph = FleetGraph::from_scene(uavs, users, aoi, ranges);
             let env = EnvParams { detection_range: ranges.detection, ..EnvParams::default() };
-            remember((&env, &graph.sight().unwrap(), slot), (sharing, false), &mut self.memory, &mut self.exchange);
+            remember((&env, &graph.sight().unwrap(), slot), (sharing, UserCount::Fixed), &mut self.memory, &mut self.exchange);
         }
 
         fn of(&self, uav: usize) -> UavMemory<'_> {
@@ -292,24 +297,28 @@ mod tests {
     }
 
     /// The slot in which the search began, after slots 0 to `slot` in which all ground was in range, and one user at `user`.
-    fn search_began(slot: u64, user: Point, open: bool) -> f64 {
+    fn search_began(slot: u64, user: Point, count: UserCount) -> f64 {
         let env = EnvParams { detection_range: 2.0, ..EnvParams::default() };
         let graph = FleetGraph::from_scene(&[[0.5, 0.5]], &[user], &[1.0], RANGES);
         let mut fleet = Fleet::new(1, 1);
         for slot in 0..=slot {
             let sight = graph.sight().unwrap();
-            remember((&env, &sight, slot), (Sharing::Shared, open), &mut fleet.memory, &mut fleet.exchange);
+            remember((&env, &sight, slot), (Sharing::Shared, count), &mut fleet.memory, &mut fleet.exchange);
         }
-        fleet.of(0).unknown_since(true)
+        fleet.of(0).unknown_since(UserCount::Unknown)
     }
 
     #[test]
     fn the_ground_is_searched_again_for_users_that_are_missing_or_may_be_new() {
         let (found, missed) = ([0.5, 0.6], [0.9, 0.9]);
         let late = SEARCH_AGAIN_FROM;
-        assert_eq!([late - 1, late, late + 7].map(|slot| search_began(slot, missed, false)), [0.0, 200.0, 207.0]);
-        assert_eq!(search_began(late + 7, found, false), 0.0);
-        assert_eq!([0, 1, 7].map(|slot| search_began(slot, found, true)), [0.0, 1.0, 7.0]);
+        assert_eq!([late - 1, late, late + 7].map(|slot| search_began(slot, missed, UserCount::Fixed)), [0.0, 200.0, 207.0]);
+        assert_eq!(search_began(late + 7, found, UserCount::Fixed), 0.0);
+        for count in [UserCount::Unknown, UserCount::Listed(1)] {
+            assert_eq!([0, 1, 7].map(|slot| search_began(slot, missed, count)), [0.0, 1.0, 7.0]);
+        }
+        assert_eq!(search_began(7, found, UserCount::Unknown), 7.0);
+        assert_eq!(search_began(late + 7, found, UserCount::Listed(1)), 0.0);
     }
 
     #[test]
@@ -319,17 +328,17 @@ mod tests {
         fleet.see(0, &[at], &users, &[1.0; 3], Sharing::Own, RANGES);
         let cells: u32 = (0..GRID).map(|row| fleet.of(0).searched(row).count_ones()).sum();
         let share = f64::from(cells) / 400.0;
-        assert_eq!((fleet.of(0).unknown_users(false), fleet.of(0).unknown_since(false)), (2, 0.0));
-        assert_eq!(fleet.of(0).unknown_users(true), (2.0 * (1.0 - share) / share).ceil() as usize);
+        assert_eq!((fleet.of(0).unknown_users(UserCount::Fixed), fleet.of(0).unknown_since(UserCount::Fixed)), (2, 0.0));
+        assert_eq!(fleet.of(0).unknown_users(UserCount::Unknown), (2.0 * (1.0 - share) / share).ceil() as usize);
         search::begin(30, &mut fleet.memory[..GRID]);
         fleet.see(31, &[at], &users[..1].repeat(3), &[1.0; 3], Sharing::Own, RANGES);
-        assert_eq!((fleet.of(0).unknown_users(false), fleet.of(0).unknown_users(true)), (0, 1));
-        assert_eq!((fleet.of(0).unknown_since(false), fleet.of(0).unknown_since(true)), (0.0, 30.0));
+        assert_eq!((fleet.of(0).unknown_users(UserCount::Fixed), fleet.of(0).unknown_users(UserCount::Unknown)), (0, 1));
+        assert_eq!((fleet.of(0).unknown_since(UserCount::Fixed), fleet.of(0).unknown_since(UserCount::Unknown)), (0.0, 30.0));
         search::search(at, 2.0, &mut fleet.memory[..GRID]);
-        assert_eq!(fleet.of(0).unknown_users(true), 0);
+        assert_eq!(fleet.of(0).unknown_users(UserCount::Unknown), 0);
         // Two of them move away: in an open fleet, they may have left.
         fleet.see(32, &[at], &[users[0], users[1], users[1]], &[1.0; 3], Sharing::Own, RANGES);
-        assert_eq!((fleet.of(0).unknown_users(false), fleet.of(0).unknown_users(true)), (2, 0));
+        assert_eq!((fleet.of(0).unknown_users(UserCount::Fixed), fleet.of(0).unknown_users(UserCount::Unknown)), (2, 0));
     }
 
     #[test]

@@ -188,7 +188,7 @@ mod tests {
     use super::super::{Exchange, Sharing, carry, memories, remember};
     use super::*;
     use crate::env::Ranges;
-    use crate::policy::{Carry, EnvParams, FleetGraph};
+    use crate::policy::{Carry, EnvParams, FleetGraph, UserCount};
 
     /// What a UAV knows, as docs/model.md defines it: for each user its entry, of which the first number is 1 if the user is there.
     type Known = BTreeMap<usize, Entry>;
@@ -259,7 +259,7 @@ mod tests {
             let aoi: Vec<f32> = (0..users).map(|j| (j % 7) as f32).collect();
             let graph = FleetGraph::from_scene(&place(uavs), &at, &aoi, ranges);
             let sight = graph.sight().unwrap();
-            remember((&env, &sight, slot), (Sharing::Shared, false), &mut memory, &mut exchange);
+            remember((&env, &sight, slot), (Sharing::Shared, UserCount::Fixed), &mut memory, &mut exchange);
             expected = next_slot(&sight, ranges.detection, slot as f32, &expected);
             for (memory, expected) in memory.chunks_exact(len).zip(&expected) {
                 assert_eq!(&known(memory, users), expected, "slot {slot}");
@@ -271,7 +271,7 @@ mod tests {
         }
         assert!(gone > 0 && full > 0, "{gone} entries of users that have gone, {full} full memories");
         for uav in memories(&memory, users) {
-            assert_eq!(uav.users().flatten().count() + uav.users_left_out() + uav.unknown_users(false), users);
+            assert_eq!(uav.users().flatten().count() + uav.users_left_out() + uav.unknown_users(UserCount::Fixed), users);
         }
     }
 
@@ -305,9 +305,14 @@ mod tests {
                 || [f32::NAN, f32::INFINITY, -1e30, -301.0, 0.5, 1.5, 300.9, 301.0, 0.0, 7.0][rng.random_range(0..10)];
             let mut memory: Vec<f32> = (0..2 * uav_memory_len(users)).map(|_| number()).collect();
             let graph = FleetGraph::from_scene(&[[0.5; 2]; 2], &vec![[0.6; 2]; users], &vec![1.0; users], 0.5);
-            remember((&env, &graph.sight().unwrap(), 9), (Sharing::Shared, false), &mut memory, &mut Exchange::default());
+            remember(
+                (&env, &graph.sight().unwrap(), 9),
+                (Sharing::Shared, UserCount::Fixed),
+                &mut memory,
+                &mut Exchange::default(),
+            );
             for uav in memories(&memory, users) {
-                uav.unknown_users(true);
+                uav.unknown_users(UserCount::Unknown);
                 assert_eq!(uav.users().flatten().count(), MAX_REMEMBERED, "all are detected");
             }
         }

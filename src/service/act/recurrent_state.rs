@@ -10,7 +10,9 @@ use super::request::{Placed, Request, Response};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::service::{App, Error, policies};
-use crate::serving::{FleetMemory, Flight, Members, OutputBuffers, Owner, RecurrentState, Roster, RosterRules, Task, UserMemory};
+use crate::serving::{
+    FleetMemory, Flight, ListedUsers, Members, OutputBuffers, Owner, RecurrentState, Roster, RosterRules, Task, UserMemory,
+};
 
 pub(super) async fn act(
     app: &App,
@@ -32,7 +34,8 @@ pub(super) async fn act(
     let placed = Placed::new(request.input, &policy, flight.as_ref(), request.return_motion)?;
     let sensing = placed.sensing(&policy);
     let Placed { fleet, canonical_of_request, content, speeds, endurance, flight, motion } = placed;
-    let only_detected = implementation.remembers_users() && content.lists_only_detected();
+    let listed = content.listed_users();
+    let open = listed == ListedUsers::Detected && implementation.remembers_users();
     let input = content.into_task_input(fleet.size(), implementation, sensing)?;
     let step = state.as_ref().map_or(0, |state| state.step);
     if let Some(sent) = request.step.filter(|&sent| sent != step) {
@@ -41,10 +44,10 @@ pub(super) async fn act(
     }
     let seed = state.as_ref().map_or_else(|| request.seed.unwrap_or(0), |state| state.seed);
     let before = match &state {
-        None => Roster::new(&fleet, step, only_detected, UserMemory::of(&policy)),
+        None => Roster::new(&fleet, step, open, UserMemory::of(&policy)),
         Some(state) => state.roster(&fleet, &policy)?,
     };
-    let rules = RosterRules { policy: &policy, absent_after: app.absent_after, seed };
+    let rules = RosterRules { policy: &policy, absent_after: app.absent_after, seed, listed };
     let (roster, change) = before.advance(&fleet, step, &rules);
     let memory = match state {
         None => FleetMemory::initial(implementation, before.size(), seed, Vec::new()),

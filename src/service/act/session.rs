@@ -8,7 +8,8 @@ use super::request::{Motion, Placed, Request, Response};
 use crate::invalid::Invalid;
 use crate::service::{App, Error};
 use crate::serving::{
-    FleetIds, Flight, Listed, LoadedPolicy, PolicySpec, Session, StepStart, TableEntry, Task, TaskInput, VersionSelector,
+    FleetIds, Flight, Listed, ListedUsers, LoadedPolicy, PolicySpec, Session, StepStart, TableEntry, Task, TaskInput,
+    VersionSelector,
 };
 
 pub(super) async fn act(app: &App, session: &Session, request: Request, deadline: Option<Instant>) -> Result<Response, Error> {
@@ -31,8 +32,8 @@ pub(super) async fn act(app: &App, session: &Session, request: Request, deadline
 pub(super) struct SessionStep {
     fleet: FleetIds,
     canonical_of_request: Vec<u32>,
-    /// Whether the input lists only what a UAV detects.
-    only_detected: bool,
+    /// Which users the input lists.
+    users: ListedUsers,
     input: TaskInput,
     speeds: Vec<f64>,
     endurance: Vec<f64>,
@@ -47,10 +48,10 @@ impl SessionStep {
     pub(super) fn new(placed: Placed, policy: &LoadedPolicy, step: Option<u64>, run_id: Option<String>) -> Result<Self, Invalid> {
         let sensing = placed.sensing(policy);
         let Placed { fleet, canonical_of_request, content, speeds, endurance, flight, motion } = placed;
-        let only_detected = policy.implementation.remembers_users() && content.lists_only_detected();
+        let users = content.listed_users();
         let input = content.into_task_input(fleet.size(), &*policy.implementation, sensing)?;
         let explain = false;
-        Ok(Self { fleet, canonical_of_request, only_detected, input, speeds, endurance, flight, motion, step, run_id, explain })
+        Ok(Self { fleet, canonical_of_request, users, input, speeds, endurance, flight, motion, step, run_id, explain })
     }
 }
 
@@ -62,20 +63,9 @@ pub(super) async fn advance(
     deadline: Option<Instant>,
 ) -> Result<Response, Error> {
     let policy = session.policy().clone();
-    let SessionStep {
-        fleet,
-        canonical_of_request,
-        only_detected,
-        input,
-        speeds,
-        endurance,
-        flight,
-        motion,
-        step,
-        run_id,
-        explain,
-    } = step;
-    let listed = Listed { fleet: &fleet, only_detected };
+    let SessionStep { fleet, canonical_of_request, users, input, speeds, endurance, flight, motion, step, run_id, explain } =
+        step;
+    let listed = Listed { fleet: &fleet, users };
     let decision = match session.begin_step(listed, step, run_id.as_deref(), app.absent_after).await? {
         StepStart::Repeated(decision) => decision,
         StepStart::Next(mut pending) => {

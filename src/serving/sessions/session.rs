@@ -17,8 +17,8 @@ use crate::invalid::Invalid;
 use crate::serving::memory_budget::MemoryCharge;
 use crate::serving::table::{LastUse, TableEntry};
 use crate::serving::{
-    Decision, Error, FleetChange, FleetIds, FleetMemory, Flight, FlightOptions, LoadedPolicy, OutputBuffers, Owner, PolicyRef,
-    Roster, RosterRules, TaskOutput, UserMemory, Warning,
+    Decision, Error, FleetChange, FleetIds, FleetMemory, Flight, FlightOptions, ListedUsers, LoadedPolicy, OutputBuffers, Owner,
+    PolicyRef, Roster, RosterRules, TaskOutput, UserMemory, Warning,
 };
 
 /// Maximum number of former runs that a session remembers, in order to reject them.
@@ -63,8 +63,8 @@ pub struct SessionOptions {
 pub struct Listed<'a> {
     /// The UAVs and users that it lists.
     pub fleet: &'a FleetIds,
-    /// Whether it lists only what a UAV detects, so that there may be more users.
-    pub only_detected: bool,
+    /// Which users these are.
+    pub users: ListedUsers,
 }
 
 /// A fleet whose memory the server keeps, pinned to one policy version.
@@ -134,8 +134,9 @@ struct Followed {
 impl Followed {
     /// In the first step of a run.
     fn first(listed: Listed<'_>, rules: &RosterRules<'_>) -> Self {
-        let Listed { fleet, only_detected } = listed;
-        let roster = only_detected.then(|| Roster::new(fleet, 0, true, UserMemory::of(rules.policy)));
+        let Listed { fleet, users } = listed;
+        let open = users == ListedUsers::Detected && rules.policy.implementation.remembers_users();
+        let roster = open.then(|| Roster::new(fleet, 0, true, UserMemory::of(rules.policy)));
         let change = roster.as_ref().map(|roster| Box::new(roster.advance(fleet, 0, rules).1));
         Self { roster, change, fleet: Some(fleet.clone()) }
     }
@@ -245,7 +246,7 @@ impl Session {
         let first = new_run.is_some() || state.fleet.is_none();
         let run = new_run.as_deref().or(state.run_id.as_deref());
         let seed = state.seed.unwrap_or_else(|| session_seed(&self.id, run));
-        let rules = RosterRules { policy: &self.policy, absent_after, seed };
+        let rules = RosterRules { policy: &self.policy, absent_after, seed, listed: listed.users };
         let Followed { roster, change, fleet: ids } =
             if first { Followed::first(listed, &rules) } else { self.follow(&state, fleet, step, &rules)? };
         let buffer = std::mem::take(&mut state.spare_memory);

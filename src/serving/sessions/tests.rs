@@ -7,7 +7,7 @@ use super::*;
 use crate::clock::ManualClock;
 use crate::invalid::Invalid;
 use crate::policy::{EnvParams, Policy, RequiredInput};
-use crate::serving::{Decision, FleetIds, FleetMemory, Limits, PolicyRef, TaskOutput};
+use crate::serving::{Decision, FleetIds, FleetMemory, Limits, ListedUsers, PolicyRef, TaskOutput};
 
 /// Its memory is the seed at first; it decides nothing.
 struct SeedPolicy;
@@ -66,7 +66,7 @@ fn fleet(ids: [&str; 2]) -> FleetIds {
 
 async fn begin<'a>(session: &'a Session, uavs: [&str; 2], step: Option<u64>, run: Option<&str>) -> Result<StepStart<'a>, Error> {
     let fleet = fleet(uavs);
-    session.begin_step(Listed { fleet: &fleet, only_detected: false }, step, run, 100).await
+    session.begin_step(Listed { fleet: &fleet, users: ListedUsers::Named }, step, run, 100).await
 }
 
 async fn step_once(session: &Session, step: Option<u64>, run: Option<&str>) -> Result<(u64, Vec<f32>), &'static str> {

@@ -22,10 +22,9 @@ pub(super) struct Tour;
 
 /// Share of the transmission range that a user may move before the fleet plans again.
 const MAX_MOVE: f64 = 0.5;
-/// Maximum number of slots that a plan looks ahead.
-const MAX_SLOTS: usize = 200;
-/// Smallest number, used near the end of an episode and after it.
-const MIN_SLOTS: usize = 20;
+/// A plan looks ahead as many slots as an episode has, but at least and at most these. A plan that looked to the end of the episode only
+/// could leave out users that are far away; a session flies it much longer.
+const SLOTS: std::ops::RangeInclusive<usize> = 20..=200;
 
 impl Rule for Tour {
     const NAME: &'static str = "tour";
@@ -45,11 +44,10 @@ impl Rule for Tour {
     fn start(&self, _seed: u64, _memory: &mut [f32]) {}
 
     fn decide(&self, slot: &Slot<'_>, memory: &mut [f32], headings: &mut [u8]) {
-        let Slot { env, graph, step, .. } = *slot;
+        let Slot { env, graph, .. } = *slot;
         let (uavs, users) = (uav_positions(graph), user_positions(graph));
         let mut states = read_plan(env, uavs.len(), users, memory).unwrap_or_else(|| {
-            let left = env.slots.saturating_sub(usize::try_from(step).unwrap_or(usize::MAX));
-            let slots = left.clamp(MIN_SLOTS, MAX_SLOTS);
+            let slots = env.slots.clamp(*SLOTS.start(), *SLOTS.end());
             let problem = Problem { env, uavs, users, aoi: graph.aoi(), slots };
             let tours = plan::tours(&problem, capacity(uavs.len(), users.len()));
             write_plan(&tours, users, memory);
