@@ -42,8 +42,12 @@ fn describe() {
     describe_counter!("qedgix_replica_failures_total", "Replica: questions to the primary that failed.");
     describe_counter!("http_requests_total", "REST requests completed.");
     describe_histogram!("http_request_duration_seconds", "Time from a REST request to the header of its response.");
-    describe_gauge!("qedgix_connections", "Open connections, including those of local workers.");
-    describe_counter!("qedgix_connections_refused_total", "Connections closed at once because of --max-connections.");
+    describe_gauge!("qedgix_connections", "Open connections, including those of workers.");
+    describe_counter!(
+        "qedgix_connections_refused_total",
+        "Connections closed at once because of --max-connections or --max-connections-per-peer."
+    );
+    describe_counter!("qedgix_connections_ended_total", "Connections that the server ended, by reason.");
     describe_histogram!("qedgix_act_queue_seconds", "Time a fleet waited in the queue of the engine.");
     describe_histogram!("qedgix_act_compute_seconds", "Time of the forward pass that computed a fleet.");
     describe_histogram!("qedgix_act_batch_size", "Fleets per forward pass.");
