@@ -15,8 +15,7 @@ import math
 import random
 import statistics
 
-SPEED, TRANSMISSION, DETECTION = 0.12, 0.12, 0.28
-WORLD = {"speed": SPEED, "transmission_range": TRANSMISSION, "detection_range": DETECTION, "slots": 80}
+TRANSMISSION, DETECTION = 0.12, 0.28
 
 
 class Server:
@@ -35,9 +34,10 @@ class Server:
 
 
 class World:
-    """Three UAVs and five users."""
+    """Three UAVs and five users. `speed`: distance that a UAV flies per slot."""
 
-    def __init__(self, seed):
+    def __init__(self, seed, speed):
+        self.speed = speed
         self.random = random.Random(seed)
         self.uavs = [[0.5, 0.5] for _ in range(3)]
         self.users, self.born = {}, 0
@@ -66,7 +66,7 @@ class World:
         for at, action in zip(self.uavs, actions):
             if action.get("heading_deg") is not None:
                 angle = math.radians(action["heading_deg"])
-                move = (SPEED * math.cos(angle), SPEED * math.sin(angle))
+                move = (self.speed * math.cos(angle), self.speed * math.sin(angle))
                 at[:] = [min(max(x + step, 0.0), 1.0) for x, step in zip(at, move)]
         for name, (to, _) in self.users.items():
             if any(math.dist(at, to) <= TRANSMISSION for at in self.uavs):
@@ -76,11 +76,13 @@ class World:
         return statistics.fmean(slot + 1 - last for _, last in self.users.values())
 
 
-def fly(server, policy, seed, slots, every):
+def fly(server, policy, seed, args):
     """Mean AoI over one session."""
-    world, ages = World(seed), []
-    session = server.call("POST", "/sessions", {"policy": policy, "seed": seed, "world": WORLD})["session_id"]
-    for slot in range(slots):
+    world, ages, every = World(seed, args.speed), [], args.every
+    ranges = {"transmission_range": TRANSMISSION, "detection_range": DETECTION}
+    options = {"policy": policy, "seed": seed, "world": {"speed": args.speed, "slots": 80, **ranges}}
+    session = server.call("POST", "/sessions", options)["session_id"]
+    for slot in range(args.slots):
         if every and slot and slot % every == 0:
             del world.users[min(world.users)]
             world.add_user(slot)
@@ -96,6 +98,7 @@ def main() -> None:
     parser.add_argument("--server", default="127.0.0.1:8080", help="HTTP address of the server [default: 127.0.0.1:8080]")
     parser.add_argument("--policy", action="append", required=True, help="name of a policy; may be repeated")
     parser.add_argument("--slots", type=int, default=400, help="slots per session [default: 400]")
+    parser.add_argument("--speed", type=float, default=0.04, help="distance that a UAV flies per slot [default: 0.04]")
     parser.add_argument("--every", type=int, default=40, help="slots between two changes; 0: none [default: 40]")
     parser.add_argument("--worlds", type=int, default=64, help="number of sessions, each in another world [default: 64]")
     args = parser.parse_args()
@@ -104,7 +107,7 @@ def main() -> None:
     server = Server(args.server)
     print("| policy | mean AoI | 95 % interval |\n| --- | --- | --- |")
     for policy in args.policy:
-        means = [fly(server, policy, seed, args.slots, args.every) for seed in range(args.worlds)]
+        means = [fly(server, policy, seed, args) for seed in range(args.worlds)]
         mean, half = statistics.fmean(means), 1.96 * statistics.stdev(means) / len(means) ** 0.5
         print(f"| `{policy}` | {mean:.2f} | {mean - half:.2f} to {mean + half:.2f} |", flush=True)
 
