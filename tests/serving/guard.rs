@@ -198,6 +198,21 @@ fn large_groups_are_kept_apart() {
 }
 
 #[test]
+fn what_constraints_cost_is_estimated() {
+    // What the thread of a caller may do, and what threads for heavy tasks do, in units of work.
+    let (inline, heavy) = (1 << 13, 1 << 16);
+    let apart = Guard { min_separation: 0.05, ..Guard::default() };
+    let row = |uavs: usize, by: f64| (0..uavs).map(|i| [by * i as f64, 0.5]).collect::<Vec<Point>>();
+    let cost = |guard: &Guard, positions: &[Point]| guard.work(Some(positions), positions.len(), 0.04);
+    assert!(cost(&apart, &row(3, 0.01)) < inline);
+    assert!(cost(&apart, &row(12, 0.2)) < inline, "far from each other");
+    assert!(cost(&apart, &row(12, 0.01)) > heavy);
+    assert!(apart.work(None, 12, 0.04) > heavy, "positions are not known yet");
+    let zones = Guard { no_fly: vec![Zone::Polygon(vec![[0.0; 2]; 64]); 64], ..Guard::default() };
+    assert!(cost(&zones, &row(3, 0.2)) > inline && cost(&zones, &row(12, 0.2)) > heavy);
+}
+
+#[test]
 fn a_uav_outside_of_the_area_does_not_jump_back() {
     let zone = Zone::Circle([1.2, 0.5], 0.05);
     let guard = Guard { no_fly: vec![zone], ..Guard::default() };
