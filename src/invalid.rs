@@ -36,7 +36,7 @@ impl Invalid {
 
     /// `field` has a `value` of the right type that is not accepted: HTTP status 400, code `invalid_argument`.
     pub fn new(field: impl Into<String>, value: impl Display, expected: impl Into<String>) -> Self {
-        let value = Some(cut(value.to_string()));
+        let value = Some(cut(shorten_numbers(value.to_string())));
         Self { field: field.into(), value, expected: expected.into(), kind: InvalidKind::Value }
     }
 
@@ -79,7 +79,18 @@ impl Invalid {
             return Self::schema(path, format!("{:?} twice", quoted()), "each field once");
         }
         match message.split_once(", expected ") {
-            Some((received, _)) => Self::schema(path, received_value(received), expectation(&message)),
+            Some((received, wanted)) => {
+                let value = received_value(received);
+                // A whole number that is too large looks as if it were accepted, unless the limit is named.
+                let limit = match wanted {
+                    "u64" | "usize" => Some(u64::MAX),
+                    "u32" => Some(u32::MAX.into()),
+                    _ => None,
+                };
+                let too_large = value.parse().is_ok_and(|number: f64| number > 0.0 && number.fract() == 0.0);
+                let limit = limit.filter(|_| too_large).map_or_else(String::new, |limit| format!(", at most {limit}"));
+                Self::schema(path, value, expectation(&message) + &limit)
+            }
             None => Self::schema(path, message, "a value of the documented type"),
         }
     }
@@ -134,6 +145,29 @@ pub fn nearest<'a>(word: &str, known: impl IntoIterator<Item = &'a str>) -> Opti
     others.filter(|(distance, _)| *distance <= (length / 3).max(1)).min_by_key(|(distance, _)| *distance).map(|(_, other)| other)
 }
 
+/// `text` with its very long numbers, such as the 309 digits of 1e308, in scientific form.
+fn shorten_numbers(text: String) -> String {
+    /// Longer than any whole number of 64 bits, and than any other number of 17 digits that is not tiny.
+    const MAX_DIGITS: usize = 24;
+    let is_digit = |c: char| c.is_ascii_digit() || c == '.';
+    if text.len() <= MAX_DIGITS || text.split(|c| !is_digit(c)).all(|digits| digits.len() <= MAX_DIGITS) {
+        return text;
+    }
+    let mut short = String::new();
+    let mut rest = text.as_str();
+    while !rest.is_empty() {
+        let (digits, after) = rest.split_at(rest.find(|c| !is_digit(c)).unwrap_or(rest.len()));
+        match digits.parse::<f64>() {
+            Ok(number) if digits.len() > MAX_DIGITS && number.is_finite() => short += &format!("{number:e}"),
+            _ => short += digits,
+        }
+        let (between, after) = after.split_at(after.find(is_digit).unwrap_or(after.len()));
+        short += between;
+        rest = after;
+    }
+    short
+}
+
 fn cut(value: String) -> String {
     if value.chars().count() <= Invalid::MAX_VALUE_LEN {
         return value;
@@ -169,6 +203,11 @@ pub fn expectation(error: &impl Display) -> String {
     }
 }
 
+/// `value` without what rounding added to it: lengths in units of a caller have been in other units.
+pub fn tidy(value: f64) -> f64 {
+    format!("{value:.11e}").parse().unwrap_or(value)
+}
+
 /// Checks that `value` lies in `range`. NaN lies in no range.
 ///
 /// # Errors
@@ -180,7 +219,8 @@ where
     if range.contains(&value) {
         return Ok(());
     }
-    Err(Invalid::new(field, &value, format!("a number from {} to {}", range.start(), range.end())))
+    let ends = [range.start(), range.end()].map(|end| shorten_numbers(end.to_string()));
+    Err(Invalid::new(field, &value, format!("a number from {} to {}", ends[0], ends[1])))
 }
 
 #[cfg(test)]
@@ -219,6 +259,16 @@ mod tests {
                 "unknown variant `ppo`, expected one of `qmix`, `vdn`",
                 owned("algorithm", "\"ppo\"", "one of qmix, vdn", InvalidKind::Schema),
             ),
+            (
+                "seed",
+                "invalid value: floating point `18446744073709551616.0`, expected u64",
+                owned(
+                    "seed",
+                    "18446744073709551616.0",
+                    "a whole number, 0 or more, at most 18446744073709551615",
+                    InvalidKind::Schema,
+                ),
+            ),
             ("a", "missing field `x`", owned("a.x", "", "a value", InvalidKind::Schema)),
             ("", "missing field `x`", owned("x", "", "a value", InvalidKind::Schema)),
             ("a.y", "unknown field `y`, expected `x`", owned("a.y", "", "x", InvalidKind::UnknownField)),
@@ -250,6 +300,19 @@ mod tests {
         assert_eq!(field.suggestion(), Some("learning_rate"));
         assert_eq!(Invalid::new("algorithm", "\"qmx\"", "one of qmix, vdn").suggestion(), Some("qmix"));
         assert_eq!(Invalid::new("uavs", 5000, "at most 4096").suggestion(), None);
+    }
+
+    #[test]
+    fn long_numbers_are_in_scientific_form() {
+        let value = |value: &dyn Display| Invalid::new("f", value, "less").value.unwrap();
+        assert_eq!(value(&1e308), "1e308");
+        assert_eq!(value(&-2.5e-300), "-2.5e-300");
+        assert_eq!(value(&format!("({}, 0.5)", 1e200)), "(1e200, 0.5)");
+        for plain in ["18446744073709551615", "-0.1234567890123456789", "1.5", "a.b.c", ""] {
+            assert_eq!(value(&plain), plain);
+        }
+        let error = in_range("f", -1.0, 0.0..=1e30).unwrap_err();
+        assert_eq!(error.to_string(), "f: got -1, expected a number from 0 to 1e30");
     }
 
     #[test]

@@ -16,7 +16,7 @@ use crate::serving::{Constraint, ConstraintOptions};
 pub struct Frame {
     /// The corner of the area with the smallest coordinates along its axes. Default: (0, 0).
     origin: Option<Origin>,
-    /// Side of a square area; stands for a width or height that is missing.
+    /// Side of a square area; instead of `width` and `height`.
     #[schema(minimum = 1e-6, maximum = 1e9)]
     side: Option<f64>,
     /// Length along the x axis of the area.

@@ -238,6 +238,31 @@ where
     Option::deserialize(deserializer).map(|object| Some(object.map(|Object(entries)| entries)))
 }
 
+/// Longest document that is read again to explain an error.
+const MAX_EXPLAINED: usize = 1 << 20;
+
+/// The error of a document that has something else at `path` than one of the words that are accepted there: for the parser, that is
+/// not JSON at all. None if the document is not JSON indeed.
+fn not_a_word<T: DeserializeOwned>(body: &[u8], path: &serde_path_to_error::Path) -> Option<Invalid> {
+    use serde_path_to_error::Segment;
+    let mut document: Value = serde_json::from_slice(body.get(..body.len().min(MAX_EXPLAINED))?).ok()?;
+    let mut place = &mut document;
+    for segment in path {
+        place = match segment {
+            Segment::Seq { index } => place.get_mut(*index)?,
+            Segment::Map { key } => place.get_mut(key)?,
+            Segment::Enum { .. } | Segment::Unknown => return None,
+        };
+    }
+    let value = std::mem::take(place).to_string();
+    // A word is read as a word, so this error lists those that are accepted.
+    *place = Value::String(value.clone());
+    let error = serde_path_to_error::deserialize::<_, T>(ObjectOnly(document)).err()?;
+    let path = error.path().to_string();
+    let listed = Invalid::from_parser(&path, error.inner());
+    Some(Invalid::schema(path, value, listed.expected))
+}
+
 /// Reads a JSON document.
 ///
 /// # Errors
@@ -246,12 +271,12 @@ pub fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, service::Error> {
     let mut deserializer = serde_json::Deserializer::from_slice(body);
     let document = serde_path_to_error::deserialize(ObjectOnly(&mut deserializer)).map_err(|e| {
         let path = e.path().to_string();
-        let e = e.into_inner();
-        if e.is_data() {
-            Invalid::from_parser(if path == "." { "" } else { &path }, &e)
-        } else {
-            Invalid::new("body", format!("{} bytes that are not JSON ({e})", body.len()), "a JSON document")
+        let inner = e.inner();
+        if inner.is_data() {
+            return Invalid::from_parser(if path == "." { "" } else { &path }, inner);
         }
+        let not_json = || Invalid::new("body", format!("{} bytes that are not JSON ({inner})", body.len()), "a JSON document");
+        not_a_word::<T>(body, e.path()).unwrap_or_else(not_json)
     })?;
     deserializer.end().map_err(|e| Invalid::new("body", format!("more than one document ({e})"), "one JSON document"))?;
     Ok(document)
@@ -321,6 +346,25 @@ mod tests {
             let error = serde_json::from_str::<Free>(twice).unwrap_err();
             assert!(error.to_string().starts_with("duplicate field `a`"), "{twice}: {error}");
         }
+    }
+
+    #[test]
+    fn what_is_not_a_word_is_not_called_malformed() {
+        #[derive(Debug, Deserialize)]
+        #[serde(rename_all = "snake_case")]
+        enum Word {
+            Clamp,
+            Free,
+        }
+        #[derive(Debug, Deserialize)]
+        struct Of {
+            words: Vec<Word>,
+        }
+        let error = |body: &str| parse::<Of>(body.as_bytes()).unwrap_err().to_string();
+        assert_eq!(error(r#"{"words": ["clamp", 9]}"#), "words[1]: got 9, expected clamp or free");
+        assert_eq!(error(r#"{"words": [true]}"#), "words[0]: got true, expected clamp or free");
+        assert!(error(r#"{"words": ["clamp", 9}"#).contains("not JSON"));
+        assert_eq!(parse::<Of>(br#"{"words": ["free"]}"#).unwrap().words.len(), 1);
     }
 
     #[test]

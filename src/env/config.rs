@@ -16,6 +16,17 @@ pub enum Boundary {
     Free,
 }
 
+impl Boundary {
+    /// Where a UAV that flies from `from` to `to` along one axis ends, in an area of length `extent` in the middle of [0, 1]. A UAV that is
+    /// outside of the area does not jump back: it gets no further away.
+    pub fn limit(self, from: f64, to: f64, extent: f64) -> f64 {
+        match self {
+            Self::Clamp => to.clamp(from.min((1.0 - extent) / 2.0), from.max(f64::midpoint(1.0, extent))),
+            Self::Free => to,
+        }
+    }
+}
+
 /// Positions of the UAVs in slot 0.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

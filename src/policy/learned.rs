@@ -218,6 +218,13 @@ impl Policy for LearnedPolicy {
         Reach::Links(graph.max(hops).max(shared))
     }
 
+    fn rule_in(&self, env: &EnvParams) -> Option<&'static str> {
+        let config = self.agent.config();
+        let advised = !config.advice.is_none() && !self.trained.contains(1, env);
+        let rule = if config.memory.sharing() == Some(memory::Sharing::Shared) { "sweep-shared" } else { "sweep" };
+        advised.then_some(rule)
+    }
+
     fn is_cheap(&self) -> bool {
         self.agent.config().hops <= 1
     }

@@ -154,6 +154,11 @@ pub trait Policy: Send + Sync {
         32 * uavs + users + detections
     }
 
+    /// The rule that decides instead of the policy in a world outside of its training, if it has one.
+    fn rule_in(&self, _env: &EnvParams) -> Option<&'static str> {
+        None
+    }
+
     /// Whether the time for a slot is about proportional to its nodes and detections. Small fleets of such policies can be computed
     /// on the thread that received the request.
     fn is_cheap(&self) -> bool {

@@ -14,7 +14,7 @@ pub enum Error {
     #[error(transparent)]
     Invalid(#[from] Invalid),
     /// The resource does not exist.
-    #[error("no {what} {id:?}{}", near.as_ref().map_or_else(String::new, |near| format!("; did you mean {near}?")))]
+    #[error("{}", crate::serving::not_found_message(what, id, near.as_deref()))]
     NotFound {
         /// `policy`, `session`, `job`, ...
         what: &'static str,

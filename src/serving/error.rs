@@ -10,7 +10,7 @@ pub enum Error {
     #[error(transparent)]
     Invalid(#[from] Invalid),
     /// The resource does not exist and did not expire recently.
-    #[error("no {what} {id:?}{}", near.as_ref().map_or_else(String::new, |near| format!("; did you mean {near}?")))]
+    #[error("{}", not_found_message(what, id, near.as_deref()))]
     NotFound {
         /// `policy`, `session`, ...
         what: &'static str,
@@ -39,6 +39,15 @@ pub enum Error {
     /// The server failed: a policy panicked, or the engine lost a request.
     #[error("{0}")]
     Internal(String),
+}
+
+/// The message about a resource that does not exist.
+pub fn not_found_message(what: &str, id: &str, near: Option<&str>) -> String {
+    match (what, id.split_once([':', '@'])) {
+        ("policy version", Some((name, version))) => format!("policy {name} has no version {version}"),
+        ("policy alias", Some((name, alias))) => format!("policy {name} has no alias {alias}"),
+        _ => format!("no {what} {id:?}{}", near.map_or_else(String::new, |near| format!("; did you mean {near}?"))),
+    }
 }
 
 impl Error {

@@ -4,8 +4,9 @@
 //! policy's detection range and needs: it computes the detections of a scene, and completes a graph.
 
 use super::FleetIds;
+use super::frame::Frame;
 use crate::env::{Point, Ranges};
-use crate::invalid::Invalid;
+use crate::invalid::{Invalid, tidy};
 use crate::policy::{Detection, FleetGraph, Policy, RequiredInput, estimate_detections};
 
 /// Maximum number of nodes of one fleet.
@@ -201,6 +202,17 @@ impl SceneOrGraph {
         }
     }
 
+    /// The request's `field` of UAV `i`. `canonical_of_request`: see [`FleetInput`].
+    pub fn uav_field(&self, i: usize, canonical_of_request: &[u32], field: &str) -> String {
+        match self {
+            Self::Scene(_) => {
+                let place = canonical_of_request.iter().position(|&canonical| canonical as usize == i).unwrap_or(i);
+                format!("scene.uavs[{place}].{field}")
+            }
+            Self::Graph(graph) => graph.uav_field(i, field),
+        }
+    }
+
     /// The position of each UAV, where known.
     pub fn uav_positions(&self) -> Vec<Option<Point>> {
         match self {
@@ -243,12 +255,14 @@ pub struct Sensing {
     /// Whether, where only one of two nodes of a graph reports the other, both detect each other. What UAVs report of users holds for both in
     /// any case, unless the user reports detections itself.
     pub symmetric: bool,
+    /// The frame of the caller, for errors in its units.
+    pub frame: Option<Frame>,
 }
 
 impl Sensing {
     /// That of the environment of `policy`, symmetric.
     pub fn of(policy: &dyn Policy) -> Self {
-        Self { ranges: policy.ranges(), symmetric: true }
+        Self { ranges: policy.ranges(), symmetric: true, frame: None }
     }
 }
 
@@ -316,13 +330,10 @@ impl ReportedGraph {
         if needs == RequiredInput::OwnPositions
             && let Some(i) = self.positions.iter().position(Option::is_none)
         {
-            let field = match self.form {
-                GraphForm::Nodes => format!("graph.nodes[{}].position", self.request_of_canonical[i]),
-                GraphForm::Edges => "uav_positions".into(),
-            };
+            let field = self.uav_field(i, "position");
             return Err(Invalid::missing(field, "the position of the UAV, which this policy needs"));
         }
-        self.check_ranges(ranges)?;
+        self.check_ranges(sensing)?;
         if !sensing.symmetric {
             self.remove_mirrored();
         }
@@ -351,6 +362,14 @@ impl ReportedGraph {
         Ok(FleetGraph::from_flat_detections(positions, uavs, self.aoi, offsets, detections))
     }
 
+    /// The request's `field` of UAV `i`. Edges have no other than their position.
+    fn uav_field(&self, i: usize, field: &str) -> String {
+        match self.form {
+            GraphForm::Nodes => format!("graph.nodes[{}].{field}", self.request_of_canonical[i]),
+            GraphForm::Edges => "uav_positions".into(),
+        }
+    }
+
     /// The request's field that holds the relative coordinate x (`axis` 0) or y (1) of detection `place` of `node`.
     pub fn rel_field(&self, node: usize, place: u32, axis: usize) -> String {
         match self.form {
@@ -373,18 +392,24 @@ impl ReportedGraph {
     }
 
     /// Rejects detections far beyond the range: the caller uses other units, or a sensor that the policy was not trained with.
-    pub(super) fn check_ranges(&self, ranges: Ranges) -> Result<(), Invalid> {
+    pub(super) fn check_ranges(&self, Sensing { ranges, frame, .. }: Sensing) -> Result<(), Invalid> {
         let uavs = self.positions.len();
         for (node, list) in self.detections.iter().enumerate() {
             for detection in list.iter().filter(|d| !d.mirrored) {
                 let range = ranges.between(node, detection.target as usize, uavs);
                 if !is_within(&detection.rel, range * RANGE_TOLERANCE) {
-                    let [x, y] = detection.rel;
+                    let [x, y] = frame.map_or(detection.rel, |frame| frame.vector_out(detection.rel)).map(tidy);
                     let field = self.rel_field(node, detection.request_index, usize::from(y.abs() > x.abs()));
-                    let expected = format!(
-                        "a position within about the range of the policy ({range} sides of the square); for other units describe the \
-                         area by a frame, for another sensor a world"
-                    );
+                    let expected = match frame {
+                        Some(frame) => format!(
+                            "a position within about the detection range ({}); for another sensor describe a world",
+                            tidy(frame.length_out(range))
+                        ),
+                        None => format!(
+                            "a position within about the range of the policy ({range} sides of the square); for other units describe the \
+                             area by a frame, for another sensor a world"
+                        ),
+                    };
                     return Err(Invalid::new(field, format!("({x}, {y})"), expected));
                 }
             }

@@ -1,11 +1,12 @@
-//! How a caller describes its fleet, and the world that the fleet flies in: the frame of its coordinates, the world where it differs from
-//! that of the policy, and what detections mean. Policies compute in the unit square; this file translates.
+//! How a caller describes its fleet, and the world that the fleet flies in: the frame of its coordinates (`frame` translates them), the
+//! world where it differs from that of the policy, and what detections mean.
 
 use std::sync::Arc;
 
+use super::frame::{Frame, FrameOptions};
 use super::{Guard, Scene, SceneOrGraph, Sensing, Zone};
 use crate::env::{Boundary, DIRECTIONS, EnvConfig, Point};
-use crate::invalid::{Invalid, in_range};
+use crate::invalid::{Invalid, in_range, tidy};
 use crate::policy::{EnvParams, Policy};
 
 /// Largest distance of a coordinate from the unit square. Beyond, the caller uses other units.
@@ -24,23 +25,22 @@ pub struct FlightOptions {
     pub constraints: Option<ConstraintOptions>,
 }
 
+impl FlightOptions {
+    /// The first field of the request that these options come from.
+    pub fn first_field(&self) -> &'static str {
+        match self {
+            Self { frame: Some(_), .. } => "frame",
+            Self { constraints: Some(_), .. } => "constraints",
+            Self { world, .. } if *world != WorldOptions::default() => "world",
+            _ => "symmetric",
+        }
+    }
+}
+
 impl Default for FlightOptions {
     fn default() -> Self {
         Self { frame: None, world: WorldOptions::default(), symmetric: true, constraints: None }
     }
-}
-
-/// The area that a fleet flies in, a rectangle in the coordinates of the caller.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct FrameOptions {
-    /// The corner with the smallest coordinates along the axes of the area.
-    pub origin: Point,
-    /// Length along the x axis of the area.
-    pub width: f64,
-    /// Length along the y axis of the area.
-    pub height: f64,
-    /// Direction of the x axis of the area, in degrees counter-clockwise from the x axis of the caller.
-    pub rotation_deg: f64,
 }
 
 /// The world of a fleet; absent: that of the policy.
@@ -134,78 +134,6 @@ pub struct Warning {
     pub message: String,
 }
 
-/// The translation between the coordinates of a caller and the unit square. The area lies in the middle of the square, its longer side
-/// is as long as that of the square.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Frame {
-    options: FrameOptions,
-    /// Length of the square's side.
-    scale: f64,
-    /// Direction of the x axis of the area.
-    axis: [f64; 2],
-}
-
-impl Frame {
-    /// The frame of these options.
-    ///
-    /// # Errors
-    /// [`Invalid`] for the first option that is out of range.
-    pub fn new(options: FrameOptions) -> Result<Self, Invalid> {
-        const LENGTH: std::ops::RangeInclusive<f64> = 1e-6..=1e9;
-        in_range("frame.origin.x", options.origin[0], -1e9..=1e9)?;
-        in_range("frame.origin.y", options.origin[1], -1e9..=1e9)?;
-        in_range("frame.width", options.width, LENGTH)?;
-        in_range("frame.height", options.height, LENGTH)?;
-        in_range("frame.rotation_deg", options.rotation_deg, -360.0..=360.0)?;
-        let (width, height) = (options.width, options.height);
-        if width.max(height) > 100.0 * width.min(height) {
-            return Err(Invalid::new(
-                "frame",
-                format!("{width} x {height}"),
-                "a longer side of at most 100 times the shorter one",
-            ));
-        }
-        // Exact for the axes.
-        let (sin, cos) = match options.rotation_deg.rem_euclid(360.0) {
-            0.0 => (0.0, 1.0),
-            90.0 => (1.0, 0.0),
-            180.0 => (0.0, -1.0),
-            270.0 => (-1.0, 0.0),
-            other => other.to_radians().sin_cos(),
-        };
-        Ok(Self { options, scale: width.max(height), axis: [cos, sin] })
-    }
-
-    /// Width and height of the area, in units of the square's side.
-    fn extent(&self) -> [f64; 2] {
-        [self.options.width / self.scale, self.options.height / self.scale]
-    }
-
-    /// A difference of positions of the caller, in the square.
-    fn vector_in(&self, [x, y]: Point) -> Point {
-        let [cos, sin] = self.axis;
-        [(x * cos + y * sin) / self.scale, (y * cos - x * sin) / self.scale]
-    }
-
-    fn vector_out(&self, [x, y]: Point) -> Point {
-        let [cos, sin] = self.axis;
-        [(x * cos - y * sin) * self.scale, (x * sin + y * cos) * self.scale]
-    }
-
-    /// A position of the caller, in the square.
-    fn point_in(&self, [x, y]: Point) -> Point {
-        let [origin_x, origin_y] = self.options.origin;
-        let ([width, height], [x, y]) = (self.extent(), self.vector_in([x - origin_x, y - origin_y]));
-        [x + (1.0 - width) / 2.0, y + (1.0 - height) / 2.0]
-    }
-
-    fn point_out(&self, [x, y]: Point) -> Point {
-        let [width, height] = self.extent();
-        let [x, y] = self.vector_out([x - (1.0 - width) / 2.0, y - (1.0 - height) / 2.0]);
-        [x + self.options.origin[0], y + self.options.origin[1]]
-    }
-}
-
 /// The world of one fleet, for one policy.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Flight {
@@ -236,14 +164,20 @@ impl Flight {
             let Some(value) = value else { return Ok(default) };
             in_range(field, value, least * scale..=most * scale).map(|()| value / scale)
         };
-        let speed = length("world.speed", world.speed.map(|speed| speed * slot_seconds), trained.speed, 0.0, 1.0)?;
+        let speed = match world.speed {
+            None => trained.speed,
+            Some(speed) => {
+                in_range("world.speed", speed, 0.0..=scale / slot_seconds)?;
+                speed * slot_seconds / scale
+            }
+        };
         let detection = length("world.detection_range", world.detection_range, trained.detection_range, 1e-6, 2.0)?;
         let transmission = length("world.transmission_range", world.transmission_range, trained.transmission_range, 0.0, 2.0)?;
         let default = if world.detection_range.is_some() { detection } else { trained.communication_range };
         let communication = length("world.communication_range", world.communication_range, default, 0.0, 10.0)?;
         if transmission > detection {
-            let expected = format!("at least the transmission range ({})", transmission * scale);
-            return Err(Invalid::new("world.detection_range", detection * scale, expected));
+            let expected = format!("at least the transmission range ({})", tidy(transmission * scale));
+            return Err(Invalid::new("world.detection_range", tidy(detection * scale), expected));
         }
         let slots = world.slots.unwrap_or(trained.slots);
         in_range("world.slots", slots, 1..=10_000)?;
@@ -268,7 +202,7 @@ impl Flight {
 
     /// What the policy detects.
     pub fn sensing(&self) -> Sensing {
-        Sensing { ranges: self.env.ranges(), symmetric: self.symmetric }
+        Sensing { ranges: self.env.ranges(), symmetric: self.symmetric, frame: self.frame }
     }
 
     /// How the world differs from the one that `policy` was trained in, or made for.
@@ -285,7 +219,11 @@ impl Flight {
         let differs = |now: f64, trained: f64| (now - trained).abs() > 0.01 * trained.abs();
         let differing = pairs.into_iter().filter(|&(_, now, trained, _)| differs(now, trained));
         let warning = |(field, now, trained, unit): (&'static str, f64, f64, f64)| {
-            let message = format!("{} here, {} in the world that the policy was made for", now * unit, trained * unit);
+            let (now, trained) = (tidy(now * unit), tidy(trained * unit));
+            let mut message = format!("{now} here, {trained} in the world that the policy was made for");
+            if let Some(rule) = policy.rule_in(&self.env).filter(|_| field == "world.detection_range") {
+                message += &format!("; with a range below its training the policy flies exactly as the rule {rule}");
+            }
             Warning { field, message }
         };
         let shape = (self.env.extent != [1.0; 2])
@@ -320,17 +258,20 @@ impl Flight {
         Err(Invalid::new("frame", format!("{} x {}", frame.options.width, frame.options.height), expected))
     }
 
-    /// The speed of each UAV, in sides of the square per slot, where `own` has speeds of the caller; empty if it has none.
+    /// The speed of each UAV, in sides of the square per slot, where `own` has speeds of the caller; empty if it has none. `field`: the
+    /// field of the request that has the speed of a UAV.
     ///
     /// # Errors
     /// [`Invalid`] if a UAV is too fast.
-    pub fn speeds(&self, own: &[Option<f64>]) -> Result<Vec<f64>, Invalid> {
+    pub fn speeds(&self, own: &[Option<f64>], field: impl Fn(usize) -> String) -> Result<Vec<f64>, Invalid> {
         let scale = self.frame.map_or(1.0, |frame| frame.scale);
-        let speed = |speed: &Option<f64>| {
-            let Some(speed) = *speed else { return Ok(self.env.speed) };
-            in_range("speed", speed, 0.0..=scale / self.slot_seconds).map(|()| speed * self.slot_seconds / scale)
+        let most = scale / self.slot_seconds;
+        let speed = |(i, speed): (usize, &Option<f64>)| match *speed {
+            None => Ok(self.env.speed),
+            Some(speed) if (0.0..=most).contains(&speed) => Ok(speed * self.slot_seconds / scale),
+            Some(speed) => Err(Invalid::new(field(i), speed, format!("a number from 0 to {}", tidy(most)))),
         };
-        own.iter().map(speed).collect()
+        own.iter().enumerate().map(speed).collect()
     }
 
     /// A length in the square, in units of the caller.
@@ -354,7 +295,8 @@ impl Flight {
         Some(self.frame.map_or(own, |frame| (own + frame.options.rotation_deg).rem_euclid(360.0)))
     }
 
-    /// The velocity of a UAV on a heading, in units of the caller per second. `speed`: its own speed, in these units.
+    /// The velocity of a UAV on a heading, in units of the caller per second; the border of the area does not change it. `speed`: its own
+    /// speed, in these units.
     pub fn velocity(&self, heading: u8, speed: Option<f64>) -> Point {
         let scale = self.frame.map_or(1.0, |frame| frame.scale);
         let speed = speed.unwrap_or(self.env.speed * scale / self.slot_seconds);
@@ -368,12 +310,8 @@ impl Flight {
         let scale = self.frame.map_or(1.0, |frame| frame.scale);
         let step = speed.map_or(self.env.speed, |speed| speed * self.slot_seconds / scale);
         let direction = DIRECTIONS[usize::from(heading).min(EnvConfig::COMPASS)];
-        let mut to = [at[0] + step * direction[0], at[1] + step * direction[1]];
-        if self.boundary == Boundary::Clamp {
-            for (x, extent) in to.iter_mut().zip(self.env.extent) {
-                *x = x.clamp((1.0 - extent) / 2.0, f64::midpoint(1.0, extent));
-            }
-        }
+        let end = |axis: usize| self.boundary.limit(at[axis], at[axis] + step * direction[axis], self.env.extent[axis]);
+        let to = [end(0), end(1)];
         self.frame.map_or(to, |frame| frame.point_out(to))
     }
 }
@@ -430,5 +368,15 @@ mod tests {
         assert!((x - 500.0).abs() < 1e-6 && (y - -40.0).abs() < 1e-6, "{x}, {y}");
         let [x, y] = flight.waypoint(at, 4, None);
         assert!((x - 500.0).abs() < 1e-6 && (y - -200.0).abs() < 1e-6, "clamped to the area: {x}, {y}");
+    }
+
+    #[test]
+    fn waypoints_of_uavs_outside_of_the_area_can_be_reached() {
+        let flight = flight(1000.0, 1000.0, 0.0);
+        let at = flight.frame.unwrap().point_in([200.0, 300.0]);
+        for (heading, expected) in [(0, [320.0, 300.0]), (2, [200.0, 420.0]), (4, [200.0, 300.0])] {
+            let [x, y] = flight.waypoint(at, heading, None);
+            assert!((x - expected[0]).abs() < 1e-6 && (y - expected[1]).abs() < 1e-6, "{heading}: {x}, {y}");
+        }
     }
 }

@@ -11,6 +11,7 @@ mod fleet_ids;
 mod fleet_input;
 mod fleet_memory;
 pub mod flight;
+mod frame;
 mod guard;
 pub(crate) mod ids;
 mod memory_budget;
@@ -30,14 +31,15 @@ pub use environments::{
     CopyObservation, CopyState, Environment, EnvironmentInfo, EnvironmentReset, EnvironmentSpec, EnvironmentState,
     EnvironmentStep, Environments, EpisodeCursor, FinishedEpisode,
 };
-pub use error::Error;
+pub use error::{Error, not_found_message};
 pub use fleet_ids::FleetIds;
 pub use fleet_input::{
     FleetInput, GraphForm, LARGE_NODES, ListedUsers, MAX_DETECTIONS, MAX_NODES, ReportedDetection, ReportedGraph, Scene,
     SceneOrGraph, Sensing, TaskInput,
 };
 pub use fleet_memory::FleetMemory;
-pub use flight::{ConstraintOptions, Flight, FlightOptions, Frame, FrameOptions, Warning, WorldOptions};
+pub use flight::{ConstraintOptions, Flight, FlightOptions, Warning, WorldOptions};
+pub use frame::{Frame, FrameOptions};
 pub use guard::{Constraint, Guard, Overruled, Situation, Zone};
 pub use nodes::{Node, NodeDetection, SceneUav};
 pub use owner::Owner;

@@ -253,3 +253,85 @@ async fn policies_are_listed_in_pages() {
         assert_eq!(refused(get(malformed).await).0, Code::InvalidArgument, "{malformed}");
     }
 }
+
+#[tokio::test]
+async fn errors_name_the_field_and_have_the_units_of_the_caller() {
+    let server = Server::start().await;
+    let mut client = server.grpc().await;
+    let frame = Some(v1::Frame { side: Some(1000.0), ..Default::default() });
+    let world = |world: v1::World| Some(v1::World { slot_seconds: Some(2.0), ..world });
+    let metres = || {
+        let mut scene = scene(3, 5, 0);
+        scene.uavs.iter_mut().for_each(|uav| (uav.x, uav.y) = (1000.0 * uav.x, 1000.0 * uav.y));
+        scene.users.iter_mut().for_each(|user| (user.x, user.y) = (1000.0 * user.x, 1000.0 * user.y));
+        scene
+    };
+    let fast = world(v1::World { speed: Some(501.0), ..Default::default() });
+    let request = v1::ActRequest { frame, world: fast, ..held("sweep", Bytes::new(), metres()) };
+    let status = client.act(request).await.unwrap_err();
+    assert_eq!(status.message(), "world.speed: got 501, expected a number from 0 to 500");
+
+    let mut own = metres();
+    own.uavs.reverse();
+    own.uavs[0].speed = Some(501.0);
+    let slow = world(v1::World { speed: Some(10.0), ..Default::default() });
+    let request = v1::ActRequest { frame, world: slow, ..held("sweep", Bytes::new(), own) };
+    let status = client.act(request).await.unwrap_err();
+    assert_eq!(status.message(), "scene.uavs[0].speed: got 501, expected a number from 0 to 500");
+
+    let far = v1::Detection { target_id: "b".into(), rel_x: 0.0, rel_y: 900.0, ..Default::default() };
+    let node =
+        |id: &str, detections| v1::Node { id: id.into(), kind: v1::NodeKind::Uav.into(), detections, ..Default::default() };
+    let graph = v1::Graph { nodes: vec![node("b", vec![]), node("a", vec![far])] };
+    let graph = Some(v1::act_request::Observation::Graph(graph));
+    let request = v1::ActRequest { frame, observation: graph.clone(), ..held("random", Bytes::new(), metres()) };
+    let status = client.act(request).await.unwrap_err();
+    assert_eq!(
+        status.message(),
+        "graph.nodes[1].detections[0].rel_y: got (0, 900), expected a position within about the detection range (280); for another \
+         sensor describe a world"
+    );
+    let constraints = Some(v1::Constraints { min_separation: Some(1.0), ..Default::default() });
+    let request =
+        v1::ActRequest { constraints: constraints.clone(), observation: graph, ..held("random", Bytes::new(), metres()) };
+    assert_invalid(client.act(request).await, "graph.nodes[1].position", "");
+
+    client.open_session(open("sweep", "s")).await.unwrap();
+    for (request, field) in [
+        (v1::ActRequest { frame, ..in_session("s", None, metres()) }, "frame"),
+        (v1::ActRequest { world: slow, ..in_session("s", None, metres()) }, "world"),
+        (v1::ActRequest { constraints: constraints.clone(), ..in_session("s", None, metres()) }, "constraints"),
+    ] {
+        assert_invalid(client.act(request).await, field, "a value");
+    }
+    let status = client.open_session(v1::OpenSessionRequest { constraints, ..open("sweep", "s") }).await.unwrap_err();
+    assert!(status.message().contains("constraints"), "{}", status.message());
+
+    let late = v1::ActRequest { step: Some(5), ..held("sweep", Bytes::new(), scene(3, 5, 0)) };
+    let status = client.act(late).await.unwrap_err();
+    assert!(status.message().ends_with("a first request begins at step 0"), "{}", status.message());
+    for (policy, expected) in [
+        ("sweep:2", "policy sweep has no version 2"),
+        ("sweep@live", "policy sweep has no alias live"),
+        ("swep:2", "no policy \"swep:2\"; did you mean sweep?"),
+    ] {
+        let status = client.act(held(policy, Bytes::new(), scene(3, 5, 0))).await.unwrap_err();
+        assert_eq!((status.code(), status.message()), (Code::NotFound, expected));
+    }
+}
+
+#[tokio::test]
+async fn a_session_is_told_when_a_rule_decides_instead_of_its_policy() {
+    let server = Server::start().await;
+    let mut client = server.grpc().await;
+    for (policy, range, rule) in [("qedgix", 0.15, true), ("qedgix", 0.22, false), ("qedgix-onboard", 0.15, false)] {
+        let world = Some(v1::World { detection_range: Some(range), communication_range: Some(0.28), ..Default::default() });
+        let request = v1::OpenSessionRequest { world, session_id: String::new(), ..open(policy, "") };
+        let session = client.open_session(request).await.unwrap().into_inner();
+        let [warning] = &session.warnings[..] else { panic!("{:?}", session.warnings) };
+        assert_eq!(
+            (warning.field.as_str(), warning.message.contains("as the rule sweep-shared")),
+            ("world.detection_range", rule)
+        );
+    }
+}

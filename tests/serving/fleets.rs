@@ -580,7 +580,10 @@ async fn coordinates_in_other_units_need_a_frame() {
     for (frame, field) in [
         (v1::Frame::default(), "frame.side"),
         (v1::Frame { width: Some(1.0), ..Default::default() }, "frame.height"),
-        (v1::Frame { side: Some(f64::NAN), ..Default::default() }, "frame.width"),
+        (v1::Frame { side: Some(f64::NAN), ..Default::default() }, "frame.side"),
+        (v1::Frame { side: Some(0.0), ..Default::default() }, "frame.side"),
+        (v1::Frame { side: Some(3000.0), width: Some(3000.0), ..Default::default() }, "frame.width"),
+        (v1::Frame { side: Some(3000.0), height: Some(2000.0), ..Default::default() }, "frame.height"),
         (v1::Frame { side: Some(3000.0), rotation_deg: 1e9, ..Default::default() }, "frame.rotation_deg"),
         (v1::Frame { side: Some(30.0), ..Default::default() }, "frame"),
     ] {
@@ -604,7 +607,7 @@ async fn coordinates_in_other_units_need_a_frame() {
     let (code, reason, _) = refused(client.open_session(open("sweep", "s")).await);
     assert_eq!((code, reason.as_str()), (Code::AlreadyExists, "already_exists"), "another world is another session");
     let framed = v1::ActRequest { symmetric: Some(true), ..in_session("s", None, scene(3, 5, 0)) };
-    assert_invalid(client.act(framed).await, "frame", "frame, world, symmetric or constraints");
+    assert_invalid(client.act(framed).await, "symmetric", "a value");
     let policy = client.get_policy(v1::GetPolicyRequest { policy: "qedgix".into() }).await.unwrap().into_inner();
     let of = policy.world.unwrap();
     assert_eq!((of.speed, of.detection_range, of.slots, of.boundary()), (Some(0.04), Some(0.28), Some(80), v1::Boundary::Clamp));

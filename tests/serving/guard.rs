@@ -2,9 +2,12 @@
 //!
 //! Long form: `QEDGIX_GUARD_SLOTS=1000000 cargo test --release --test serving -- guard --nocapture`
 
+use std::sync::Arc;
+
+use bytes::Bytes;
 use qedgix::env::{Boundary, DIRECTIONS, Point};
 use qedgix::policy::EnvParams;
-use qedgix::serving::{Constraint, Guard, Situation, Zone};
+use qedgix::serving::{Constraint, Guard, Overruled, Situation, Zone};
 use qedgix::wire::v1;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
@@ -155,6 +158,87 @@ fn no_constraint_is_broken_that_could_be_kept() {
     }
     println!("{slots} slots: {changed} changed, {unavoidable} with a violation that nothing avoids");
     assert!(changed > slots / 10 && unavoidable > 0);
+}
+
+/// UAVs at `positions` that keep `min_separation`, with random Q-values and headings.
+fn crowd(positions: Vec<Point>, min_separation: f64) -> (Slot, Vec<u8>, Vec<Overruled>) {
+    let mut rng = qedgix::rng::stream(positions.len() as u64, "crowd", 0);
+    let q: Vec<f32> = (0..8 * positions.len()).map(|_| rng.random()).collect();
+    let headings: Vec<u8> = (0..positions.len()).map(|_| rng.random_range(0..8)).collect();
+    let guard = Guard { min_separation, home: Some([0.5; 2]), ..Guard::default() };
+    let endurance = vec![f64::INFINITY; positions.len()];
+    let slot = Slot { guard, env: EnvParams::default(), positions, endurance, q, headings };
+    let mut headings = slot.headings.clone();
+    let Slot { guard, env, positions, endurance, q, .. } = &slot;
+    let overruled = guard.apply(&Situation { env, speeds: &[], positions, endurance, q_values: q }, &mut headings);
+    (slot, headings, overruled)
+}
+
+#[test]
+fn thousands_in_one_place_do_not_take_forever() {
+    // A search over all of them would be 5000 calls deep, and there are 12 million pairs.
+    let (_, _, overruled) = crowd(vec![[0.5; 2]; 5000], 10.0);
+    assert_eq!(overruled.len(), 5000, "nobody can keep the distance");
+    assert!(overruled.iter().all(|of| of.violates == [Constraint::Separation]));
+    // Groups of six, of which none can be separated: the slot has one budget for all of them.
+    let groups = (0..300).flat_map(|k| vec![[0.1 * f64::from(k % 20), 0.1 * f64::from(k / 20)]; 6]).collect();
+    let (_, _, overruled) = crowd(groups, 0.085);
+    assert!(overruled.iter().filter(|of| !of.violates.is_empty()).count() >= 300 * 2);
+}
+
+#[test]
+fn large_groups_are_kept_apart() {
+    let grid = |n: usize, apart: f64| (0..n * n).map(|k| [k % n, k / n].map(|x| 0.1 + apart * x as f64)).collect::<Vec<Point>>();
+    for (n, apart) in [(5, 0.06), (12, 0.055)] {
+        let (slot, headings, overruled) = crowd(grid(n, apart), 0.05);
+        assert!(overruled.iter().all(|of| of.violates.is_empty()), "{n} x {n}: all could hover");
+        assert_eq!(slot.broken(&headings, ROUNDING), []);
+        assert!(headings.iter().filter(|&&h| usize::from(h) < 8).count() > n, "not all hover");
+    }
+}
+
+#[test]
+fn what_constraints_cost_is_estimated() {
+    // What the thread of a caller may do, and what threads for heavy tasks do, in units of work.
+    let (inline, heavy) = (1 << 13, 1 << 16);
+    let apart = Guard { min_separation: 0.05, ..Guard::default() };
+    let row = |uavs: usize, by: f64| (0..uavs).map(|i| [by * i as f64, 0.5]).collect::<Vec<Point>>();
+    let cost = |guard: &Guard, positions: &[Point]| guard.work(Some(positions), positions.len(), 0.04);
+    assert!(cost(&apart, &row(3, 0.01)) < inline);
+    assert!(cost(&apart, &row(12, 0.2)) < inline, "far from each other");
+    assert!(cost(&apart, &row(12, 0.01)) > heavy);
+    assert!(apart.work(None, 12, 0.04) > heavy, "positions are not known yet");
+    let zones = Guard { no_fly: vec![Zone::Polygon(vec![[0.0; 2]; 64]); 64], ..Guard::default() };
+    assert!(cost(&zones, &row(3, 0.2)) > inline && cost(&zones, &row(12, 0.2)) > heavy);
+}
+
+#[test]
+fn a_uav_outside_of_the_area_does_not_jump_back() {
+    let zone = Zone::Circle([1.2, 0.5], 0.05);
+    let guard = Guard { no_fly: vec![zone], ..Guard::default() };
+    let (env, positions) = (EnvParams::default(), [[1.5, 0.5]]);
+    let situation = Situation { env: &env, speeds: &[], positions: &positions, endurance: &[], q_values: &[] };
+    let mut headings = [4];
+    assert_eq!(guard.apply(&situation, &mut headings), [], "it does not reach the zone in this slot");
+    assert_eq!(headings, [4]);
+}
+
+#[tokio::test]
+async fn a_panic_while_constraints_are_applied_is_an_error() {
+    let server = Server::with(|config| config.engine.threads = 1).await;
+    server.add("panics", 1, Arc::new(TestPolicy::PanicOverruled));
+    server.add("counts", 1, Arc::new(TestPolicy::Count));
+    let mut client = server.grpc().await;
+    let center = Some(v1::Position { x: 0.5, y: 0.5, z: None });
+    let zone = v1::Zone { center, radius: Some(2.0), ..Default::default() };
+    let constraints = Some(v1::Constraints { no_fly: vec![zone], ..Default::default() });
+    for _ in 0..3 {
+        let request = v1::ActRequest { constraints: constraints.clone(), ..held("panics", Bytes::new(), scene(2, 2, 0)) };
+        let (code, reason, _) = refused(with_timeout(client.act(request)).await);
+        assert_eq!((code, reason.as_str()), (Code::Internal, "internal"));
+    }
+    // The only thread of the engine still works.
+    with_timeout(client.act(held("counts", Bytes::new(), scene(2, 2, 0)))).await.unwrap();
 }
 
 #[tokio::test]

@@ -118,6 +118,8 @@ pub enum TestPolicy {
     Count,
     /// Panics.
     Panic,
+    /// Decides like `Count`, and panics when constraints change a heading.
+    PanicOverruled,
     /// Waits until the gate is open, then decides like `Count`.
     Wait(Arc<Gate>),
 }
@@ -170,9 +172,12 @@ impl Policy for TestPolicy {
     fn start(&self, _: usize, _: usize, seed: u64, memory: &mut [f32]) {
         memory[0] = (seed % 9) as f32;
     }
+    fn overrule(&self, _: &mut [f32], _: usize, _: u8) {
+        assert!(!matches!(self, Self::PanicOverruled), "a policy of the tests panics");
+    }
     fn act(&self, turns: &mut [FleetStep<'_>]) {
         match self {
-            Self::Count => {}
+            Self::Count | Self::PanicOverruled => {}
             Self::Panic => panic!("a policy of the tests panics"),
             Self::Wait(gate) => gate.pass(),
         }

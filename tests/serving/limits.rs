@@ -90,7 +90,7 @@ async fn errors_of_invalid_scenes_name_the_field() {
         ("scene", "20001 UAVs and users", |r| in_scene(r).users = scene(1, 19_998, 0).users),
         ("scene.uavs[1].x", "NaN", |r| in_scene(r).uavs[1].x = f64::NAN),
         ("scene.uavs[0].y", "inf", |r| in_scene(r).uavs[0].y = f64::INFINITY),
-        ("scene.users[2].x", "1000000", |r| in_scene(r).users[2].x = 1e300),
+        ("scene.users[2].x", "1e300", |r| in_scene(r).users[2].x = 1e300),
         ("scene.users[2].aoi", "-1", |r| in_scene(r).users[2].aoi = -1.0),
         ("scene.users[2].aoi", "NaN", |r| in_scene(r).users[2].aoi = f64::NAN),
         ("scene.users[2].aoi", "1000000000", |r| in_scene(r).users[2].aoi = 1e20),

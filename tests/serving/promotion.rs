@@ -49,7 +49,7 @@ async fn an_alias_is_set_moved_and_deleted_and_that_is_remembered() {
     let (status, problem) = put(3, Some(1)).await;
     assert_eq!((status.as_u16(), &problem["code"]), (409, &json!("alias_moved")), "{problem}");
     let (status, problem) = put(9, None).await;
-    assert_eq!((status.as_u16(), &problem["detail"]), (404, &json!("no policy \"mine:9\"")));
+    assert_eq!((status.as_u16(), &problem["detail"]), (404, &json!("policy mine has no version 9")));
     let aliases = json!({"aliases": [{"alias": "live", "version": 2}], "next_page_token": ""});
     assert_eq!(rest.get("/v1/policies/mine/aliases").await.1, aliases);
     assert_eq!(rest.get("/v1/policies/mine@live").await.1["ref"]["version"], 2);

@@ -157,6 +157,7 @@ async fn the_table_of_errors() {
         (with(&["scene", "uavs", "1", "x"], Value::Null), 422, "invalid_schema", "scene.uavs[1].x"),
         (with(&["scene", "uavs", "1", "w"], json!(1)), 422, "invalid_schema", "scene.uavs[1].w"),
         (with(&["scene", "uavs", "0"], json!({"id": "a", "x": 0})), 422, "invalid_schema", "scene.uavs[0].y"),
+        (with(&["world"], json!({"boundary": 9})), 422, "invalid_schema", "world.boundary"),
         (with(&["graph"], json!({"nodes": []})), 422, "invalid_schema", "graph"),
         (with(&["recurrent_state"], json!("")), 422, "invalid_schema", "session_id"),
         (with(&["hello"], json!(1)), 422, "invalid_schema", "hello"),

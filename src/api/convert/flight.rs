@@ -1,7 +1,7 @@
 //! The frame and the world of a fleet in requests; the checks are the same for all transports.
 
 use crate::env::{Boundary, Point};
-use crate::invalid::Invalid;
+use crate::invalid::{Invalid, in_range};
 use crate::serving::{Constraint, ConstraintOptions, FlightOptions, FrameOptions, WorldOptions, Zone};
 use crate::wire::v1;
 
@@ -37,7 +37,7 @@ impl FlightFields {
     /// The options; `None` if the request says nothing.
     ///
     /// # Errors
-    /// [`Invalid`] for an area without size.
+    /// [`Invalid`] for an area without size, or with two sizes.
     pub fn options(self) -> Result<Option<Box<FlightOptions>>, Invalid> {
         let Self { frame, world, symmetric, constraints } = self;
         if frame.is_none() && world.is_none() && symmetric.is_none() && constraints.is_none() {
@@ -49,10 +49,18 @@ impl FlightFields {
     }
 }
 
+/// What is accepted beside the side of a square area.
+const SIDE_ALONE: &str = "no value beside frame.side, which is width and height";
+
 impl FrameFields {
     fn options(self) -> Result<FrameOptions, Invalid> {
         let (width, height) = match (self.side, self.width, self.height) {
-            (Some(side), width, height) => (width.unwrap_or(side), height.unwrap_or(side)),
+            (Some(side), None, None) => {
+                in_range("frame.side", side, FrameOptions::LENGTH)?;
+                (side, side)
+            }
+            (Some(_), Some(width), _) => return Err(Invalid::new("frame.width", width, SIDE_ALONE)),
+            (Some(_), None, Some(height)) => return Err(Invalid::new("frame.height", height, SIDE_ALONE)),
             (None, Some(width), Some(height)) => (width, height),
             (None, Some(_), None) => return Err(Invalid::missing("frame.height", "the length of the area along its y axis")),
             (None, None, Some(_)) => return Err(Invalid::missing("frame.width", "the length of the area along its x axis")),

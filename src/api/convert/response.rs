@@ -69,11 +69,17 @@ pub fn actions(response: &mut act::Response, wanted: Wanted) -> impl Iterator<It
             degrees: flight.as_ref().map_or_else(|| degrees(heading), |flight| flight.degrees(heading)),
             q_values: if wanted.q_values && q.iter().all(|q| q.is_finite()) { q.to_vec() } else { Vec::new() },
             velocity: flight.as_ref().filter(|_| wanted.velocity).map(|flight| flight.velocity(heading, speed)),
-            overruled: overruled.iter().find(|overruled| overruled.uav as usize == uav).cloned(),
-            influences: influences.iter().filter(|of| of.uav as usize == uav).cloned().collect(),
+            overruled: of_uav(overruled, uav, |of| of.uav).first().cloned(),
+            influences: of_uav(influences, uav, |of| of.uav).to_vec(),
             waypoint: flight.as_ref().zip(at).map(|(flight, at)| flight.waypoint(at, heading, speed)),
         }
     })
+}
+
+/// The entries of UAV `uav` in a list that is in the order of the UAVs.
+fn of_uav<T>(list: &[T], uav: usize, of: impl Fn(&T) -> u32) -> &[T] {
+    let begin = list.partition_point(|entry| (of(entry) as usize) < uav);
+    &list[begin..begin + list[begin..].partition_point(|entry| of(entry) as usize == uav)]
 }
 
 /// The response, with what is wanted.

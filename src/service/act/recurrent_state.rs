@@ -39,7 +39,12 @@ pub(super) async fn act(
     let input = content.into_task_input(fleet.size(), implementation, sensing)?;
     let step = state.as_ref().map_or(0, |state| state.step);
     if let Some(sent) = request.step.filter(|&sent| sent != step) {
-        let message = format!("step {sent} does not match recurrent_state, which belongs to step {step}");
+        let message = match &state {
+            Some(_) => format!("step {sent} does not match recurrent_state, which belongs to step {step}"),
+            None => format!(
+                "step {sent} needs the recurrent_state of the response before; without one, a first request begins at step 0"
+            ),
+        };
         return Err(Error::Precondition { code: ErrorCode::WrongStep, message });
     }
     let seed = state.as_ref().map_or_else(|| request.seed.unwrap_or(0), |state| state.seed);

@@ -144,10 +144,12 @@ impl Placed {
             };
         };
         flight.translate(&mut content, far)?;
-        let speeds = flight.speeds(&own)?;
+        let speeds = flight.speeds(&own, |i| content.uav_field(i, &canonical_of_request, "speed"))?;
         let endurance = flight.endurance(&endurances);
-        if flight.guard.is_some() && content.uav_positions().contains(&None) {
-            return Err(Invalid::missing("position", "the position of every UAV, which constraints need"));
+        let unknown = |content: &SceneOrGraph| content.uav_positions().iter().position(Option::is_none);
+        if let Some(i) = flight.guard.as_ref().and_then(|_| unknown(&content)) {
+            let field = content.uav_field(i, &canonical_of_request, "position");
+            return Err(Invalid::missing(field, "the position of every UAV, which constraints need"));
         }
         let motion = motion.then(|| Motion { positions: content.uav_positions(), speeds: own });
         Ok(Self { fleet, canonical_of_request, content, speeds, endurance, flight: Some(flight), motion })

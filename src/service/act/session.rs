@@ -19,9 +19,9 @@ pub(super) async fn act(app: &App, session: &Session, request: Request, deadline
     if let Some(seed) = request.seed {
         return Err(Invalid::new("seed", seed, "no value, because a session takes its seed when it is opened").into());
     }
-    if request.flight.is_some() {
+    if let Some(options) = request.flight {
         let expected = "no value, because a session takes it when it is opened";
-        return Err(Invalid::new("frame", "frame, world, symmetric or constraints", expected).into());
+        return Err(Invalid::new(options.first_field(), "a value", expected).into());
     }
     let placed = Placed::new(request.input, session.policy(), session.flight(), request.return_motion)?;
     let step = SessionStep::new(placed, session.policy(), request.step, request.run_id)?;

@@ -225,7 +225,11 @@ impl<'a> Flight<'a> {
             endurance: None,
         };
         let input = FleetInput::from_nodes((0..m + n).map(node).collect())?;
-        input.content.into_fleet_graph(self.size, self.policy, Sensing { ranges: self.params.ranges(), symmetric: false })
+        input.content.into_fleet_graph(
+            self.size,
+            self.policy,
+            Sensing { ranges: self.params.ranges(), symmetric: false, frame: None },
+        )
     }
 
     fn message_bytes(&mut self, observations: &[Observation]) -> usize {

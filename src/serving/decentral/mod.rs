@@ -159,7 +159,7 @@ impl Slot<'_> {
 
     /// What the policy reads. A detection far beyond the range is refused; the sender of a message has checked its own.
     fn fleet_graph(&self, own: &Member<'_>, others: &[Member<'_>]) -> Result<FleetGraph, Invalid> {
-        let sensing = Sensing { ranges: self.env.ranges(), symmetric: false };
+        let sensing = Sensing { ranges: self.env.ranges(), symmetric: false, frame: None };
         SceneOrGraph::Graph(self.graph(own, others)?).into_fleet_graph(self.size, self.policy, sensing)
     }
 

@@ -64,9 +64,10 @@ impl Observation {
         let input = FleetInput::from_nodes(std::iter::once(own).chain(others.map(named)).collect()).map_err(in_request)?;
         let FleetInput { speeds, far, mut content, .. } = input;
         flight.translate(&mut content, far.map(|far| Box::new(in_request(*far))))?;
-        let speed = if speeds.is_empty() { None } else { flight.speeds(&speeds)?.get(uav).copied() };
+        let speed =
+            if speeds.is_empty() { None } else { flight.speeds(&speeds, |_| "observation.speed".to_owned())?.get(uav).copied() };
         let SceneOrGraph::Graph(graph) = content else { unreachable!("made of nodes") };
-        graph.check_ranges(flight.env.ranges()).map_err(in_request)?;
+        graph.check_ranges(flight.sensing()).map_err(in_request)?;
         let aoi = |target: u32| (target as usize).checked_sub(ids.uavs.len()).map_or(0.0, |user| graph.aoi[user]);
         let detections =
             graph.detections[uav].iter().map(|d| OwnDetection { target: d.target, rel: d.rel, aoi: aoi(d.target) }).collect();

@@ -157,7 +157,9 @@ impl TaskBatch {
             let timings = Timings { queue: started - since, compute: computed - started, batch_size: size as u32 };
             metrics.record_times(timings.queue, timings.compute);
             // The caller may have stopped waiting during the forward pass.
-            let is_received = reply.send(Ok(task.finish(timings))).is_ok();
+            let output = finish(task, timings, policy);
+            let is_computed = output.is_ok();
+            let is_received = reply.send(output).is_ok() && is_computed;
             received += u64::from(is_received);
             self.outcomes.push((timings.queue, is_received));
         }
@@ -179,6 +181,12 @@ fn prepare(task: &mut Task) -> Result<(), Error> {
     }
 }
 
+/// As [`Task::finish`], which runs constraints, and the policy again to explain; a panic is an error as well.
+fn finish(task: Task, timings: Timings, policy: &LoadedPolicy) -> Result<TaskOutput, Error> {
+    // Unwind safe: after a panic, nothing of the task remains.
+    catch_unwind(AssertUnwindSafe(|| task.finish(timings))).map_err(|_| panicked(policy))
+}
+
 /// Computes one task on the caller's thread.
 pub(super) fn run_single(mut task: Task, metrics: &EngineMetrics) -> Result<TaskOutput, Error> {
     let started = Instant::now();
@@ -195,12 +203,12 @@ pub(super) fn run_single(mut task: Task, metrics: &EngineMetrics) -> Result<Task
         metrics.record_failure(&policy, computed - started);
         return Err(panicked(&policy));
     }
+    let timings = Timings { queue: Duration::ZERO, compute: computed - started, batch_size: 1 };
+    let output = finish(task, timings, &policy).inspect_err(|_| metrics.record_failure(&policy, started.elapsed()))?;
     let counters = metrics.policy(&policy.reference.name);
     metrics.record_batch(&counters, 1);
     counters.success.increment(1);
-    let timings = Timings { queue: Duration::ZERO, compute: computed - started, batch_size: 1 };
     metrics.record_times(timings.queue, timings.compute);
-    let output = task.finish(timings);
     let end = Instant::now();
     let times = ComputeTimes { input: prepared - started, infer: computed - prepared, output: end - computed };
     metrics.of_version(&policy).record_batch([(Duration::ZERO, true)].into_iter(), &times, end);

@@ -154,12 +154,12 @@ impl EngineState {
             let started = Instant::now();
             // What is light is shorter than it takes to start a thread.
             let threads = if lane == Lane::Heavy { self.config.threads } else { 1 };
+            let running = (lane == Lane::Light).then(|| Running { shared: self, count: |state| &mut state.light_running });
             threads::allow(threads, || batch.run(&self.metrics));
+            drop(running);
             drop(alone);
-            let mut state = self.lock();
-            match lane {
-                Lane::Light => state.light_running -= 1,
-                Lane::Heavy => state.queue.measure(work, started.elapsed()),
+            if lane == Lane::Heavy {
+                self.lock().queue.measure(work, started.elapsed());
             }
         }
     }
@@ -181,9 +181,9 @@ impl EngineState {
 
     /// Computes one task on this thread. [`EngineState::reserve_inline`] has returned true.
     fn run_inline(&self, task: Task) -> Result<TaskOutput, Error> {
+        let _running = Running { shared: self, count: |state| &mut state.inline_running };
         let output = batch::run_single(task, &self.metrics);
         self.single_batches.fetch_add(1, Ordering::Relaxed);
-        self.lock().inline_running -= 1;
         output
     }
 
@@ -201,15 +201,15 @@ impl EngineState {
             state.inline_running += 1;
             batch
         };
+        let running = Running { shared: self, count: |state| &mut state.inline_running };
         let size = batch.run(&self.metrics);
+        drop(running);
         if size > 1 {
             self.single_batches.store(0, Ordering::Relaxed);
         } else {
             self.single_batches.fetch_add(1, Ordering::Relaxed);
         }
-        let mut state = self.lock();
-        state.inline_running -= 1;
-        state.spare_batches.push(batch);
+        self.lock().spare_batches.push(batch);
         InlineBatch::Computed
     }
 
@@ -228,6 +228,18 @@ impl EngineState {
             job.refuse(Error::Busy("the engine's queue is full, mostly of requests of this caller".into()));
         }
         Ok(())
+    }
+}
+
+/// A computation that counts as running until it ends, also by a panic: a count that stayed too high would keep later ones from running.
+struct Running<'a> {
+    shared: &'a EngineState,
+    count: fn(&mut State) -> &mut usize,
+}
+
+impl Drop for Running<'_> {
+    fn drop(&mut self) {
+        *(self.count)(&mut self.shared.lock()) -= 1;
     }
 }
 
@@ -323,7 +335,7 @@ impl Engine {
     pub async fn run(&self, owner: &Owner, task: Task, deadline: Option<Instant>) -> Result<TaskOutput, Error> {
         let shared = &*self.shared;
         if deadline.is_some_and(|deadline| deadline <= Instant::now()) {
-            return Err(Error::Deadline("before the engine's queue"));
+            return Err(Error::Deadline("before the policy could begin"));
         }
         let small = is_small(&task) && shared.config.max_batch_delay.is_zero();
         let expects_batch = small && shared.expects_batch();

@@ -35,6 +35,8 @@ pub struct Task {
     /// The memory that the policy works on.
     numbers: Vec<f32>,
     decision: Decision,
+    /// Number of detections, or its estimate.
+    detections: usize,
     work: usize,
 }
 
@@ -112,7 +114,8 @@ impl Task {
         q_values.resize(uavs * policy.implementation.actions(), f32::NAN);
         let decision =
             Decision { step, headings, q_values, timings: Timings::default(), overruled: Vec::new(), influences: Vec::new() };
-        let work = policy.implementation.work(uavs, users, input.detection_count());
+        let detections = input.detection_count();
+        let work = policy.implementation.work(uavs, users, detections);
         let (graph, unconverted) = match input {
             TaskInput::Graph(graph) => (graph, None),
             TaskInput::Large { content, sensing, .. } => (FleetGraph::default(), Some((content, sensing))),
@@ -132,6 +135,7 @@ impl Task {
             memory,
             numbers: Vec::new(),
             decision,
+            detections,
             work,
         }
     }
@@ -157,6 +161,9 @@ impl Task {
     /// The same task with constraints, and the slots that each UAV can still fly. The input has the positions of all UAVs.
     #[must_use]
     pub fn guarded(mut self, guard: Arc<Guard>, endurance: Vec<f64>) -> Self {
+        let speeds = self.profile.as_ref().map_or(&[][..], |profile| &profile.speeds);
+        let fastest = speeds.iter().copied().fold(self.env.speed, f64::max);
+        self.work = self.work.saturating_add(guard.work(self.graph.uav_positions(), self.size.0, fastest));
         self.guard = Some((guard, endurance));
         self
     }
@@ -164,6 +171,10 @@ impl Task {
     /// The same task, whose decision is explained. `ids`: those of the input.
     #[must_use]
     pub fn explained(mut self, ids: FleetIds) -> Self {
+        let (uavs, users) = self.size;
+        let runs = uavs * uavs + self.detections;
+        let explained = runs.saturating_mul(self.policy.implementation.work(uavs, users, self.detections));
+        self.work = self.work.saturating_add(explained.min(MAX_EXPLAINED));
         self.explain = Some(Box::new((ids, Vec::new())));
         self
     }

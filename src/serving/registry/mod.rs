@@ -161,11 +161,16 @@ impl Default for Registry {
     }
 }
 
-/// The error about a policy that `spec` does not resolve to, with an existing name that is similar.
+/// The error about a policy that `spec` does not resolve to: which version or alias is missing, or an existing name that is similar.
 fn not_found(entries: &Entries, spec: &PolicySpec) -> Error {
+    let what = match (entries.contains_key(&spec.name), &spec.version) {
+        (true, VersionSelector::Version(_)) => "policy version",
+        (true, VersionSelector::Alias(_)) => "policy alias",
+        _ => "policy",
+    };
     let known = entries.keys().take(MAX_COMPARED).map(String::as_str);
-    let near = if entries.contains_key(&spec.name) { None } else { nearest(&spec.name, known) };
-    Error::NotFound { what: "policy", id: spec.to_string(), near: near.map(str::to_owned) }
+    let near = if what == "policy" { nearest(&spec.name, known) } else { None };
+    Error::NotFound { what, id: spec.to_string(), near: near.map(str::to_owned) }
 }
 
 /// Maximum number of names that an unknown one is compared with.
@@ -303,7 +308,10 @@ impl Registry {
                 return Err(wrong(format!("{name}@{alias} points to {name}:{number}; move or delete the alias first")));
             }
             if entry.versions.get(number).is_some_and(VersionEntry::in_use) {
-                return Err(wrong(format!("sessions or requests use {name}:{number}; close them first, or unload the policy")));
+                return Err(wrong(format!(
+                    "sessions or requests use {name}:{number}; close its sessions first, or unload it, so that no new ones begin, and \
+                     wait until they have ended"
+                )));
             }
         }
         let removed: Vec<_> = versions.iter().filter_map(|number| entry.versions.remove(number)).collect();

@@ -301,7 +301,7 @@ impl Session {
             return taken(&format!("with policy {}", self.policy.reference));
         }
         if self.flight.as_ref().map(|(_, flight)| flight) != options.flight.as_ref() {
-            return taken("with another frame, world or meaning of detections");
+            return taken("with another frame, world or meaning of detections, or other constraints");
         }
         match state.new_run(&self.id, options.run_id.as_deref())? {
             Some(run) => {

@@ -181,6 +181,10 @@ async fn what_cannot_be_used_is_named() {
         ("uav_positions", "16 bytes", |r| input(r, "uav_positions").datatype = "FP64".into()),
         ("uav_positions", "15 bytes", |r| *raw_of(r, "uav_positions") = Bytes::from_static(&[0; 15])),
         ("uav_positions.shape", "[]", |r| input(r, "uav_positions").shape.clear()),
+        ("uav_positions", "no UAV", |r| {
+            input(r, "uav_positions").shape = vec![0, 2];
+            input(r, "uav_ids").shape = vec![0];
+        }),
         ("uav_positions.shape", "[4]", |r| input(r, "uav_positions").shape = vec![4]),
         ("uav_positions.shape", "[2, 2, 1]", |r| input(r, "uav_positions").shape = vec![2, 2, 1]),
         ("uav_positions.shape", "[-2, 2]", |r| input(r, "uav_positions").shape = vec![-2, 2]),

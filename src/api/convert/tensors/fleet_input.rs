@@ -61,7 +61,8 @@ pub fn fleet_input(tensors: &mut Vec<Tensor>) -> Result<FleetInput, Invalid> {
     let user_aoi = user_aoi.ok_or_else(|| Invalid::missing("user_aoi", "the AoI of each user in slots, [N]"))?;
     let users = user_aoi.rows("[N]", &[], MAX_NODES)?;
     let uavs = count_uavs(uav_positions.as_ref(), uav_count.as_ref(), uav_ids.as_ref())?;
-    check_counts("uavs and users", uavs, users)?;
+    let counted = if uav_positions.is_some() { "uav_positions" } else { "uav_ids" };
+    check_counts(if uavs == 0 { counted } else { "user_aoi" }, uavs, users)?;
     let ages = user_aoi.numbers(users)?.into_iter().enumerate();
     let ages = ages.map(|(j, value)| check_aoi(|| format!("user_aoi[{j}]"), value)).collect::<Result<Vec<f32>, _>>()?;
     let mut far = None;
