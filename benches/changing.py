@@ -6,7 +6,7 @@
 
 Three UAVs start in the middle of the unit square. There are always five users. After every `--every` slots, the oldest user leaves and a
 new user appears at a random place; with `--every 0`, all users stay. Each request lists the UAVs, and only those users that a UAV detects
-in this slot. Mean AoI in slots, with a 95 % interval over worlds (1.96 standard errors)."""
+in this slot; with `--scene`, all users. Mean AoI in slots, with a 95 % interval over worlds (1.96 standard errors)."""
 
 import argparse
 import http.client
@@ -61,6 +61,12 @@ class World:
             nodes.append({"id": f"uav-{i}", "kind": "uav", "position": {"x": at[0], "y": at[1]}, "detections": detections})
         return {"nodes": nodes + [{"id": name, "kind": "user"} for name in sorted(seen)]}
 
+    def scene(self, slot):
+        """Where all UAVs and users are."""
+        uavs = [{"id": f"uav-{i}", "x": x, "y": y} for i, (x, y) in enumerate(self.uavs)]
+        users = [{"id": name, "x": x, "y": y, "aoi": slot - last} for name, ((x, y), last) in sorted(self.users.items())]
+        return {"uavs": uavs, "users": users}
+
     def move(self, actions, slot):
         """Flies the headings; users in range are collected."""
         for at, action in zip(self.uavs, actions):
@@ -86,7 +92,8 @@ def fly(server, policy, seed, args):
         if every and slot and slot % every == 0:
             del world.users[min(world.users)]
             world.add_user(slot)
-        answer = server.call("POST", "/act", {"session_id": session, "step": slot, "graph": world.graph(slot)})
+        observation = {"scene": world.scene(slot)} if args.scene else {"graph": world.graph(slot)}
+        answer = server.call("POST", "/act", {"session_id": session, "step": slot, **observation})
         world.move(answer["actions"], slot)
         ages.append(world.mean_aoi(slot))
     server.call("DELETE", f"/sessions/{session}")
@@ -100,6 +107,7 @@ def main() -> None:
     parser.add_argument("--slots", type=int, default=400, help="slots per session [default: 400]")
     parser.add_argument("--speed", type=float, default=0.04, help="distance that a UAV flies per slot [default: 0.04]")
     parser.add_argument("--every", type=int, default=40, help="slots between two changes; 0: none [default: 40]")
+    parser.add_argument("--scene", action="store_true", help="requests list all users")
     parser.add_argument("--worlds", type=int, default=64, help="number of sessions, each in another world [default: 64]")
     args = parser.parse_args()
     if args.worlds < 2:
