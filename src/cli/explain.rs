@@ -35,7 +35,7 @@ pub fn write(
         let last = name.rsplit(['/', '\\']).next().unwrap_or(name);
         let last: String = last.chars().take(40).map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect();
         let file = directory.join(format!("explain-{}-{last}", i + 1));
-        figures.write(&file.with_extension("svg"), &figure(name, &slots, &env))?;
+        figures.write(&file.with_extension("svg"), &figure((name, seed), &slots, &env))?;
         write_atomic(&file.with_extension("json"), format!("{:#}\n", document(name, seed, &slots)).as_bytes())?;
     }
     Ok(())
@@ -47,7 +47,8 @@ fn at(slot: &ExplainedSlot, node: u32) -> Point {
     node.checked_sub(slot.uavs.len()).map_or_else(|| slot.uavs[node], |user| slot.users[user])
 }
 
-fn figure(name: &str, slots: &[ExplainedSlot], env: &EnvConfig) -> String {
+fn figure((name, seed): (&str, u64), slots: &[ExplainedSlot], env: &EnvConfig) -> String {
+        note: format!("The layout with seed {seed}."),
     let uavs = slots.first().map_or(0, |slot| slot.uavs.len());
     let shown = Trajectories {
         uavs: (0..uavs).map(|i| slots.iter().map(|slot| slot.uavs[i]).collect()).collect(),

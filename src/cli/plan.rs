@@ -163,7 +163,7 @@ impl PlanArgs {
                 Series { name: "mean AoI".into(), points: mean.0, band: mean.1 },
             ],
             levels: vec![("target of p95".into(), self.target_p95)],
-            note: "Bars are 95 % intervals over layouts.".into(),
+            note: "Whiskers are 95 % intervals over layouts.".into(),
             markers: true,
         })
     }
@@ -183,7 +183,7 @@ impl PlanArgs {
             y: "p95 AoI (slots)".into(),
             series: vec![series(0), series(1)],
             levels: vec![("target".into(), self.target_p95)],
-            note: "Bars are 95 % intervals over layouts.".into(),
+            note: "Whiskers are 95 % intervals over layouts.".into(),
             markers: true,
         })
     }

@@ -12,9 +12,9 @@ fn aoi_on(layouts: &str) -> String {
 /// What the error bars of results are.
 fn intervals_note(summary: &ExperimentSummary) -> &'static str {
     if summary.seeds.len() > 1 {
-        "Bars: 95 % intervals over seeds and layouts."
+        "Whiskers: 95 % intervals over seeds and layouts."
     } else {
-        "Bars: 95 % intervals over layouts; one seed."
+        "Whiskers: 95 % intervals over layouts; one seed."
     }
 }
 
@@ -73,7 +73,7 @@ fn convergence(experiment: &Experiment, summary: &ExperimentSummary, curves: &[T
                 .map(|b| (format!("{} on {}", b.name, summary.layouts), b.mean_aoi.mean))
                 .collect(),
             note: convergence_note(summary),
-            markers: false,
+            ..Chart::default()
         };
         files.push((file_name("convergence", &point.name), lines(&chart)));
         let bar = |name: &str, aoi: &Interval| Bar { name: name.to_owned(), mean: aoi.mean, low: aoi.low, high: aoi.high };
@@ -114,6 +114,7 @@ fn parameter(experiment: &Experiment, summary: &ExperimentSummary) -> String {
         levels: Vec::new(),
         note: intervals_note(summary).to_owned(),
         markers: true,
+        ..Chart::default()
     })
 }
 

@@ -219,7 +219,11 @@ fn trajectories(experiment: &Experiment, out: &Path) -> anyhow::Result<Vec<Traje
         let env = &run.config.environment;
         let trajectory = evaluate_traced(&policy, env, &experiment.layout_seeds[..1], 0, &Disturbance::default(), 1)?.trajectory;
         let users = trajectory.users.iter().filter_map(|path| path.first().copied()).collect();
-        Ok(Trajectories { uavs: trajectory.uavs, users, transmission_range: env.transmission_range })
+        let note = format!(
+            "Layout 0 of {} (seed {}), flown with the best weights of seed {}.",
+            experiment.layouts, experiment.layout_seeds[0], run.config.seed
+        );
+        Ok(Trajectories { uavs: trajectory.uavs, users, transmission_range: env.transmission_range, note })
     };
     first.map(trajectory).collect()
 }
