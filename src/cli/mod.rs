@@ -30,6 +30,7 @@ mod signals;
 mod table;
 mod train;
 mod upload;
+mod toml_file;
 mod variables;
 mod worker;
 mod world_args;

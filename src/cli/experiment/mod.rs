@@ -19,6 +19,7 @@ use self::runner::Runner;
 use super::figures::FigureArgs;
 use super::files::write_atomic;
 use super::run_args::{self, all_cores, count};
+use super::toml_file;
 use crate::cli::output::outln;
 use crate::env::EpisodeMetrics;
 use crate::experiment::{Experiment, ExperimentSummary, Overrides, PlotKind, RunResult, TrainingCurve, plots, readme};
@@ -106,7 +107,7 @@ pub async fn run(args: ExperimentArgs) -> anyhow::Result<()> {
 fn read(args: &ExperimentArgs) -> anyhow::Result<Experiment> {
     let name = args.file.display().to_string();
     let text = fs::read_to_string(&args.file).with_context(|| name.clone())?;
-    let document: Value = toml::from_str(&text).with_context(|| name.clone())?;
+    let document = toml_file::parse(&name, &text)?;
     let mut overrides = Overrides {
         seeds: args.seeds.clone(),
         num_seeds: args.num_seeds.map(usize::from),
