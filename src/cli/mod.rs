@@ -16,6 +16,7 @@ mod in_process_server;
 mod jobs;
 mod keys;
 mod manual;
+mod numbers;
 mod output;
 mod plan;
 mod policies;
@@ -94,7 +95,8 @@ enum Command {
 
 /// Runs the command of the command line.
 pub fn run() -> ExitCode {
-    let cli = match Cli::try_parse() {
+    let parsed = numbers::with_negative(Cli::command()).try_get_matches();
+    let cli = match parsed.and_then(|matches| Cli::from_arg_matches(&matches)).map_err(numbers::explained) {
         Ok(cli) => cli,
         Err(message) => return output::print_usage(&message),
     };
