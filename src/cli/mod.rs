@@ -20,6 +20,7 @@ mod numbers;
 mod output;
 mod plan;
 mod policies;
+mod policy_file;
 mod ports;
 mod progress;
 mod report;
@@ -29,9 +30,9 @@ mod serve;
 mod server;
 mod signals;
 mod table;
+mod toml_file;
 mod train;
 mod upload;
-mod toml_file;
 mod variables;
 mod worker;
 mod world_args;
@@ -40,7 +41,7 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::error::ErrorKind;
-use clap::{CommandFactory, Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use crate::nn::{VECTOR_WIDTH_VARIABLE, VectorWidth};
 

@@ -14,6 +14,7 @@ use super::curve::CurveFile;
 use crate::checkpoint::Checkpoint;
 use crate::cli::files::{check_distinct, check_writable, full_path, write_atomic};
 use crate::cli::output::{Exit, errln, outln};
+use crate::cli::policy_file::read_checkpoint;
 use crate::cli::run_args::all_cores;
 use crate::cli::signals::StopFlag;
 use crate::cli::{progress, table};
@@ -61,7 +62,7 @@ fn begin(args: &TrainArgs, threads: usize) -> anyhow::Result<Trainer> {
                 fs::read(name).with_context(|| format!("--init {name}: neither a bundled policy nor a file that can be read"))?
             }
         };
-        let weights = Checkpoint::from_bytes(&bytes).with_context(|| format!("--init {name}"))?;
+        let weights = read_checkpoint(name, &bytes).with_context(|| format!("--init {name}"))?;
         trainer.begin_with(&weights).with_context(|| format!("--init {name}"))?;
     }
     Ok(trainer)
