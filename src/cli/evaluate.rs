@@ -123,7 +123,7 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
             }
             _ => {
                 let opened = open(name, env)?;
-                opened.warn_of_other_world(name, &world, list.drawn());
+                bar.suspend(|| opened.warn_of_other_world(name, &world, list.drawn()));
                 let env = opened.environment(name, &world)?;
                 let policy = opened.policy;
                 let threads = args.threads.unwrap_or_else(all_cores);

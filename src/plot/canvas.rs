@@ -292,11 +292,25 @@ fn dashes(length: i32, dash: Option<(i32, i32)>) -> Vec<(i32, i32)> {
 /// The marker of a series at a place in pixels.
 pub(super) fn marker(sheet: &Sheet, look: Look, (x, y): (i32, i32)) -> Drawn {
     let style = look.colour().filled();
+    let line = look.colour().stroke_width(2);
+    // The inner side of an open marker hides the line through it.
     match look.marker {
         Marker::Circle => sheet.draw(&Circle::new((x, y), 5, style)),
         Marker::Square => sheet.draw(&Rectangle::new([(x - 4, y - 4), (x + 4, y + 4)], style)),
-        Marker::Diamond => sheet.draw(&Polygon::new(vec![(x, y - 6), (x + 6, y), (x, y + 6), (x - 6, y)], style)),
         Marker::Triangle => sheet.draw(&Polygon::new(vec![(x, y - 6), (x + 6, y + 5), (x - 6, y + 5)], style)),
+        Marker::Diamond => sheet.draw(&Polygon::new(vec![(x, y - 6), (x + 6, y), (x, y + 6), (x - 6, y)], style)),
+        Marker::Ring => {
+            sheet.draw(&Circle::new((x, y), 5, WHITE.filled()))?;
+            sheet.draw(&Circle::new((x, y), 5, line))
+        }
+        Marker::Cross => {
+            sheet.draw(&PathElement::new([(x - 5, y - 5), (x + 5, y + 5)], line))?;
+            sheet.draw(&PathElement::new([(x - 5, y + 5), (x + 5, y - 5)], line))
+        }
+        Marker::Frame => {
+            sheet.draw(&Rectangle::new([(x - 5, y - 5), (x + 5, y + 5)], WHITE.filled()))?;
+            sheet.draw(&Rectangle::new([(x - 5, y - 5), (x + 5, y + 5)], line))
+        }
     }
 }
 

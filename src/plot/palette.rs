@@ -61,22 +61,27 @@ pub(super) enum Marker {
     Square,
     Triangle,
     Diamond,
+    Ring,
+    Cross,
+    Frame,
 }
 
 /// Dashes of series that differ in hue as well, so that no reader needs the hue.
 const DASHES: [Option<(i32, i32)>; 4] = [None, Some((9, 4)), Some((2, 4)), Some((15, 4))];
-/// Markers of series and of baselines.
+/// Markers of series that no algorithm names.
 const MARKERS: [Marker; 4] = [Marker::Circle, Marker::Triangle, Marker::Square, Marker::Diamond];
+/// Markers of algorithms. Baselines have others, because they share hues with algorithms.
+const ALGORITHM_MARKERS: [Marker; 3] = [Marker::Circle, Marker::Triangle, Marker::Diamond];
 /// Baselines are never solid.
 const BASELINE_DASHES: [(i32, i32); 4] = [(5, 4), (2, 4), (10, 3), (16, 6)];
-const BASELINE_MARKERS: [Marker; 4] = [Marker::Square, Marker::Diamond, Marker::Triangle, Marker::Circle];
+const BASELINE_MARKERS: [Marker; 4] = [Marker::Square, Marker::Ring, Marker::Cross, Marker::Frame];
 
 impl Look {
-    /// The look of series `i` of those that no algorithm names, and of UAV `i`: in the order of the palette, with dashes and markers that
-    /// take another order in the next round.
+    /// The look of series `i` of those that no algorithm names, and of UAV `i`: in the order of the palette, with dashes and markers whose
+    /// pairs differ for the first 16.
     pub(super) fn of_index(i: usize) -> Self {
-        let nth = (i + i / TONES.len()) % DASHES.len();
-        Self { place: i % TONES.len(), dash: DASHES[nth], marker: MARKERS[nth] }
+        let marker = MARKERS[i % MARKERS.len()];
+        Self { place: i % TONES.len(), dash: DASHES[(i + i / MARKERS.len()) % DASHES.len()], marker }
     }
 
     /// Solid first, then dashes.
@@ -114,7 +119,11 @@ pub(super) fn looks<'a>(names: impl IntoIterator<Item = &'a str>) -> Vec<Look> {
         seen[known] += 1;
         let place = PLACES[known].1;
         if known < ALGORITHMS {
-            return Look { place, marker: MARKERS[(known + nth) % MARKERS.len()], ..Look::of_repetition(nth) };
+            return Look {
+                place,
+                marker: ALGORITHM_MARKERS[(known + nth) % ALGORITHM_MARKERS.len()],
+                ..Look::of_repetition(nth)
+            };
         }
         let nth = baselines % BASELINE_DASHES.len();
         baselines += 1;
@@ -159,6 +168,10 @@ mod tests {
             );
         }
         assert_ne!(styles(&["Qedgix", "QMIX"])[0].1, styles(&["Qedgix", "QMIX"])[1].1);
+        assert_ne!(styles(&["VDN", "sweep"])[0].1, styles(&["VDN", "sweep"])[1].1, "they share a hue");
+        let uavs: Vec<Look> = (0..16).map(Look::of_index).collect();
+        let alike = |a: &Look, b: &Look| (a.dash, a.marker) == (b.dash, b.marker);
+        assert!((0..16).all(|i| uavs[..i].iter().all(|other| !alike(other, &uavs[i]))));
         assert_eq!(algorithm("qmixed"), None);
         let many = looks(std::iter::repeat_n("x", 30));
         assert_eq!((many[8].place, many[0].place), (0, 0));
