@@ -1,6 +1,6 @@
 //! The flags that describe the world in which policies are evaluated, shared by `evaluate`, `plan` and `audit`.
 
-use anyhow::ensure;
+use anyhow::bail;
 use clap::Args;
 use serde_json::{Map, Value};
 
@@ -83,7 +83,7 @@ impl WorldArgs {
         let (mut environment, mut training) = (Map::new(), Map::new());
         run_args::set(&self.set, &mut environment, &mut training)?;
         if let Some(field) = training.keys().next() {
-            ensure!(false, "--set training.{field}: nothing is trained here; expected environment.FIELD=VALUE");
+            bail!("--set training.{field}: nothing is trained here; expected environment.FIELD=VALUE");
         }
         Ok(environment)
     }
