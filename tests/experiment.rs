@@ -189,7 +189,18 @@ fn errors_name_the_file_the_table_and_the_field() {
         ("episodes = 6", "episodes = 0", "episodes"),
         ("\"random\"", "\"rundom\"", "baselines[1]"),
         ("algorithm = \"qmix\"", "algorithm = \"ppo\"", "series[1].algorithm"),
-        ("name = \"QMIX\"", "name = \"qedgix\"", "series[1].name"),
+        ("name = \"QMIX\"", "name = \"Qedgix\"", "series[1].name: got \"Qedgix\", expected another name than series[0] has"),
+        (
+            "algorithm = \"qmix\"\ntraining = { learning_rate = 2e-3 }",
+            "algorithm = \"qedgix\"",
+            "series: got \"QMIX\", with the settings of \"Qedgix\"",
+        ),
+        ("users = 3", "users = 2", "points: got \"3 users\", with the settings of \"2 users\""),
+        ("x = \"users\"", "x = \"users\"\nx_scale = \"sqrt\"", "x_scale"),
+        ("x = 3", "x = nan", "points[1].x: got NaN, expected a finite number"),
+        ("learning_rate = 2e-3", "learning_rate = nan", "series[1].training.learning_rate: got NaN, expected a finite number"),
+        ("learning_rate = 2e-3", "learning_rate = 2026-01-01", "learning_rate: got 2026-01-01, expected a number"),
+        ("steps = 600", "steps = 600.5", "run.training.steps: got 600.5"),
         ("learning_rate = 2e-3", "learning_rate = 2", "series[1].training.learning_rate"),
         ("learning_rate = 2e-3", "learningrate = 2", "series[1].training.learningrate"),
         ("users = 3", "users = \"three\"", "points[1].environment.users"),
@@ -205,6 +216,20 @@ fn errors_name_the_file_the_table_and_the_field() {
         assert!(!output.status.success() && message.contains("tiny.toml") && message.contains(hint), "{to}: {message}");
         assert!(!dir.path().join("results").exists(), "{to}: no run is started");
     }
+    let logarithmic = TINY.replacen("x = \"users\"", "x = \"users\"\nx_scale = \"log\"", 1);
+    for (from, to, hint) in [
+        ("x = 3", "x = 0", "points[1].x: got 0, expected a number above 0"),
+        ("\"parameter\"", "\"convergence\"", "x_scale: got"),
+    ] {
+        let dir = directory_with(&logarithmic.replacen(from, to, 1));
+        let message = String::from_utf8(run(dir.path(), &["tiny.toml"]).stderr).unwrap();
+        assert!(message.contains(hint), "{to}: {message}");
+    }
+    let dir = directory_with(&TINY.replace("algorithm = \"qmix\"", "algorithm = \"qedgix\""));
+    let message =
+        String::from_utf8(run(dir.path(), &["tiny.toml", "--set", "training.learning_rate=1e-3", "--dry-run"]).stderr).unwrap();
+    let expected = "training.learning_rate: got 0.001, expected a field that no series set";
+    assert!(message.contains(expected) && message.contains("\"Qedgix\" and \"QMIX\""), "{message}");
     let dir = directory_with(TINY);
     for (words, hint) in [
         (vec!["tiny.toml", "--set", "training.bach=3"], "training.bach"),
@@ -220,6 +245,21 @@ fn errors_name_the_file_the_table_and_the_field() {
     ] {
         let message = String::from_utf8(run(dir.path(), &words).stderr).unwrap();
         assert!(message.contains(hint), "{words:?}: {message}");
+    }
+}
+
+#[test]
+fn names_that_differ_are_accepted_and_whole_numbers_are_written_as_people_write_them() {
+    let plain = directory_with(TINY);
+    let listed = run_successfully(plain.path(), &["tiny.toml", "--dry-run"]);
+    let floats = TINY.replace("steps = 600", "steps = 6e2").replace("users = 3", "users = 3.0").replace("[1, 2]", "[1.0, 2]");
+    let dir = directory_with(&floats.replace("episodes = 6", "episodes = 6.0"));
+    assert_eq!(run_successfully(dir.path(), &["tiny.toml", "--dry-run"]), listed, "the same runs in the same folders");
+    for (from, to) in [("QMIX", "Qedgix+"), ("QMIX", "qedgix"), ("2 users", "学习率"), ("3 users", "> 2 users")] {
+        let dir = directory_with(&TINY.replace(&format!("name = \"{from}\""), &format!("name = \"{to}\"")));
+        let renamed = run_successfully(dir.path(), &["tiny.toml", "--dry-run"]);
+        let folders: std::collections::BTreeSet<&str> = renamed.lines().skip(1).filter_map(|l| l.rsplit(' ').next()).collect();
+        assert_eq!(folders.len(), 8, "{renamed}");
     }
 }
 
@@ -252,21 +292,30 @@ fn the_experiments_of_the_repository_are_valid() {
 
 #[cfg(unix)]
 #[test]
-fn ctrl_c_saves_the_runs_in_progress() {
+fn ctrl_c_and_sigterm_save_the_runs_in_progress() {
     let dir = directory_with(TINY);
     // A run that does not end during the test, with one evaluation at the start.
     let long = ["tiny.toml", "--steps", "100000000", "--set", "training.eval_every=100000000", "--threads", "2"];
-    let mut child = qedgix(dir.path(), &long).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    let begin = || qedgix(dir.path(), &long).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
     let snapshots = || files(dir.path()).iter().filter(|(name, _)| name.ends_with("snapshot")).count();
-    let deadline = Instant::now() + Duration::from_secs(60);
-    while snapshots() < 2 && Instant::now() < deadline {
-        std::thread::sleep(Duration::from_millis(10));
+    for (signal, code) in [("-INT", 130), ("-TERM", 143)] {
+        let child = begin();
+        let deadline = Instant::now() + Duration::from_secs(60);
+        while snapshots() < 2 && Instant::now() < deadline {
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        let busy = run(dir.path(), &long);
+        assert!(String::from_utf8_lossy(&busy.stderr).contains("another process"), "two processes must not write the same files");
+        let signalled = Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap();
+        assert!(signalled.success());
+        let ended = child.wait_with_output().unwrap();
+        let said = String::from_utf8(ended.stderr).unwrap();
+        assert_eq!(ended.status.code(), Some(code), "{said}");
+        assert!(said.ends_with("stopped; the same command resumes the experiment\n"), "{said}");
+        let listed = run_successfully(dir.path(), &[&long[..5], &["--dry-run"]].concat());
+        assert_eq!(listed.lines().filter(|line| line.contains("at step")).count(), 2, "{listed}");
+        for (name, _) in files(dir.path()).iter().filter(|(name, _)| name.ends_with("snapshot")) {
+            fs::remove_file(dir.path().join(name)).unwrap();
+        }
     }
-    let busy = run(dir.path(), &long);
-    assert!(String::from_utf8_lossy(&busy.stderr).contains("another process"), "two processes must not write the same files");
-    let interrupted = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
-    assert!(interrupted.success());
-    assert!(!child.wait().unwrap().success());
-    let listed = run_successfully(dir.path(), &[&long[..5], &["--dry-run"]].concat());
-    assert_eq!(listed.lines().filter(|line| line.contains("at step")).count(), 2, "{listed}");
 }

@@ -2,13 +2,13 @@
 
 use anyhow::{Context, ensure};
 use clap::Args;
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 
-use super::evaluate;
 use super::output::{Exit, outln};
+use super::policy_file::open;
 use super::run_args::all_cores;
 use super::table::text_table;
-use super::world_args::WorldArgs;
+use super::world_args::{WorldArgs, named_by_flag};
 use crate::env::EnvConfig;
 use crate::learner::layout_list;
 use crate::policy::{EnvParams, Policy, Reach, RequiredInput};
@@ -34,9 +34,9 @@ pub struct AuditArgs {
     /// Number of layouts, from the first of the list; all if the list has fewer
     #[arg(long, env = "QEDGIX_EPISODES", default_value_t = 256)]
     episodes: usize,
-    /// Number of UAVs
-    #[arg(long, env = "QEDGIX_UAVS", default_value_t = 3)]
-    uavs: usize,
+    /// Number of UAVs [default: 3]
+    #[arg(long, env = "QEDGIX_UAVS")]
+    uavs: Option<usize>,
     #[command(flatten)]
     world: WorldArgs,
     /// Threads [default: all cores]
@@ -52,13 +52,16 @@ pub struct AuditArgs {
 /// # Errors
 /// An unknown policy or list, a policy that does not fit the environment; exit status 1 if the policy does not pass.
 pub fn run(args: &AuditArgs) -> anyhow::Result<()> {
-    let env = args.world.environment(args.uavs);
-    env.validate()?;
-    let list = layout_list(&args.layouts)?;
+    let default = EnvConfig::default();
+    let base = EnvConfig { uavs: args.uavs.unwrap_or(default.uavs), ..default };
+    let world = args.world.world(base, if args.uavs.is_some() { &["uavs"] } else { &[] })?;
+    let list = layout_list(&args.layouts).map_err(|e| named_by_flag(e, &Map::new()))?;
     ensure!(!list.mixed, "--layouts {}: it draws the environments itself; choose a list that is not mixed", list.name);
     ensure!(args.episodes > 0, "--episodes: got 0, expected at least 1");
-    let policy = evaluate::open(&args.policy, &env)?;
-    let env = EnvConfig { hover: policy.actions() > EnvConfig::COMPASS, ..env };
+    let opened = open(&args.policy, &world.env)?;
+    opened.warn_of_other_world(&args.policy, &world, &[]);
+    let env = opened.environment(&args.policy, &world)?;
+    let policy = opened.policy;
     if policy.needs() == RequiredInput::FullScene {
         let why = "it needs the positions of all UAVs and users (full information), which no UAV has";
         if args.json {

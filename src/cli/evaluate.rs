@@ -1,26 +1,23 @@
 //! `qedgix evaluate`: compares policies on frozen layouts, in this process or through `Act` of a server.
 
-use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
 use clap::Args;
+use serde_json::Map;
 
 use super::connect::ConnectArgs;
 use super::figures::FigureArgs;
-use super::files::read_if_exists;
 use super::output::{errln, outln};
-use super::world_args::WorldArgs;
+use super::policy_file::open;
+use super::world_args::{World, WorldArgs, named_by_flag};
 use super::{act_client, explain, ports, progress, report, run_args::all_cores, table};
-use crate::checkpoint::Checkpoint;
 use crate::env::{EnvConfig, LostUav, UserSlots};
-use crate::invalid::Invalid;
 use crate::learner::{
     Comparison, Disturbance, LayoutList, PolicyEvaluation, TracedEvaluation, Trajectory, evaluate_list, evaluate_traced,
     layout_list,
 };
-use crate::policy::{Policy, baselines};
-use crate::serving::bundled;
+use crate::policy::baselines;
 
 /// Flags of `evaluate`.
 #[derive(Args, Debug)]
@@ -33,6 +30,7 @@ use crate::serving::bundled;
 Conditions that differ from training:
   qedgix evaluate --policy policy.safetensors --policy sweep --uavs 4 --users 8 --json
   qedgix evaluate --policy qedgix --policy sweep --detection-range 0.2 --user-speed 0.01
+  qedgix evaluate --policy policy.safetensors --policy sweep --set environment.speed=0.08   # as in training
   qedgix evaluate --policy qedgix --policy sweep-shared --communication-range 1.5   # everywhere
   qedgix evaluate --policy qedgix --policy sweep-shared --layouts eval-mixed-v2     # drawn sizes, ranges and horizons
   qedgix evaluate --policy qedgix --policy sweep --lose-uav 1@20      # UAV 1 of 0, 1, 2 is lost from slot 20 on
@@ -48,14 +46,14 @@ pub struct EvaluateArgs {
     /// Number of layouts, from the first of the list; all if the list has fewer
     #[arg(long, env = "QEDGIX_EPISODES", default_value_t = 256)]
     episodes: usize,
-    /// Number of UAVs
-    #[arg(long, env = "QEDGIX_UAVS", default_value_t = 3)]
-    uavs: usize,
+    /// Number of UAVs [default: 3]
+    #[arg(long, env = "QEDGIX_UAVS")]
+    uavs: Option<usize>,
     #[command(flatten)]
     world: WorldArgs,
-    /// Distance that users move per slot, in units of the square's side; 0: users stay
-    #[arg(long, env = "QEDGIX_USER_SPEED", default_value_t = 0.0)]
-    user_speed: f64,
+    /// Distance that users move per slot, in units of the square's side; 0: users stay [default: 0]
+    #[arg(long, env = "QEDGIX_USER_SPEED")]
+    user_speed: Option<f64>,
     /// Index of a UAV (from 0) that is lost from a slot on: it does not move, collect or detect, and is not detected
     #[arg(long, env = "QEDGIX_LOSE_UAV", value_name = "UAV@SLOT", value_parser = lost_uav)]
     lose_uav: Option<LostUav>,
@@ -96,13 +94,13 @@ pub struct EvaluateArgs {
 /// An unknown policy or list, a policy that does not fit the environment, an error of the server, a directory that cannot be
 /// written.
 pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
-    let (list, seeds, env) = check(&args)?;
+    let (list, seeds, world) = check(&args)?;
+    let env = &world.env;
     let disturbance = args.disturbance();
     // The gaps to references are in the JSON and in the report only.
     let requested = |name: &str| args.policy.iter().any(|p| p == name);
     let references: &[&str] = if args.json || args.report.is_some() { &Comparison::REFERENCES } else { &[] };
-    let references =
-        references.iter().copied().filter(|name| !requested(name) && baselines::by_name(name, (&env).into()).is_some());
+    let references = references.iter().copied().filter(|name| !requested(name) && baselines::by_name(name, env.into()).is_some());
     let names: Vec<(&str, bool)> =
         args.policy.iter().map(|name| (name.as_str(), false)).chain(references.map(|name| (name, true))).collect();
 
@@ -120,12 +118,14 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
         bar.set_position((number * seeds.len()) as u64);
         let evaluation = match &server {
             Some(server) if !reference => {
-                let episodes = act_client::run_episodes(server, name, &env, &seeds, &bar).await?;
+                let episodes = act_client::run_episodes(server, name, env, &seeds, &bar).await?;
                 TracedEvaluation { episodes, aoi: Vec::new(), trajectory: Trajectory::default() }
             }
             _ => {
-                let policy = open(name, &env)?;
-                let env = EnvConfig { hover: policy.actions() > EnvConfig::COMPASS, ..env.clone() };
+                let opened = open(name, env)?;
+                bar.suspend(|| opened.warn_of_other_world(name, &world, list.drawn()));
+                let env = opened.environment(name, &world)?;
+                let policy = opened.policy;
                 let threads = args.threads.unwrap_or_else(all_cores);
                 if list.mixed {
                     let episodes = evaluate_list(policy.as_ref(), (&list, args.episodes), &env, threads)
@@ -144,11 +144,11 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
     }
     bar.finish_and_clear();
     if let Some(directory) = &args.explain {
-        explain::write((directory, &args.figures), (&args.policy, &|name| open(name, &env)), &env, seeds[args.report_layout])
+        explain::write((directory, &args.figures), &args.policy, &world, seeds[args.report_layout])
             .with_context(|| format!("writing explanations to {}", directory.display()))?;
     }
 
-    let comparison = Comparison { layouts: list, episodes: seeds.len(), env, disturbance, policies: evaluations };
+    let comparison = Comparison { layouts: list, episodes: seeds.len(), env: world.env, disturbance, policies: evaluations };
     if let Some(directory) = &args.report {
         report::write((directory, &args.figures), &comparison, &args.command_line())
             .with_context(|| format!("writing the report to {}", directory.display()))?;
@@ -166,19 +166,22 @@ pub async fn run(args: EvaluateArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The list of layouts, the seeds and the environment of the flags, checked.
-fn check(args: &EvaluateArgs) -> anyhow::Result<(LayoutList, Vec<u64>, EnvConfig)> {
-    let env = EnvConfig {
-        user_speed: args.user_speed,
+/// The list of layouts, the seeds and the world of the flags, checked.
+fn check(args: &EvaluateArgs) -> anyhow::Result<(LayoutList, Vec<u64>, World)> {
+    let default = EnvConfig::default();
+    let base = EnvConfig {
+        uavs: args.uavs.unwrap_or(default.uavs),
+        user_speed: args.user_speed.unwrap_or(default.user_speed),
         // A server is not told who is lost; it sees who is listed.
         lose_uav: args.lose_uav.filter(|_| args.server.is_some()),
         user_slots: args.user_slots.clone(),
-        ..args.world.environment(args.uavs)
+        ..default
     };
-    env.validate()?;
-    args.disturbance().validate(&env)?;
+    let given = [args.uavs.map(|_| "uavs"), args.user_speed.map(|_| "user_speed")];
+    let world = args.world.world(base, &given.into_iter().flatten().collect::<Vec<_>>())?;
+    args.disturbance().validate(&world.env).map_err(|e| named_by_flag(e, &Map::new()))?;
     ensure!(args.episodes > 0, "--episodes: got 0, expected at least 1");
-    let list = layout_list(&args.layouts)?;
+    let list = layout_list(&args.layouts).map_err(|e| named_by_flag(e, &Map::new()))?;
     let seeds = list.seeds(args.episodes);
     ensure!(
         args.report_layout < seeds.len(),
@@ -200,7 +203,8 @@ fn check(args: &EvaluateArgs) -> anyhow::Result<(LayoutList, Vec<u64>, EnvConfig
         "--layouts {}: it draws the environments itself; leave out --server, --report, --lose-uav and --position-noise",
         list.name
     );
-    Ok((list, seeds, env))
+    args.figures.warn_if_unused(args.report.is_some() || args.explain.is_some(), "--report or --explain");
+    Ok((list, seeds, world))
 }
 
 impl EvaluateArgs {
@@ -221,7 +225,7 @@ impl EvaluateArgs {
         for (flag, value, default) in
             [("uavs", self.uavs, default.uavs), ("users", world.users, default.users), ("slots", world.slots, default.slots)]
         {
-            if value != default {
+            if let Some(value) = value.filter(|value| *value != default) {
                 add(flag, value.to_string());
             }
         }
@@ -229,14 +233,17 @@ impl EvaluateArgs {
             ("detection-range", world.detection_range, default.detection_range),
             ("transmission-range", world.transmission_range, default.transmission_range),
             ("user-speed", self.user_speed, default.user_speed),
-            ("position-noise", self.position_noise, 0.0),
+            ("position-noise", Some(self.position_noise), 0.0),
         ] {
-            if value != default {
+            if let Some(value) = value.filter(|value| *value != default) {
                 add(flag, value.to_string());
             }
         }
         if let Some(range) = world.communication_range {
             add("communication-range", range.to_string());
+        }
+        for item in &world.set {
+            add("set", item.clone());
         }
         if let Some(LostUav { uav, slot }) = self.lose_uav {
             add("lose-uav", format!("{uav}@{slot}"));
@@ -282,26 +289,6 @@ fn quoted(word: &str) -> String {
     if !word.is_empty() && word.chars().all(plain) { word.to_owned() } else { format!("'{}'", word.replace('\'', "'\\''")) }
 }
 
-/// The policy with this name on the command line: a file, a bundled policy or a baseline.
-///
-/// # Errors
-/// The name is none of these, or the file is not a checkpoint.
-pub fn open(name: &str, env: &EnvConfig) -> anyhow::Result<Arc<dyn Policy>> {
-    if let Some(policy) = baselines::by_name(name, env.into()) {
-        return Ok(policy);
-    }
-    let bytes = match bundled::BUNDLED.iter().find(|(bundled, _)| *bundled == name) {
-        Some((_, bytes)) => bytes.to_vec(),
-        None => read_if_exists(Path::new(name))?.ok_or_else(|| {
-            let known = baselines::LIST.iter().map(|b| b.name).chain(bundled::BUNDLED.iter().map(|(name, _)| *name));
-            let known = known.collect::<Vec<_>>().join(", ");
-            Invalid::new("--policy", format!("{name:?}"), format!("a checkpoint file, or one of {known}"))
-        })?,
-    };
-    let checkpoint = Checkpoint::from_bytes(&bytes).with_context(|| format!("{name} is not a checkpoint"))?;
-    Ok(Arc::new(checkpoint.policy()))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -323,18 +310,24 @@ mod tests {
         for (words, hint) in [
             (vec!["--lose-uav", "1"], "UAV@SLOT"),
             (vec!["--lose-uav", "one@3"], "UAV@SLOT"),
-            (vec!["--lose-uav", "3@0"], "lose.uav"),
-            (vec!["--lose-uav", "0@80"], "lose.slot"),
-            (vec!["--position-noise", "nan"], "position_noise"),
-            (vec!["--position-noise", "2"], "position_noise"),
-            (vec!["--user-speed", "-1"], "'-1'"),
-            (vec!["--user-speed", "3"], "user_speed"),
-            (vec!["--transmission-range", "0.5"], "detection_range"),
+            (vec!["--lose-uav", "3@0"], "--lose-uav, uav: got 3"),
+            (vec!["--lose-uav", "0@80"], "--lose-uav, slot: got 80"),
+            (vec!["--position-noise", "nan"], "--position-noise: got NaN"),
+            (vec!["--position-noise", "2"], "--position-noise: got 2"),
+            (vec!["--user-speed=-1"], "--user-speed: got -1"),
+            (vec!["--user-speed", "3"], "--user-speed: got 3"),
+            (vec!["--transmission-range", "0.5"], "--detection-range: got 0.28"),
+            (vec!["--layouts", "eval-v0"], "--layouts: got"),
+            (vec!["--set", "environment.speed=2"], "--set environment.speed: got 2"),
+            (vec!["--set", "environment.t=0.5"], "--detection-range: got 0.28"),
+            (vec!["--set", "environment.sped=0.5"], "--set environment.sped: unknown field"),
+            (vec!["--set", "training.batch=5"], "nothing is trained"),
+            (vec!["--set", "speed=0.5"], "environment.FIELD"),
             (vec!["--report-layout", "256"], "from 0 to 255"),
             (vec!["--report", "r", "--server", "localhost:1"], "leave out --server"),
             (vec!["--position-noise", "0.1", "--server", "localhost:1"], "leave out --server"),
-            (vec!["--user-slots", "5@0"], "user_slots[0].user"),
-            (vec!["--user-slots", "1@9..3"], "user_slots[0].until"),
+            (vec!["--user-slots", "5@0"], "--user-slots, user: got 5"),
+            (vec!["--user-slots", "1@9..3"], "--user-slots, until: got 3"),
             (vec!["--user-slots", "1@x"], "USER@FROM"),
         ] {
             let refused = parse(&words).and_then(|args| check(&args).map(|_| ()).map_err(|e| format!("{e:#}")));
@@ -344,13 +337,22 @@ mod tests {
     }
 
     #[test]
+    fn any_field_of_the_world_can_be_set_and_the_last_word_is_that_of_set() {
+        let world = |words: &[&str]| check(&parse(words).expect("flags parse")).expect("valid").2.env;
+        assert_eq!(world(&[]), EnvConfig::default());
+        let words = ["--users", "4", "--uavs", "2", "--set", "environment.speed=0.08", "--set", "environment.users=6"];
+        assert_eq!(world(&words), EnvConfig { uavs: 2, users: 6, speed: 0.08, ..EnvConfig::default() });
+    }
+
+    #[test]
     fn the_command_line_contains_the_flags() {
         let words = ["--policy", "it's mine.safetensors", "--uavs", "4", "--lose-uav", "1@20", "--position-noise", "0.02"];
+        let words = [&words[..], &["--set", "environment.v=0.08"]].concat();
         let line = parse(&words).expect("flags parse").command_line();
         assert_eq!(
             line,
             "qedgix evaluate --policy sweep --policy 'it'\\''s mine.safetensors' --layouts eval-v1 --episodes 256 --uavs 4 \
-             --position-noise 0.02 --lose-uav 1@20"
+             --position-noise 0.02 --set environment.v=0.08 --lose-uav 1@20"
         );
     }
 }

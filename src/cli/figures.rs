@@ -6,6 +6,7 @@ use anyhow::Context;
 use clap::{Args, ValueEnum};
 
 use super::files::{check_writable, write_atomic};
+use super::output::errln;
 use crate::plot;
 
 /// A format of figures.
@@ -60,6 +61,14 @@ impl FigureArgs {
         let names = self.figures.iter().filter_map(|format| Some(format.to_possible_value()?.get_name().to_owned()));
         let value = names.collect::<Vec<_>>().join(",");
         (value != "svg").then_some(value)
+    }
+
+    /// Warns on standard error of formats that were asked for while nothing asks for figures. It is no error, because the variable may be
+    /// set for all commands.
+    pub fn warn_if_unused(&self, used: bool, flags: &str) {
+        if let Some(value) = self.value().filter(|_| !used) {
+            errln!("warning: --figures {value} writes nothing without {flags}");
+        }
     }
 
     /// The file of a figure that a page shows: not a PDF if there is another one.

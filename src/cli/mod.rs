@@ -16,9 +16,11 @@ mod in_process_server;
 mod jobs;
 mod keys;
 mod manual;
+mod numbers;
 mod output;
 mod plan;
 mod policies;
+mod policy_file;
 mod ports;
 mod progress;
 mod report;
@@ -28,6 +30,7 @@ mod serve;
 mod server;
 mod signals;
 mod table;
+mod toml_file;
 mod train;
 mod upload;
 mod variables;
@@ -38,7 +41,7 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::error::ErrorKind;
-use clap::{CommandFactory, Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use crate::nn::{VECTOR_WIDTH_VARIABLE, VectorWidth};
 
@@ -93,7 +96,8 @@ enum Command {
 
 /// Runs the command of the command line.
 pub fn run() -> ExitCode {
-    let cli = match Cli::try_parse() {
+    let parsed = numbers::with_negative(Cli::command()).try_get_matches();
+    let cli = match parsed.and_then(|matches| Cli::from_arg_matches(&matches)).map_err(numbers::explained) {
         Ok(cli) => cli,
         Err(message) => return output::print_usage(&message),
     };

@@ -4,15 +4,16 @@ use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
 use clap::Args;
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 
 use super::figures::FigureArgs;
 use super::files::write_atomic;
 use super::output::{Exit, outln};
+use super::policy_file::open;
+use super::progress;
 use super::run_args::all_cores;
 use super::table::text_table;
-use super::world_args::WorldArgs;
-use super::{evaluate, progress};
+use super::world_args::{World, WorldArgs, named_by_flag};
 use crate::env::{EnvConfig, EpisodeMetrics, LostUav};
 use crate::learner::{Disturbance, Failure, FleetSize, Interval, Sizing, SizingTarget, evaluate_traced, layout_list};
 use crate::plot::{self, Chart, Series};
@@ -67,15 +68,20 @@ pub struct PlanArgs {
 /// # Errors
 /// A policy that does not fit, flags out of range, files that cannot be written; exit status 1 if no fleet meets the target.
 pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
-    args.target().validate()?;
+    args.target().validate().map_err(|e| named_by_flag(e, &Map::new()))?;
     ensure!(args.episodes > 0, "--episodes: got 0, expected at least 1");
-    let list = layout_list(&args.layouts)?;
+    let list = layout_list(&args.layouts).map_err(|e| named_by_flag(e, &Map::new()))?;
     ensure!(!list.mixed, "--layouts {}: it draws the environments itself; choose a list that is not mixed", list.name);
-    let plan = args.plan(&list.seeds(args.episodes))?;
-    let document = args.document(&plan);
+    args.figures.warn_if_unused(args.report.is_some(), "--report");
+    let world = args.world.world(EnvConfig::default(), &[])?;
+    ensure!(!world.is_given("uavs"), "--set environment.uavs: plan tries fleets of all sizes; --max-uavs is the largest");
+    open(&args.policy, &world.env)?.warn_of_other_world(&args.policy, &world, &["uavs"]);
+    let plan = args.plan(&world, &list.seeds(args.episodes))?;
+    let users = world.env.users;
+    let document = args.document(&plan, users);
     if let Some(directory) = &args.report {
         std::fs::create_dir_all(directory).with_context(|| format!("cannot create {}", directory.display()))?;
-        args.figures.write(&directory.join("plan.svg"), &args.figure(&plan))?;
+        args.figures.write(&directory.join("plan.svg"), &args.figure(&plan, users))?;
         write_atomic(&directory.join("plan.json"), format!("{document:#}\n").as_bytes())?;
         if args.failures {
             args.figures.write(&directory.join("failures.svg"), &args.failure_figure(&plan))?;
@@ -84,7 +90,7 @@ pub fn run(args: &PlanArgs) -> anyhow::Result<()> {
     if args.json {
         outln!("{document:#}")?;
     } else {
-        args.print(&plan)?;
+        args.print(&plan, users)?;
     }
     match plan.uavs {
         Some(_) => Ok(()),
@@ -100,10 +106,11 @@ impl PlanArgs {
         SizingTarget { target_p95, max_uavs, failures }
     }
 
-    fn plan(&self, seeds: &[u64]) -> anyhow::Result<Sizing> {
-        let bar = progress::bar(self.target().evaluations(self.world.slots) as u64, "fleets");
-        let sizing = self.target().run(self.world.slots, |uavs, lose| {
-            let episodes = self.evaluate(uavs, lose, seeds)?;
+    fn plan(&self, world: &World, seeds: &[u64]) -> anyhow::Result<Sizing> {
+        let slots = world.env.slots;
+        let bar = progress::bar(self.target().evaluations(slots) as u64, "fleets");
+        let sizing = self.target().run(slots, |uavs, lose| {
+            let episodes = self.evaluate(world, (uavs, lose), seeds)?;
             bar.inc(1);
             Ok::<_, anyhow::Error>(Some(episodes))
         })?;
@@ -111,25 +118,30 @@ impl PlanArgs {
         sizing.context("the plan was stopped")
     }
 
-    fn evaluate(&self, uavs: usize, lose: Option<LostUav>, seeds: &[u64]) -> anyhow::Result<Vec<EpisodeMetrics>> {
-        let env = self.world.environment(uavs);
+    fn evaluate(
+        &self,
+        world: &World,
+        (uavs, lose): (usize, Option<LostUav>),
+        seeds: &[u64],
+    ) -> anyhow::Result<Vec<EpisodeMetrics>> {
+        let opened = open(&self.policy, &EnvConfig { uavs, ..world.env.clone() })?;
+        let env = EnvConfig { uavs, ..opened.environment(&self.policy, world)? };
         env.validate()?;
-        let policy = evaluate::open(&self.policy, &env)?;
-        let env = EnvConfig { hover: policy.actions() > EnvConfig::COMPASS, ..env };
+        let policy = opened.policy;
         let disturbance = Disturbance { lose, ..Disturbance::default() };
         let threads = self.threads.unwrap_or_else(all_cores);
         let evaluation = evaluate_traced(&*policy, &env, seeds, 0, &disturbance, threads);
         Ok(evaluation.with_context(|| format!("policy {} with {uavs} UAVs", self.policy))?.episodes)
     }
 
-    fn print(&self, plan: &Sizing) -> anyhow::Result<()> {
+    fn print(&self, plan: &Sizing, users: usize) -> anyhow::Result<()> {
         let mut before = None;
         let rows = plan.sizes.iter().map(|size| {
             let gain =
                 before.replace(size.p95.mean).map_or_else(String::new, |before: f64| format!("{:.2}", before - size.p95.mean));
             [size.uavs.to_string(), cell(&size.p95), gain, cell(&size.mean_aoi)]
         });
-        outln!("{} users, {}, AoI in slots, mean and 95 % interval over layouts", self.world.users, self.policy)?;
+        outln!("{users} users, {}, AoI in slots, mean and 95 % interval over layouts", self.policy)?;
         outln!("{}", text_table(["UAVs", "p95 AoI", "gain by the last UAV", "mean AoI"], rows))?;
         if let Some(uavs) = plan.uavs {
             let [low, high] =
@@ -147,7 +159,7 @@ impl PlanArgs {
         Ok(())
     }
 
-    fn figure(&self, plan: &Sizing) -> String {
+    fn figure(&self, plan: &Sizing, users: usize) -> String {
         let points = |of: fn(&FleetSize) -> Interval| -> (Vec<[f64; 2]>, Option<Vec<[f64; 2]>>) {
             let ends = |size: &FleetSize| [of(size).low, of(size).high];
             let points = plan.sizes.iter().map(|size| [size.uavs as f64, of(size).mean]).collect();
@@ -155,7 +167,7 @@ impl PlanArgs {
         };
         let (p95, mean) = (points(|size| size.p95), points(|size| size.mean_aoi));
         plot::lines(&Chart {
-            title: format!("{}: fleets for {} users", self.policy, self.world.users),
+            title: format!("{}: fleets for {users} users", self.policy),
             x: "UAVs".into(),
             y: "AoI (slots)".into(),
             series: vec![
@@ -163,8 +175,9 @@ impl PlanArgs {
                 Series { name: "mean AoI".into(), points: mean.0, band: mean.1 },
             ],
             levels: vec![("target of p95".into(), self.target_p95)],
-            note: "Bars are 95 % intervals over layouts.".into(),
+            note: "Whiskers are 95 % intervals over layouts.".into(),
             markers: true,
+            log_x: false,
         })
     }
 
@@ -183,15 +196,16 @@ impl PlanArgs {
             y: "p95 AoI (slots)".into(),
             series: vec![series(0), series(1)],
             levels: vec![("target".into(), self.target_p95)],
-            note: "Bars are 95 % intervals over layouts.".into(),
+            note: "Whiskers are 95 % intervals over layouts.".into(),
             markers: true,
+            log_x: false,
         })
     }
 
-    fn document(&self, plan: &Sizing) -> Value {
+    fn document(&self, plan: &Sizing, users: usize) -> Value {
         let mut document = json!({
             "policy": self.policy,
-            "users": self.world.users,
+            "users": users,
             "target_p95": self.target_p95,
             "layouts": self.layouts,
             "episodes": self.episodes,

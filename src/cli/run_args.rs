@@ -132,10 +132,18 @@ fn first_difference<'a>(path: &str, one: &'a Value, other: &'a Value) -> Option<
 /// # Errors
 /// The text is not a whole number from 0 to 2^64 - 1.
 pub fn count(text: &str) -> Result<u64, String> {
+    const LARGEST: f64 = (1_u64 << 53) as f64;
     let plain = without_separators(text);
-    let whole = |x: &f64| x.fract() == 0.0 && (0.0..=2f64.powi(53)).contains(x);
-    let number = plain.parse().ok().or_else(|| plain.parse().ok().filter(whole).map(|x| x as u64));
-    number.ok_or_else(|| "expected a whole number, as 400000, 400_000 or 4e5".to_owned())
+    let float: Option<f64> = plain.parse().ok();
+    let whole = float.filter(|x| x.fract() == 0.0 && (0.0..=LARGEST).contains(x));
+    plain.parse().ok().or_else(|| whole.map(|x| x as u64)).ok_or_else(|| {
+        let limit = match float {
+            Some(x) if x < 0.0 => ", 0 or more",
+            Some(x) if x > LARGEST => " of at most 2^53, about 9e15",
+            _ => "",
+        };
+        format!("expected a whole number{limit}, as 400000, 400_000 or 4e5")
+    })
 }
 
 /// A number without the underscores between its digits; other text as it is.
@@ -222,6 +230,8 @@ mod tests {
         for text in ["", "-1", "1.5", "1e-3", "1e300", "nan", "inf", "_1", "1_", "1__0", "1 000", "0x10", "many"] {
             assert!(count(text).is_err(), "{text}");
         }
+        assert!(count("1e30").unwrap_err().contains("at most 2^53"));
+        assert!(count("-5").unwrap_err().contains("0 or more"));
     }
 
     #[test]

@@ -9,12 +9,13 @@ mod plan;
 mod plots;
 mod run_result;
 mod settings;
+mod slugs;
 mod statistics;
 mod summary;
 mod tables;
 
 pub use curve::TrainingCurve;
-pub use plan::{Experiment, ExperimentPoint, PlotKind, Run};
+pub use plan::{Experiment, ExperimentPoint, PlotKind, Run, XScale};
 pub use plots::plots;
 pub use run_result::{EvaluatedWeights, RunResult};
 pub use settings::Overrides;

@@ -1,7 +1,6 @@
 //! The plots of an experiment.
 
-use super::plan::slug;
-use super::{Experiment, ExperimentSummary, PlotKind, Run, TrainingCurve};
+use super::{Experiment, ExperimentPoint, ExperimentSummary, PlotKind, Run, TrainingCurve, XScale};
 use crate::learner::Interval;
 use crate::plot::{self, Bar, Chart, Series, Trajectories, bars, lines};
 
@@ -12,9 +11,9 @@ fn aoi_on(layouts: &str) -> String {
 /// What the error bars of results are.
 fn intervals_note(summary: &ExperimentSummary) -> &'static str {
     if summary.seeds.len() > 1 {
-        "Bars: 95 % intervals over seeds and layouts."
+        "Whiskers: 95 % intervals over seeds and layouts."
     } else {
-        "Bars: 95 % intervals over layouts; one seed."
+        "Whiskers: 95 % intervals over layouts; one seed."
     }
 }
 
@@ -73,19 +72,16 @@ fn convergence(experiment: &Experiment, summary: &ExperimentSummary, curves: &[T
                 .map(|b| (format!("{} on {}", b.name, summary.layouts), b.mean_aoi.mean))
                 .collect(),
             note: convergence_note(summary),
-            markers: false,
+            ..Chart::default()
         };
-        files.push((file_name("convergence", &point.name), lines(&chart)));
+        files.push((file_name("convergence", point), lines(&chart)));
         let bar = |name: &str, aoi: &Interval| Bar { name: name.to_owned(), mean: aoi.mean, low: aoi.low, high: aoi.high };
         let reached: Vec<Bar> = (summary.series_summaries.iter().filter(|row| row.point == point.name))
             .map(|row| bar(&row.series, &row.mean_aoi))
             .chain(summary.baselines.iter().filter(|b| b.point == point.name).map(|b| bar(&b.name, &b.mean_aoi)))
             .collect();
         let title = format!("{title}: best weights");
-        files.push((
-            file_name("reached", &point.name),
-            bars(&title, &aoi_on(&summary.layouts), intervals_note(summary), &reached),
-        ));
+        files.push((file_name("reached", point), bars(&title, &aoi_on(&summary.layouts), intervals_note(summary), &reached)));
     }
     files
 }
@@ -114,15 +110,16 @@ fn parameter(experiment: &Experiment, summary: &ExperimentSummary) -> String {
         levels: Vec::new(),
         note: intervals_note(summary).to_owned(),
         markers: true,
+        log_x: experiment.x_scale == XScale::Log,
     })
 }
 
 fn trajectory_plots(experiment: &Experiment, trajectories: &[Trajectories]) -> Vec<(String, String)> {
     let panel = |(run, trajectory): (&Run, &Trajectories)| {
-        let (series, point) = (&experiment.series[run.series], &experiment.points[run.point].name);
+        let (series, point) = (&experiment.series[run.series], &experiment.points[run.point]);
         (
-            file_name(&format!("trajectories-{}", slug(series)), point),
-            plot::trajectories(&title_with_point(series, point), trajectory),
+            file_name(&format!("trajectories-{}", experiment.series_slugs[run.series]), point),
+            plot::trajectories(&title_with_point(series, &point.name), trajectory),
         )
     };
     experiment.runs.iter().zip(trajectories).map(panel).collect()
@@ -132,6 +129,6 @@ fn title_with_point(title: &str, point: &str) -> String {
     if point.is_empty() { title.to_owned() } else { format!("{title}: {point}") }
 }
 
-fn file_name(plot: &str, point: &str) -> String {
-    if point.is_empty() { format!("{plot}.svg") } else { format!("{plot}-{}.svg", slug(point)) }
+fn file_name(plot: &str, point: &ExperimentPoint) -> String {
+    if point.slug.is_empty() { format!("{plot}.svg") } else { format!("{plot}-{}.svg", point.slug) }
 }

@@ -33,7 +33,10 @@ pub(super) struct TableReader {
 }
 
 impl TableReader {
-    /// The table `value`; an error if it has other fields than `known`.
+    /// The table `value`.
+    ///
+    /// # Errors
+    /// It is no table, or has other fields than `known`.
     pub fn new(path: &str, value: Value, known: &[&str]) -> Result<Self, Invalid> {
         let Value::Object(fields) = value else {
             return Err(Invalid::schema(path, &value, "a table"));
@@ -50,16 +53,27 @@ impl TableReader {
         if self.path.is_empty() { field.to_owned() } else { format!("{}.{field}", self.path) }
     }
 
+    /// The value of a field, if it is there.
+    ///
+    /// # Errors
+    /// It has another type.
     pub fn optional<T: DeserializeOwned>(&mut self, field: &str) -> Result<Option<T>, Invalid> {
         let Some(value) = self.fields.remove(field) else { return Ok(None) };
         T::deserialize(&value).map(Some).map_err(|e| Invalid::schema(self.at(field), &value, expectation(&e)))
     }
 
+    /// The value of a field; `expected` says what is missing without it.
+    ///
+    /// # Errors
+    /// It is missing, or has another type.
     pub fn required<T: DeserializeOwned>(&mut self, field: &str, expected: &str) -> Result<T, Invalid> {
         self.optional(field)?.ok_or_else(|| Invalid::missing_field(self.at(field), expected))
     }
 
     /// A name: not empty, on one line.
+    ///
+    /// # Errors
+    /// It is missing, empty, longer than 80 characters or has several lines.
     pub fn name(&mut self, field: &str) -> Result<String, Invalid> {
         let expected = "1 to 80 characters on one line";
         let name: String = self.required(field, expected)?;
@@ -85,6 +99,10 @@ impl RunSettings {
     /// Its fields.
     pub const FIELDS: [&str; 4] = ["algorithm", "preset", "environment", "training"];
 
+    /// The settings of a table.
+    ///
+    /// # Errors
+    /// A field has another type.
     pub fn read(table: &mut TableReader) -> Result<Self, Invalid> {
         Ok(Self {
             prefix: table.at(""),
@@ -101,6 +119,11 @@ impl RunSettings {
         Self { prefix, environment, training, ..Self::default() }
     }
 
+    /// The prefix of its fields in errors.
+    pub fn prefix(&self) -> &str {
+        &self.prefix
+    }
+
     /// The first field that `other` sets, too, with the value of `other`: `training.gamma`.
     pub fn field_in_common<'a>(&self, other: &'a Self) -> Option<(String, &'a Value)> {
         let sections = [("environment", &self.environment, &other.environment), ("training", &self.training, &other.training)];
@@ -110,7 +133,10 @@ impl RunSettings {
         })
     }
 
-    /// The configuration of one run; later sections override earlier ones. An error names the section of the invalid field.
+    /// The configuration of one run; later sections override earlier ones.
+    ///
+    /// # Errors
+    /// The first field that is unknown, of the wrong type or out of range, with the name of its section.
     pub fn resolve(sections: &[&Self], seed: u64) -> Result<TrainConfig, Invalid> {
         let mut all = Self::default();
         for section in sections {

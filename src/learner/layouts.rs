@@ -39,6 +39,11 @@ const MIXED: Vary = Vary {
 };
 
 impl LayoutList {
+    /// The fields of the environment that the list draws.
+    pub fn drawn(&self) -> &'static [&'static str] {
+        if self.mixed { &["uavs", "users", "slots", "detection_range", "communication_range"] } else { &[] }
+    }
+
     /// The first `episodes` seeds of the list in groups, each with its environment: `base`, or in a mixed list one that is drawn
     /// for the group.
     pub fn environments(&self, base: &EnvConfig, episodes: usize) -> Vec<(EnvConfig, Vec<u64>)> {

@@ -31,7 +31,7 @@ pub use loss::LossMetrics;
 pub use memory::MemoryEstimate;
 pub use rollout::Rollout;
 pub use sizing::{Failure, FleetSize, Sizing, SizingTarget};
-pub use snapshot::SnapshotError;
+pub use snapshot::{SnapshotError, is_snapshot};
 pub use summary::{Difference, Interval, Summary, difference, interval, summarize};
 pub use trainer::Trainer;
 pub use update::{Learner, LearnerState};

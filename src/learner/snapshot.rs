@@ -72,6 +72,11 @@ struct Head {
     replay_next: usize,
 }
 
+/// Whether these bytes begin as a snapshot does.
+pub fn is_snapshot(bytes: &[u8]) -> bool {
+    bytes.starts_with(MAGIC)
+}
+
 pub(super) fn encode(config: &TrainConfig, run: &RunState, learner: &LearnerState, replay: &Replay) -> Vec<u8> {
     let head = Head {
         config: config.clone(),

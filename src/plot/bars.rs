@@ -3,7 +3,7 @@
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, VPos};
 
-use super::canvas::{self, Axes, BOTTOM, HEIGHT, INK, Key, Legend, TEXT, TOP, WIDTH, Words, fitting, text, text_width};
+use super::canvas::{self, Axes, BOTTOM, HEIGHT, INK, Key, Legend, TEXT, TOP, WIDTH, Words, all_fitting, text, text_width};
 use super::data::Bar;
 use super::palette::looks;
 use super::scale::{drawable, extent, value};
@@ -34,15 +34,23 @@ pub fn bars(title: &str, value_label: &str, note: &str, bars: &[Bar]) -> String 
         canvas::heading(sheet, title)?;
         // Bar i is at y = -i, so that the first is on top.
         let ranges = [axis, 0.5 - rows as f64..0.5];
-        let axes =
-            Axes { ranges, names: [value_label, ""], x_ticks: None, left: names as u32, right: 16, below: legend.height() };
+        let axes = Axes {
+            ranges,
+            names: [value_label, ""],
+            x_ticks: None,
+            log_x: false,
+            left: names as u32,
+            right: 16,
+            below: legend.height(),
+        };
         let mut plot = canvas::axes(sheet, axes)?;
         let left = 10 + names;
+        let labels: Vec<&str> = bars[..rows].iter().map(|bar| bar.name.as_str()).collect();
+        let labels = all_fitting(&labels, names - 4, TEXT);
         for (i, bar) in bars[..rows].iter().enumerate() {
             let at = -(i as f64);
             let row = plot.backend_coord(&(0.0, at)).1;
-            let name = fitting(&bar.name, names - 4, TEXT);
-            sheet.draw(&Text::new(name, (left - 8, row), text(TEXT, INK, HPos::Right, VPos::Center)))?;
+            sheet.draw(&Text::new(labels[i].clone(), (left - 8, row), text(TEXT, INK, HPos::Right, VPos::Center)))?;
             if !drawable(bar.mean) {
                 continue;
             }

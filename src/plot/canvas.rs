@@ -12,7 +12,7 @@ use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::palette::{Look, Marker, TONES};
-use super::scale::{tick, ticks};
+use super::scale::{tick, ticks, unlog};
 
 /// The drawing area, in pixels.
 pub(super) type Sheet<'a> = DrawingArea<SVGBackend<'a>, Shift>;
@@ -141,6 +141,8 @@ pub(super) struct Axes<'a> {
     pub(super) names: [&'a str; 2],
     /// Ticks of the x axis; none: round numbers.
     pub(super) x_ticks: Option<Vec<f64>>,
+    /// Whether x values are decimal logarithms of what their labels say.
+    pub(super) log_x: bool,
     /// Pixels left and right of the plot, and below it for the legend.
     pub(super) left: u32,
     pub(super) right: u32,
@@ -162,11 +164,13 @@ pub(super) fn axes<'b>(sheet: &Sheet<'b>, axes: Axes) -> Result<Plot<'b, 'b>, Dr
         .build_cartesian_2d(Axis { range: x, ticks: x_ticks }, Axis { range: y, ticks: y_ticks })?;
     let [x_name, y_name] = axes.names;
     let (width, height) = plot.plotting_area().dim_in_pixel();
+    let log = axes.log_x;
+    let x_label = move |&x: &f64| tick(if log { unlog(x) } else { x });
     let mut mesh = plot.configure_mesh();
     mesh.light_line_style(TRANSPARENT)
         .bold_line_style(FAINT)
         .axis_style(AXIS)
-        .x_label_formatter(&|&x| tick(x))
+        .x_label_formatter(&x_label)
         .y_label_formatter(&|&x| tick(x))
         .label_style(("sans-serif", TEXT).into_font().color(&INK))
         .axis_desc_style(("sans-serif", TEXT).into_font().color(&INK))
@@ -223,8 +227,9 @@ impl Legend {
 
     /// The first `shown` entries, and how many more there are.
     fn with_rest(all: &[(Key, String)], shown: usize) -> Vec<(Key, String)> {
-        let cut = |(key, name): &(Key, String)| (*key, fitting(name, WIDTH as i32 - 24 - SYMBOL, TEXT));
-        let mut entries: Vec<_> = all[..shown].iter().map(cut).collect();
+        let names: Vec<&str> = all.iter().map(|(_, name)| name.as_str()).collect();
+        let names = all_fitting(&names, WIDTH as i32 - 20 - SYMBOL, TEXT);
+        let mut entries: Vec<_> = all.iter().zip(names).take(shown).map(|((key, _), name)| (*key, name)).collect();
         if shown < all.len() {
             entries.push((Key::Note, format!("and {} more", all.len() - shown)));
         }
@@ -287,10 +292,25 @@ fn dashes(length: i32, dash: Option<(i32, i32)>) -> Vec<(i32, i32)> {
 /// The marker of a series at a place in pixels.
 pub(super) fn marker(sheet: &Sheet, look: Look, (x, y): (i32, i32)) -> Drawn {
     let style = look.colour().filled();
+    let line = look.colour().stroke_width(2);
+    // The inner side of an open marker hides the line through it.
     match look.marker {
         Marker::Circle => sheet.draw(&Circle::new((x, y), 5, style)),
         Marker::Square => sheet.draw(&Rectangle::new([(x - 4, y - 4), (x + 4, y + 4)], style)),
         Marker::Triangle => sheet.draw(&Polygon::new(vec![(x, y - 6), (x + 6, y + 5), (x - 6, y + 5)], style)),
+        Marker::Diamond => sheet.draw(&Polygon::new(vec![(x, y - 6), (x + 6, y), (x, y + 6), (x - 6, y)], style)),
+        Marker::Ring => {
+            sheet.draw(&Circle::new((x, y), 5, WHITE.filled()))?;
+            sheet.draw(&Circle::new((x, y), 5, line))
+        }
+        Marker::Cross => {
+            sheet.draw(&PathElement::new([(x - 5, y - 5), (x + 5, y + 5)], line))?;
+            sheet.draw(&PathElement::new([(x - 5, y + 5), (x + 5, y - 5)], line))
+        }
+        Marker::Frame => {
+            sheet.draw(&Rectangle::new([(x - 5, y - 5), (x + 5, y + 5)], WHITE.filled()))?;
+            sheet.draw(&Rectangle::new([(x - 5, y - 5), (x + 5, y + 5)], line))
+        }
     }
 }
 
@@ -318,6 +338,43 @@ pub(super) fn fitting(text: &str, width: i32, size: i32) -> String {
     // The longest that fits.
     let fits = (0..=all.len()).collect::<Vec<_>>().partition_point(|&kept| text_width(&cut(kept), size) <= width);
     cut(fits.saturating_sub(1))
+}
+
+/// All of `texts` shortened so that each fits into `width` pixels, and different ones stay different: where shortened ones would be the
+/// same, what the texts have in common at their beginning is left out, and if that is not enough, they are numbered.
+pub(super) fn all_fitting(texts: &[&str], width: i32, size: i32) -> Vec<String> {
+    let mut short: Vec<String> = texts.iter().map(|text| fitting(text, width, size)).collect();
+    for i in 0..texts.len() {
+        let alike: Vec<usize> = (0..texts.len()).filter(|&j| short[j] == short[i]).collect();
+        if alike.iter().all(|&j| texts[j] == texts[i]) {
+            continue;
+        }
+        let common = alike.iter().map(|&j| common_prefix(texts[i], texts[j])).min().unwrap_or(0);
+        for &j in &alike {
+            let rest: String = texts[j].chars().skip(common.saturating_sub(CONTEXT)).collect();
+            short[j] = fitting(&format!("…{rest}"), width, size);
+        }
+    }
+    for i in 1..texts.len() {
+        let is_taken = |name: &str| (0..i).any(|j| short[j] == name && texts[j] != texts[i]);
+        let numbered = |number: usize| {
+            let end = format!(" ({number})");
+            fitting(&short[i], width - text_width(&end, size), size) + &end
+        };
+        if is_taken(&short[i]) {
+            let free = (2..=texts.len() + 1).map(numbered).find(|name| !is_taken(name));
+            short[i] = free.expect("there are more numbers than texts");
+        }
+    }
+    short
+}
+
+/// Letters before the first difference that a shortened text keeps.
+const CONTEXT: usize = 12;
+
+/// Number of letters with which both begin.
+fn common_prefix(one: &str, other: &str) -> usize {
+    one.chars().zip(other.chars()).take_while(|(a, b)| a == b).count()
 }
 
 /// `text` in lines that fit into `width` pixels, broken at spaces.

@@ -30,6 +30,8 @@ pub struct Chart {
     pub note: String,
     /// Draws a marker at every point, and bands as error bars: for few x values.
     pub markers: bool,
+    /// Whether the x axis is logarithmic. Points whose x is not above 0 are left out.
+    pub log_x: bool,
 }
 
 /// A bar with its interval.
@@ -65,4 +67,6 @@ pub struct Trajectories {
     pub users: Vec<Point>,
     /// Range within which a user's data is collected.
     pub transmission_range: f64,
+    /// Which episode it is, as a sentence below the legend.
+    pub note: String,
 }

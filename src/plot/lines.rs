@@ -7,13 +7,27 @@ use plotters::prelude::*;
 use super::canvas::{self, Axes, Drawn, HEIGHT, Key, Legend, Plot, Sheet, WIDTH, Words};
 use super::data::{Chart, Series};
 use super::palette::{Look, looks};
-use super::scale::{drawable, extent, value, value_axis};
+use super::scale::{drawable, extent, log_ticks, value, value_axis};
 
 /// Most different x values that are ticks of a chart with markers.
 const MAX_TICKS: usize = 8;
 
 /// Curves with bands, or with markers and error bars, as SVG.
 pub fn lines(chart: &Chart) -> String {
+    if chart.log_x { logarithmic(chart) } else { linear(chart) }
+}
+
+/// The chart with the decimal logarithms of its x values.
+fn logarithmic(chart: &Chart) -> String {
+    let mut chart = chart.clone();
+    for point in chart.series.iter_mut().flat_map(|series| &mut series.points) {
+        // A number that has no logarithm is not drawable.
+        point[0] = if point[0] > 0.0 { point[0].log10() } else { f64::NAN };
+    }
+    linear(&chart)
+}
+
+fn linear(chart: &Chart) -> String {
     let all = || chart.series.iter().flat_map(|s| drawable_points(&s.points));
     let bands = chart.series.iter().flat_map(drawable_pieces).flatten().filter_map(|(_, band)| band).flatten();
     let levels = chart.levels.iter().map(|(_, value)| *value);
@@ -22,6 +36,7 @@ pub fn lines(chart: &Chart) -> String {
     };
     // With few x values, such as numbers of UAVs, exactly these are ticks. Markers do not touch the frame.
     let (x, ticks) = if chart.markers { (with_margin(&x), own_ticks(all().map(|p| p[0]).collect(), &x)) } else { (x, None) };
+    let ticks = if chart.log_x { ticks.or_else(|| Some(log_ticks(&x))) } else { ticks };
     plot(chart, [x, value_axis(&y)], ticks)
 }
 
@@ -69,10 +84,18 @@ fn plot(chart: &Chart, ranges: [Range<f64>; 2], x_ticks: Option<Vec<f64>>) -> St
     canvas::draw((WIDTH, HEIGHT + legend.height()), &words, |sheet| {
         canvas::heading(sheet, &chart.title)?;
         let x = ranges[0].clone();
-        let axes = Axes { ranges, names: [&chart.x, &chart.y], x_ticks, left: 58, right: 16, below: legend.height() };
+        let axes = Axes {
+            ranges,
+            names: [&chart.x, &chart.y],
+            x_ticks,
+            log_x: chart.log_x,
+            left: 58,
+            right: 16,
+            below: legend.height(),
+        };
         let mut plot = canvas::axes(sheet, axes)?;
         for (series, look) in chart.series.iter().zip(of_series) {
-            intervals(&mut plot, *look, series, chart.markers)?;
+            intervals(&mut plot, sheet, (*look, chart.markers), series)?;
         }
         for ((_, value), look) in chart.levels.iter().zip(of_levels).filter(|((_, value), _)| drawable(*value)) {
             stroke(&mut plot, *look, &[(x.start, *value), (x.end, *value)])?;
@@ -97,15 +120,22 @@ fn description(chart: &Chart) -> String {
     format!("{} against {}: {}.{end}", chart.y, chart.x, all.join("; "))
 }
 
+/// Half the width of the ends of error bars, in pixels.
+const CAP: i32 = 5;
+
 /// The intervals of a series, as areas or error bars.
-fn intervals(plot: &mut Plot, look: Look, series: &Series, bars: bool) -> Drawn {
+fn intervals(plot: &mut Plot, sheet: &Sheet, (look, bars): (Look, bool), series: &Series) -> Drawn {
     for piece in drawable_pieces(series) {
         let banded: Vec<([f64; 2], [f64; 2])> = piece.into_iter().filter_map(|(p, band)| Some((p, band?))).collect();
         if bars {
-            let style = look.colour().stroke_width(2);
-            plot.draw_series(
-                banded.iter().map(|(p, b)| ErrorBar::new_vertical(p[0], b[0], p[1].clamp(b[0], b[1]), b[1], style, 8)),
-            )?;
+            // The error bars of plotters have a circle at the mean, which would hide the marker.
+            for (p, b) in &banded {
+                let ends = b.map(|end| plot.backend_coord(&(p[0], end)));
+                let caps = ends.map(|(x, y)| [(x - CAP, y), (x + CAP, y)]);
+                for stroke in [ends, caps[0], caps[1]] {
+                    sheet.draw(&PathElement::new(stroke, look.colour().stroke_width(2)))?;
+                }
+            }
         } else {
             let upper = banded.iter().map(|(p, b)| (p[0], b[1]));
             let lower = banded.iter().rev().map(|(p, b)| (p[0], b[0]));

@@ -60,12 +60,28 @@ pub(super) enum Marker {
     Circle,
     Square,
     Triangle,
+    Diamond,
+    Ring,
+    Cross,
+    Frame,
 }
 
+/// Dashes of series that differ in hue as well, so that no reader needs the hue.
+const DASHES: [Option<(i32, i32)>; 4] = [None, Some((9, 4)), Some((2, 4)), Some((15, 4))];
+/// Markers of series that no algorithm names.
+const MARKERS: [Marker; 4] = [Marker::Circle, Marker::Triangle, Marker::Square, Marker::Diamond];
+/// Markers of algorithms. Baselines have others, because they share hues with algorithms.
+const ALGORITHM_MARKERS: [Marker; 3] = [Marker::Circle, Marker::Triangle, Marker::Diamond];
+/// Baselines are never solid.
+const BASELINE_DASHES: [(i32, i32); 4] = [(5, 4), (2, 4), (10, 3), (16, 6)];
+const BASELINE_MARKERS: [Marker; 4] = [Marker::Square, Marker::Ring, Marker::Cross, Marker::Frame];
+
 impl Look {
-    /// The look of series `i` of those that no algorithm names: in the order of the palette.
+    /// The look of series `i` of those that no algorithm names, and of UAV `i`: in the order of the palette, with dashes and markers whose
+    /// pairs differ for the first 16.
     pub(super) fn of_index(i: usize) -> Self {
-        Self { place: i % TONES.len(), ..Self::of_repetition(i / TONES.len()) }
+        let marker = MARKERS[i % MARKERS.len()];
+        Self { place: i % TONES.len(), dash: DASHES[(i + i / MARKERS.len()) % DASHES.len()], marker }
     }
 
     /// Solid first, then dashes.
@@ -82,8 +98,8 @@ impl Look {
     }
 }
 
-/// The looks of the series of one plot. Series of one algorithm have its colour and differ in dashes and markers; baselines are dashed.
-/// Where all are of one algorithm, or of none, they differ in colour.
+/// The looks of the series of one plot. Series of one algorithm have its colour and differ in dashes and markers; algorithms also differ in
+/// markers; baselines are dashed, each in its own way. Where all are of one algorithm, or of none, they differ in all three.
 pub(super) fn looks<'a>(names: impl IntoIterator<Item = &'a str>) -> Vec<Look> {
     let found: Vec<Option<usize>> = names.into_iter().map(algorithm).collect();
     let several = found.iter().flatten().any(|one| found.iter().flatten().any(|other| one != other));
@@ -93,14 +109,25 @@ pub(super) fn looks<'a>(names: impl IntoIterator<Item = &'a str>) -> Vec<Look> {
     let taken: Vec<usize> = found.iter().flatten().map(|&known| PLACES[known].1).collect();
     let mut free = (0..TONES.len()).filter(|place| !taken.contains(place)).cycle();
     let mut seen = [0; PLACES.len()];
+    let mut baselines = 0;
     let look = |known: Option<usize>| {
         let Some(known) = known else {
             // With every hue taken, dots tell it from the algorithm of the first.
             return free.next().map_or(Look::of_repetition(2), |place| Look { place, ..Look::of_repetition(0) });
         };
-        let look = Look { place: PLACES[known].1, ..Look::of_repetition(seen[known]) };
+        let nth = seen[known];
         seen[known] += 1;
-        if known < ALGORITHMS { look } else { Look { dash: Some((5, 4)), marker: Marker::Square, ..look } }
+        let place = PLACES[known].1;
+        if known < ALGORITHMS {
+            return Look {
+                place,
+                marker: ALGORITHM_MARKERS[(known + nth) % ALGORITHM_MARKERS.len()],
+                ..Look::of_repetition(nth)
+            };
+        }
+        let nth = baselines % BASELINE_DASHES.len();
+        baselines += 1;
+        Look { place, dash: Some(BASELINE_DASHES[nth]), marker: BASELINE_MARKERS[nth] }
     };
     found.into_iter().map(look).collect()
 }
@@ -130,6 +157,21 @@ mod tests {
         // A name that says nothing takes a colour that nobody has; series of one algorithm differ in colour.
         assert_eq!(place(&["demo-job:1", "qedgix", "qmix"]), [2, 0, 1]);
         assert_eq!(place(&["qmix lr 1e-3", "qmix lr 1e-4"]), [0, 1]);
+        // Baselines, algorithms and unnamed series can be told apart without their hues.
+        let styles =
+            |names: &[&str]| looks(names.iter().copied()).iter().map(|look| (look.dash, look.marker)).collect::<Vec<_>>();
+        for names in [&["Qedgix", "sweep", "nearest", "random"][..], &["a", "b", "c", "d"], &["lr 1", "lr 2", "lr 3", "lr 4"]] {
+            let styles = styles(names);
+            assert!(
+                (0..4).all(|i| styles[..i].iter().all(|other| other.0 != styles[i].0 && other.1 != styles[i].1)),
+                "{names:?}"
+            );
+        }
+        assert_ne!(styles(&["Qedgix", "QMIX"])[0].1, styles(&["Qedgix", "QMIX"])[1].1);
+        assert_ne!(styles(&["VDN", "sweep"])[0].1, styles(&["VDN", "sweep"])[1].1, "they share a hue");
+        let uavs: Vec<Look> = (0..16).map(Look::of_index).collect();
+        let alike = |a: &Look, b: &Look| (a.dash, a.marker) == (b.dash, b.marker);
+        assert!((0..16).all(|i| uavs[..i].iter().all(|other| !alike(other, &uavs[i]))));
         assert_eq!(algorithm("qmixed"), None);
         let many = looks(std::iter::repeat_n("x", 30));
         assert_eq!((many[8].place, many[0].place), (0, 0));

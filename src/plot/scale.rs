@@ -36,6 +36,25 @@ pub(super) fn ticks(range: &Range<f64>, count: usize) -> Vec<f64> {
     (0..=count).map(|i| first + i as f64).take_while(|&i| i <= last).map(|i| i * step).collect()
 }
 
+/// The number with this decimal logarithm, without the rounding error of the logarithm.
+pub(super) fn unlog(x: f64) -> f64 {
+    format!("{:.9e}", 10f64.powf(x)).parse().unwrap_or(f64::NAN)
+}
+
+/// Ticks of a logarithmic axis whose ends are decimal logarithms: powers of ten, and between few of them also twice and five times these.
+pub(super) fn log_ticks(range: &Range<f64>) -> Vec<f64> {
+    let inside = |x: &f64| (range.start - 1e-9..=range.end + 1e-9).contains(x);
+    let (first, last) = (range.start.floor() as i32, range.end.ceil() as i32);
+    let step = ((last - first) / 7 + 1) as usize;
+    let powers: Vec<f64> = (first..=last).step_by(step).map(f64::from).filter(inside).collect();
+    if powers.len() > 2 {
+        return powers;
+    }
+    let all = (first..=last).flat_map(|power| [1.0_f64, 2.0, 5.0].map(|factor| f64::from(power) + factor.log10()));
+    let found: Vec<f64> = all.filter(inside).collect();
+    if found.is_empty() { vec![f64::midpoint(range.start, range.end)] } else { found }
+}
+
 /// The label of a tick: few digits, with k and M for thousands and millions.
 pub(super) fn tick(x: f64) -> String {
     let (scaled, unit) = match x.abs() {

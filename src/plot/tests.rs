@@ -35,7 +35,10 @@ fn plots_without_data_say_no_data() {
         distribution("t", "x", &[("a".into(), Vec::new())]),
         distribution("t", "x", &[]),
         trajectories("t", &Trajectories::default()),
-        trajectories("t", &Trajectories { uavs: vec![vec![[f64::NAN; 2]]], users: vec![], transmission_range: f64::NAN }),
+        trajectories(
+            "t",
+            &Trajectories { uavs: vec![vec![[f64::NAN; 2]]], users: vec![], transmission_range: f64::NAN, note: String::new() },
+        ),
     ];
     for svg in empty_plots {
         assert_well_formed(&svg);
@@ -50,12 +53,18 @@ fn numbers_of_every_kind_give_well_formed_plots() {
         for &b in &strange {
             for markers in [false, true] {
                 let points = vec![[a, b], [b, a], [0.5, a], [a, a]];
-                assert_well_formed(&lines(&chart(points.clone(), Some(points), markers)));
+                let linear = chart(points.clone(), Some(points), markers);
+                assert_well_formed(&lines(&linear));
+                assert_well_formed(&lines(&Chart { log_x: true, ..linear }));
             }
             assert_well_formed(&bars("t", "y", "n", &[Bar { name: "a".into(), mean: a, low: b, high: a }]));
             assert_well_formed(&distribution("t", "x", &[("a".into(), vec![a, b]), ("b".into(), vec![])]));
-            let shown =
-                Trajectories { uavs: vec![vec![[a, b], [b, b], [0.0, a]], vec![]], users: vec![[a, a]], transmission_range: b };
+            let shown = Trajectories {
+                uavs: vec![vec![[a, b], [b, b], [0.0, a]], vec![]],
+                users: vec![[a, a]],
+                transmission_range: b,
+                note: String::new(),
+            };
             assert_well_formed(&trajectories("t", &shown));
         }
     }
@@ -67,7 +76,12 @@ fn series_beyond_the_legend_are_counted() {
     let chart = Chart { series: (0..40).map(series).collect(), ..chart(Vec::new(), None, false) };
     let svg = lines(&chart);
     assert!(svg.contains("policy 3") && svg.contains("more"), "{svg}");
-    let shown = Trajectories { uavs: vec![vec![[0.5; 2]; 3]; 100], users: vec![[0.1, 0.2]; 100], transmission_range: 0.1 };
+    let shown = Trajectories {
+        uavs: vec![vec![[0.5; 2]; 3]; 100],
+        users: vec![[0.1, 0.2]; 100],
+        transmission_range: 0.1,
+        note: String::new(),
+    };
     assert_well_formed(&trajectories("t", &shown));
 }
 
@@ -111,7 +125,12 @@ fn text_is_readable_in_a_column_of_a_paper() {
         ..chart(Vec::new(), None, false)
     };
     let bar = Bar { name: "runs/2026-01-01/a-policy-with-a-long-name.safetensors".into(), mean: 4.0, low: 3.0, high: 5.0 };
-    let shown = Trajectories { uavs: vec![vec![[0.5; 2], [0.6; 2]]; 12], users: vec![[0.1, 0.2]; 3], transmission_range: 0.1 };
+    let shown = Trajectories {
+        uavs: vec![vec![[0.5; 2], [0.6; 2]]; 12],
+        users: vec![[0.1, 0.2]; 3],
+        transmission_range: 0.1,
+        note: "Layout 1.".into(),
+    };
     for svg in [lines(&chart), bars("t", "y", "n", &[bar]), trajectories("t", &shown)] {
         assert_well_formed(&svg);
         for (size, x, text) in texts(&svg) {
@@ -132,6 +151,44 @@ fn ticks_are_at_whole_uavs() {
         assert!(labels.iter().any(|label| label == whole), "{labels:?}");
     }
     assert!(!labels.iter().any(|label| label == "2.5" || label == "5.5"), "{labels:?}");
+}
+
+#[test]
+fn a_logarithmic_axis_keeps_small_values_apart_and_has_their_ticks() {
+    let points = vec![[1e-5, 3.0], [3e-4, 2.0], [1e-2, 1.0], [0.1, 2.0]];
+    let series = Series { name: "Qedgix".into(), points, band: None };
+    let drawn = |log_x| lines(&Chart { series: vec![series.clone()], log_x, ..chart(Vec::new(), None, true) });
+    let labels: Vec<String> = texts(&drawn(true)).into_iter().map(|(_, _, text)| text.trim().to_owned()).collect();
+    for tick in ["1e-5", "0.0003", "0.01", "0.1"] {
+        assert!(labels.iter().any(|label| label == tick), "{tick}: {labels:?}");
+    }
+    assert!(!texts(&drawn(false)).iter().any(|(_, _, text)| text.trim() == "1e-5"));
+    for range in [-5.0..-1.0, -3.2..-3.1, 0.0..0.9, -300.0..12.0] {
+        let ticks = super::scale::log_ticks(&range);
+        assert!((1..=8).contains(&ticks.len()), "{range:?}: {ticks:?}");
+    }
+}
+
+#[test]
+fn the_marker_of_a_series_is_seen_over_its_error_bar() {
+    let series = |name: &str| Series { name: name.into(), points: vec![[1.0, 2.0], [2.0, 3.0]], band: Some(vec![[1.0, 3.0]; 2]) };
+    let svg = lines(&Chart { series: vec![series("QMIX"), series("sweep")], ..chart(Vec::new(), None, true) });
+    // Triangles and squares: two in the plot and one in the legend; a circle would be the mean of an error bar.
+    assert!(!svg.contains("<circle"), "{svg}");
+    assert_eq!(svg.matches("<polygon").count(), 3);
+}
+
+#[test]
+fn names_that_are_cut_stay_different() {
+    let long = "algorithm qedgix, reward_scale 0.0125, learning_rate 0.001, gamma 0.95, steps 30000, teacher";
+    let names = [format!("{long} -"), format!("{long} sweep"), "short".to_owned(), "short".to_owned()];
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    let cut = super::canvas::all_fitting(&names, 200, 15);
+    assert!(cut[0] != cut[1] && cut[1].ends_with("sweep") && cut[2..] == ["short", "short"], "{cut:?}");
+    let middle = ["a".repeat(90) + "1" + &"b".repeat(90), "a".repeat(90) + "2" + &"b".repeat(90)];
+    let cut = super::canvas::all_fitting(&[&middle[0], &middle[1]], 100, 15);
+    assert!(cut[0] != cut[1], "{cut:?}");
+    assert!(cut.iter().all(|name| super::canvas::text_width(name, 15) <= 100));
 }
 
 #[test]

@@ -43,14 +43,16 @@ pub fn explained(title: &str, shown: &Trajectories, pulls: &[Pull]) -> String {
     let range = range.start - margin..range.end + margin;
     let scale = f64::from(PLOT) / (range.end - range.start);
     let circle = if shown.transmission_range > 0.0 { (shown.transmission_range * scale).min(4e3) as i32 } else { 0 };
-    let legend = Legend::new(entries(paths.len(), !pulls.is_empty()));
-    let words =
-        Words { title, description: format!("The paths of {} UAVs over {} users, from above.", paths.len(), users.len()) };
+    let legend = Legend::new(entries(paths.len(), !pulls.is_empty(), &shown.note));
+    let words = Words {
+        title,
+        description: format!("The paths of {} UAVs over {} users, from above. {}", paths.len(), users.len(), shown.note),
+    };
     canvas::draw((SIZE.0, SIZE.1 + legend.height()), &words, |sheet| {
         canvas::heading(sheet, title)?;
         let names = ["x (sides of the square)", "y (sides of the square)"];
         let ranges = [range.clone(), range.clone()];
-        let axes = Axes { ranges, names, x_ticks: None, left: AXIS, right: 16, below: legend.height() };
+        let axes = Axes { ranges, names, x_ticks: None, log_x: false, left: AXIS, right: 16, below: legend.height() };
         let mut plot = canvas::axes(sheet, axes)?;
         plot.plotting_area().draw(&Rectangle::new([(0.0, 0.0), (1.0, 1.0)], INK.mix(0.6)))?;
         for (_, [x, y]) in &users {
@@ -65,7 +67,11 @@ pub fn explained(title: &str, shown: &Trajectories, pulls: &[Pull]) -> String {
         }
         for (i, path) in paths.iter().enumerate() {
             let line = colour(i).mix(0.75).stroke_width(2);
-            plot.draw_series(LineSeries::new(path.iter().map(|p| (p[0], p[1])), line))?;
+            let points = path.iter().map(|p| (p[0], p[1]));
+            match Look::of_index(i).dash {
+                Some((stroke, gap)) => plot.draw_series(DashedLineSeries::new(points, stroke as u32, gap as u32, line))?,
+                None => plot.draw_series(LineSeries::new(points, line))?,
+            };
             arrows(&mut plot, i, path, 6.0 / scale)?;
         }
         for (number, [x, y]) in &users {
@@ -79,8 +85,9 @@ pub fn explained(title: &str, shown: &Trajectories, pulls: &[Pull]) -> String {
         for (i, path) in paths.iter().enumerate() {
             let (Some(first), Some(last)) = (path.first(), path.last()) else { continue };
             plot.plotting_area().draw(&Circle::new((first[0], first[1]), 7, START.stroke_width(2)))?;
-            plot.plotting_area().draw(&Circle::new((last[0], last[1]), 7, WHITE.filled()))?;
-            plot.plotting_area().draw(&Circle::new((last[0], last[1]), 5, colour(i).filled()))?;
+            let end = plot.backend_coord(&(last[0], last[1]));
+            sheet.draw(&Circle::new(end, 8, WHITE.filled()))?;
+            canvas::marker(sheet, Look::of_index(i), end)?;
         }
         legend.draw(sheet)
     })
@@ -104,7 +111,7 @@ fn arrows(plot: &mut Plot, i: usize, path: &[Point], size: f64) -> Drawn {
     Ok(())
 }
 
-fn entries(uavs: usize, explained: bool) -> Vec<(Key, String)> {
+fn entries(uavs: usize, explained: bool, note: &str) -> Vec<(Key, String)> {
     let mut entries = vec![
         (Key::Ring(START, 7), "start".to_owned()),
         (Key::Dot(USER, 5), "user".to_owned()),
@@ -114,7 +121,8 @@ fn entries(uavs: usize, explained: bool) -> Vec<(Key, String)> {
         entries.extend([(Key::Dot(FOR, 5), "for the heading".to_owned()), (Key::Dot(AGAINST, 5), "against it".to_owned())]);
     }
     entries.extend((0..uavs).map(|i| (Key::Line(Look::of_index(i), true), format!("UAV {i}"))));
-    entries.push((Key::Note, "Arrows point along the flight, every fourth slot; a path ends at its dot.".to_owned()));
+    entries.push((Key::Note, "Arrows point along the flight, every fourth slot; a path ends at its marker.".to_owned()));
+    entries.push((Key::Note, note.to_owned()));
     entries
 }
 

@@ -34,6 +34,14 @@ pub fn parse_environment(mut document: Value) -> Result<EnvConfig, Invalid> {
     Ok(config)
 }
 
+/// `base` with the fields of a document overridden. Ranges are not checked.
+///
+/// # Errors
+/// [`Invalid`] for the first field that is unknown or of the wrong type, named as `environment.uavs`.
+pub fn environment_with(base: &EnvConfig, fields: &Map<String, Value>) -> Result<EnvConfig, Invalid> {
+    overridden("environment", base, fields)
+}
+
 /// Largest integer that all JSON readers and `google.protobuf.Struct` represent exactly.
 pub const MAX_EXACT_INTEGER: u64 = (1 << 53) - 1;
 

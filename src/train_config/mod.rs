@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use self::document::overridden;
-pub use self::document::{MAX_EXACT_INTEGER, field_name, floats_to_integers, parse_environment};
+pub use self::document::{MAX_EXACT_INTEGER, environment_with, field_name, floats_to_integers, parse_environment};
 pub use self::training::Training;
 use self::training::{MAX_STEPS, default_teacher_share};
 pub use self::vary::Vary;

@@ -49,12 +49,18 @@ impl RunFolder {
     }
 
     /// Creates the folder and writes the configuration.
+    ///
+    /// # Errors
+    /// The folder or the file cannot be written.
     pub fn create(&self, run: &Run) -> anyhow::Result<()> {
         fs::create_dir_all(&self.path).with_context(|| format!("cannot create {}", self.path.display()))?;
         self.write("config.json", &serde_json::to_vec_pretty(&run.config)?)
     }
 
     /// The result of the run, if it is finished and was evaluated on the layouts of this experiment.
+    ///
+    /// # Errors
+    /// The file exists and cannot be read.
     pub fn result(&self, experiment: &Experiment) -> anyhow::Result<Option<RunResult>> {
         let Some(bytes) = self.read("result.json")? else { return Ok(None) };
         // A result of another version is ignored, and the weights are evaluated again.
@@ -64,12 +70,18 @@ impl RunFolder {
     }
 
     /// The progress of the run.
+    ///
+    /// # Errors
+    /// The file exists and cannot be read.
     pub fn progress(&self) -> anyhow::Result<RunProgress> {
         let bytes = self.read("progress.json")?;
         Ok(bytes.and_then(|bytes| serde_json::from_slice(&bytes).ok()).unwrap_or_default())
     }
 
     /// The trainer, curve and seconds of the last snapshot; a new trainer if there is no usable snapshot.
+    ///
+    /// # Errors
+    /// A file exists and cannot be read, or the configuration of the run is invalid.
     pub fn restore(&self, run: &Run, threads: usize) -> anyhow::Result<(Trainer, TrainingCurve, f64)> {
         if let Some(bytes) = self.read("snapshot")?
             && let Ok(trainer) = Trainer::restore(&bytes, threads)
@@ -83,6 +95,9 @@ impl RunFolder {
     }
 
     /// The curve so far.
+    ///
+    /// # Errors
+    /// The file is missing, or is not a curve.
     pub fn curve(&self) -> anyhow::Result<TrainingCurve> {
         let bytes = self.read("curve.csv")?.with_context(|| format!("{} has no curve.csv", self.path.display()))?;
         let text = String::from_utf8(bytes).with_context(|| format!("{}/curve.csv", self.path.display()))?;
@@ -90,6 +105,9 @@ impl RunFolder {
     }
 
     /// Saves the state of a run in progress.
+    ///
+    /// # Errors
+    /// A file cannot be written.
     pub fn save(&self, snapshot: &[u8], curve: &TrainingCurve, progress: &RunProgress) -> anyhow::Result<()> {
         // The curve first: rows after the snapshot are computed again, rows before it are not.
         self.write("curve.csv", curve.csv().as_bytes())?;
@@ -98,6 +116,9 @@ impl RunFolder {
     }
 
     /// Saves the weights of a run whose training has ended.
+    ///
+    /// # Errors
+    /// A file cannot be written.
     pub fn save_weights(
         &self,
         best: &Checkpoint,
@@ -114,11 +135,17 @@ impl RunFolder {
     }
 
     /// The best weights by validation.
+    ///
+    /// # Errors
+    /// The file is missing, or is not a checkpoint.
     pub fn best(&self) -> anyhow::Result<Checkpoint> {
         self.weights("policy.safetensors")
     }
 
     /// The last weights.
+    ///
+    /// # Errors
+    /// The file is missing, or is not a checkpoint.
     pub fn last(&self) -> anyhow::Result<Checkpoint> {
         self.weights("last.safetensors")
     }
@@ -130,6 +157,9 @@ impl RunFolder {
     }
 
     /// Removes the snapshot and writes the result.
+    ///
+    /// # Errors
+    /// The snapshot cannot be removed, or the result cannot be written.
     pub fn finish(&self, result: &RunResult) -> anyhow::Result<()> {
         // The snapshot first: a run with a result is finished, and its folder is not touched again. Without a snapshot, a run
         // whose training has ended still has its weights.

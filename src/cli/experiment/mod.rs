@@ -7,8 +7,6 @@ mod runner;
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, bail};
 use clap::Args;
@@ -19,7 +17,9 @@ use self::runner::Runner;
 use super::figures::FigureArgs;
 use super::files::write_atomic;
 use super::run_args::{self, all_cores, count};
-use crate::cli::output::outln;
+use super::signals::StopFlag;
+use super::toml_file;
+use crate::cli::output::{Exit, outln};
 use crate::env::EpisodeMetrics;
 use crate::experiment::{Experiment, ExperimentSummary, Overrides, PlotKind, RunResult, TrainingCurve, plots, readme};
 use crate::learner::{Disturbance, Interval, evaluate, evaluate_traced};
@@ -28,7 +28,9 @@ use crate::policy::baselines;
 
 /// Flags of `experiment`.
 #[derive(Args, Debug)]
-#[command(after_help = "Examples:
+#[command(after_help = "Exit status: 0 all runs are finished; 1 an error; 130 or 143 stopped by ctrl-c or SIGTERM.
+
+Examples:
   qedgix experiment experiments/convergence.toml --dry-run      # lists the runs and their progress
   qedgix experiment experiments/convergence.toml                # ctrl-c stops it; the same command resumes it
   qedgix experiment experiments/range.toml --seeds 1 --steps 50000 --point '4 xi' --point '9 xi' --out quick")]
@@ -70,7 +72,7 @@ pub struct ExperimentArgs {
 /// Runs the command.
 ///
 /// # Errors
-/// The file is not a valid experiment, a run fails, or ctrl-c stops the command.
+/// The file is not a valid experiment, a run fails, or a signal stops the command: exit status 130 or 143.
 pub async fn run(args: ExperimentArgs) -> anyhow::Result<()> {
     let experiment = read(&args)?;
     let out = match &args.out {
@@ -80,13 +82,7 @@ pub async fn run(args: ExperimentArgs) -> anyhow::Result<()> {
     if args.dry_run {
         return list(&experiment, &out);
     }
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = Arc::clone(&stop);
-    tokio::spawn(async move {
-        if tokio::signal::ctrl_c().await.is_ok() {
-            flag.store(true, Ordering::Relaxed);
-        }
-    });
+    let stop = StopFlag::new()?;
     tokio::task::spawn_blocking(move || {
         fs::create_dir_all(&out).with_context(|| format!("cannot create {}", out.display()))?;
         let lock = fs::File::create(out.join(".lock")).with_context(|| format!("cannot write to {}", out.display()))?;
@@ -94,8 +90,8 @@ pub async fn run(args: ExperimentArgs) -> anyhow::Result<()> {
             bail!("{} is in use by another process", out.display());
         }
         let threads = args.threads.unwrap_or_else(all_cores);
-        if !Runner::new(&experiment, &out, threads, &stop).run()? {
-            bail!("stopped; the same command resumes the experiment");
+        if !Runner::new(&experiment, &out, threads, &stop.flag).run()? {
+            return Err(Exit::new(stop.code(), "stopped; the same command resumes the experiment").into());
         }
         write_results(&experiment, (&out, &args.figures), threads, &command(&args))
     })
@@ -106,7 +102,7 @@ pub async fn run(args: ExperimentArgs) -> anyhow::Result<()> {
 fn read(args: &ExperimentArgs) -> anyhow::Result<Experiment> {
     let name = args.file.display().to_string();
     let text = fs::read_to_string(&args.file).with_context(|| name.clone())?;
-    let document: Value = toml::from_str(&text).with_context(|| name.clone())?;
+    let document = toml_file::parse(&name, &text)?;
     let mut overrides = Overrides {
         seeds: args.seeds.clone(),
         num_seeds: args.num_seeds.map(usize::from),
@@ -219,7 +215,11 @@ fn trajectories(experiment: &Experiment, out: &Path) -> anyhow::Result<Vec<Traje
         let env = &run.config.environment;
         let trajectory = evaluate_traced(&policy, env, &experiment.layout_seeds[..1], 0, &Disturbance::default(), 1)?.trajectory;
         let users = trajectory.users.iter().filter_map(|path| path.first().copied()).collect();
-        Ok(Trajectories { uavs: trajectory.uavs, users, transmission_range: env.transmission_range })
+        let note = format!(
+            "Layout 0 of {} (seed {}), flown with the best weights of seed {}.",
+            experiment.layouts, experiment.layout_seeds[0], run.config.seed
+        );
+        Ok(Trajectories { uavs: trajectory.uavs, users, transmission_range: env.transmission_range, note })
     };
     first.map(trajectory).collect()
 }

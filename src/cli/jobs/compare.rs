@@ -48,6 +48,9 @@ pub struct CompareArgs {
 struct Compared {
     id: String,
     name: Option<String>,
+    /// Whether a sweep or an experiment made it, which numbers its name.
+    #[serde(skip)]
+    made: bool,
     state: String,
     seed: Option<u64>,
     /// Fields of the configuration that are not the same in all jobs, without the seed.
@@ -164,6 +167,7 @@ fn compared(job: &Value, curve: Vec<[f64; 2]>, largest: bool) -> Compared {
     Compared {
         id: text(&job["id"]),
         name: job["name"].as_str().map(str::to_owned),
+        made: !job["parent"].is_null(),
         state: text(&job["state"]),
         seed: job["seed"].as_u64(),
         differs: BTreeMap::new(),
@@ -194,13 +198,11 @@ fn group(jobs: &[Compared]) -> Vec<Group> {
             None => groups.push((job, vec![job])),
         }
     }
-    let of = |(first, members): (&Compared, Vec<&Compared>)| {
+    let names = names(jobs, &groups);
+    let of = |((first, members), name): ((&Compared, Vec<&Compared>), String)| {
         let values = |pick: fn(&Compared) -> Option<[f64; 2]>| -> Vec<f64> {
             members.iter().filter_map(|job| pick(job)).map(|point| point[1]).collect()
         };
-        let differs: Vec<String> =
-            first.differs.iter().map(|(field, value)| format!("{} {}", last_word(field), text(value))).collect();
-        let name = if differs.is_empty() { text(&first.config["algorithm"]) } else { differs.join(", ") };
         Group {
             differs: first.differs.clone(),
             seeds: members.iter().map(|job| job.seed).collect(),
@@ -211,7 +213,77 @@ fn group(jobs: &[Compared]) -> Vec<Group> {
             curves: members.iter().map(|job| job.curve.clone()).filter(|curve| !curve.is_empty()).collect(),
         }
     };
-    groups.into_iter().map(of).collect()
+    groups.into_iter().zip(names).map(of).collect()
+}
+
+/// The names of groups in the legend, all different. A job is known by its own name or id; groups of several seeds, and the jobs of a
+/// sweep, whose names are numbers, by what was varied.
+fn names(jobs: &[Compared], groups: &[(&Compared, Vec<&Compared>)]) -> Vec<String> {
+    let ids: Vec<String> = jobs.iter().map(|job| job.id.clone()).collect();
+    let short_id = |job: &Compared| {
+        let found = jobs.iter().position(|other| other.id == job.id).and_then(|at| short(&ids).into_iter().nth(at));
+        found.unwrap_or_else(|| job.id.clone())
+    };
+    let configs: Vec<&BTreeMap<String, Value>> = groups.iter().map(|(first, _)| &first.differs).collect();
+    let varied = independent(&configs);
+    let by_values = groups.iter().all(|(_, members)| members.len() > 1 || members[0].made);
+    let mut names: Vec<String> = Vec::new();
+    for (first, members) in groups {
+        let values = || {
+            let values = varied.iter().map(|field| format!("{} {}", last_word(field), text(&first.differs[*field])));
+            values.collect::<Vec<_>>().join(", ")
+        };
+        let own = first.name.clone().filter(|name| members.iter().all(|job| job.name.as_ref() == Some(name)));
+        let name = if by_values && !varied.is_empty() {
+            values()
+        } else if let Some(own) = own {
+            own
+        } else if members.len() == 1 {
+            short_id(first)
+        } else if varied.is_empty() {
+            text(&first.config["algorithm"])
+        } else {
+            values()
+        };
+        names.push(name);
+    }
+    // Several jobs may have one name.
+    let twice: Vec<bool> = names.iter().map(|name| names.iter().filter(|other| *other == name).count() > 1).collect();
+    for ((name, twice), (first, _)) in names.iter_mut().zip(twice).zip(groups) {
+        if twice {
+            *name = format!("{name} ({})", short_id(first));
+        }
+    }
+    names
+}
+
+/// Fields that presets and algorithms set: they name a group only if nothing else does.
+const DERIVED: [&str; 7] = ["mixer", "reward_scale", "teacher", "advice", "advice_margin", "memory", "eval_episodes"];
+
+/// The fields that tell the groups apart, without those that follow from the fields before them, as the mixer from the algorithm.
+fn independent<'a>(groups: &[&'a BTreeMap<String, Value>]) -> Vec<&'a str> {
+    let Some(first) = groups.first() else { return Vec::new() };
+    let mut fields: Vec<&str> = first.keys().map(String::as_str).collect();
+    let rank = |field: &str| match field {
+        "algorithm" => 0,
+        "preset" => 1,
+        _ if DERIVED.contains(&last_word(field)) => 4,
+        _ if field.starts_with("training.") => 2,
+        _ => 3,
+    };
+    fields.sort_by_key(|field| rank(field));
+    let mut kept: Vec<&str> = Vec::new();
+    for field in fields {
+        let same = |field: &str, a: &BTreeMap<String, Value>, b: &BTreeMap<String, Value>| a.get(field) == b.get(field);
+        let follows = groups
+            .iter()
+            .enumerate()
+            .all(|(i, a)| groups[..i].iter().all(|b| same(field, a, b) || kept.iter().any(|kept| !same(kept, a, b))));
+        if !follows {
+            kept.push(field);
+        }
+    }
+    kept
 }
 
 /// The last part of the path of a field.
@@ -340,6 +412,41 @@ mod tests {
         assert!(chart.series[1].band.is_none());
         let table = group_table("eval/mean_aoi", &fields, &groups) + &job_table("eval/mean_aoi", &fields, &jobs);
         assert!(table.contains("-10.71 to 14.71") && table.contains("training.learning_rate"), "{table}");
+    }
+
+    /// A job of some name that differs in several fields, of a sweep if it has a parent.
+    fn named(number: u64, name: Option<&str>, parent: Option<&str>, fields: &Value) -> Compared {
+        let job = json!({
+            "id": format!("01a202d1-93be-769e-80f7-75eef94960{number:02}"), "state": "succeeded", "seed": number, "name": name,
+            "parent": parent, "algorithm": fields["algorithm"], "training": fields["training"],
+        });
+        compared(&job, Vec::new(), false)
+    }
+
+    fn legend(mut jobs: Vec<Compared>) -> Vec<String> {
+        mark_differences(&mut jobs);
+        group(&jobs).into_iter().map(|group| group.name).collect()
+    }
+
+    #[test]
+    fn the_legend_says_what_differs() {
+        let fields = |algorithm: &str, mixer: &str, rate: f64| json!({"algorithm": algorithm, "training": {"learning_rate": rate, "mixer": mixer, "steps": 30_000, "gamma": rate * 9.0}});
+        let one = |number, name, rate| named(number, name, None, &fields("qmix", "invariant", rate));
+        assert_eq!(legend(vec![one(1, Some("first"), 0.1), one(2, Some("second"), 0.2)]), ["first", "second"]);
+        let same = legend(vec![one(1, Some("a"), 0.1), one(2, Some("a"), 0.2)]);
+        assert!(same[0].starts_with("a (01a202d1") && same[0] != same[1], "{same:?}");
+        let unnamed = legend(vec![one(1, None, 0.1), one(2, Some("b"), 0.2)]);
+        assert!(unnamed[0].starts_with("01a202d1") && unnamed[1] == "b", "{unnamed:?}");
+        // The mixer follows from the algorithm, and gamma here from the learning rate.
+        let sweep = [("qmix", "invariant", 0.1), ("qmix", "invariant", 0.2), ("vdn", "vdn", 0.1), ("vdn", "vdn", 0.2)];
+        let jobs = (0_u64..).zip(sweep).map(|(i, (algorithm, mixer, rate))| {
+            named(i, Some(&format!("sweep-{i:03}")), Some("p"), &fields(algorithm, mixer, rate))
+        });
+        let expected =
+            ["algorithm qmix, gamma 0.9", "algorithm qmix, gamma 1.8", "algorithm vdn, gamma 0.9", "algorithm vdn, gamma 1.8"];
+        assert_eq!(legend(jobs.collect()), expected);
+        let seeds = vec![one(1, Some("x"), 0.1), one(2, Some("y"), 0.1)];
+        assert_eq!(legend(seeds), ["qmix"]);
     }
 
     #[test]

@@ -16,6 +16,7 @@ use crate::cli::client::{Client, ClientError};
 use crate::cli::output::{errln, outln};
 use crate::cli::run_args::{RunArgs, count, insert};
 use crate::cli::serve::duration;
+use crate::cli::toml_file;
 use crate::jobs::webhooks::Secret;
 
 /// Flags of `jobs submit`.
@@ -273,7 +274,7 @@ fn read(path: &Path) -> anyhow::Result<Map<String, Value>> {
         text = std::fs::read_to_string(path).with_context(|| format!("cannot read {name}"))?;
     }
     let document: Value = if path.extension().is_some_and(|extension| extension == "toml") {
-        toml::from_str(&text).with_context(|| name.to_string())?
+        toml_file::parse(&name.to_string(), &text)?
     } else {
         serde_json::from_str(&text).with_context(|| name.to_string())?
     };

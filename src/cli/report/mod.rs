@@ -32,7 +32,7 @@ pub fn write((directory, figures): (&Path, &FigureArgs), comparison: &Comparison
 }
 
 /// What the error bars of a report are.
-const INTERVALS: &str = "Bars: 95 % intervals over layouts.";
+const INTERVALS: &str = "Whiskers: 95 % intervals over layouts.";
 
 fn page(comparison: &Comparison, command: &str) -> anyhow::Result<ReportPage> {
     let evaluations = comparison.best_first();
@@ -191,6 +191,7 @@ fn trajectories(comparison: &Comparison, evaluations: &[&PolicyEvaluation]) -> R
             uavs: trajectory.uavs.clone(),
             users: trajectory.users.iter().filter_map(|path| path.first().copied()).collect(),
             transmission_range: comparison.env.transmission_range,
+            note: format!("Layout {index} of {} (seed {seed}).", comparison.layouts.name),
         };
         let aoi = policy.evaluation.episodes.get(index).map_or(f64::NAN, |e| e.mean_aoi);
         ReportPlot {

@@ -4,7 +4,6 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
@@ -15,8 +14,9 @@ use super::curve::CurveFile;
 use crate::checkpoint::Checkpoint;
 use crate::cli::files::{check_distinct, check_writable, full_path, write_atomic};
 use crate::cli::output::{Exit, errln, outln};
+use crate::cli::policy_file::read_checkpoint;
 use crate::cli::run_args::all_cores;
-use crate::cli::signals::StopSignals;
+use crate::cli::signals::StopFlag;
 use crate::cli::{progress, table};
 use crate::files::partial_path;
 use crate::jobs::memory;
@@ -45,7 +45,7 @@ pub async fn run(args: &TrainArgs) -> anyhow::Result<()> {
         }
     };
     memory::check(trainer.config(), threads, memory::available())?;
-    let stop = Stop::new()?;
+    let stop = StopFlag::new()?;
     trainer.stop_with(Arc::clone(&stop.flag));
     let every = Duration::from_secs_f64(args.snapshot_every);
     tokio::task::spawn_blocking(move || Run::begin(trainer, paths, every)?.train(&stop, threads)).await?
@@ -62,7 +62,7 @@ fn begin(args: &TrainArgs, threads: usize) -> anyhow::Result<Trainer> {
                 fs::read(name).with_context(|| format!("--init {name}: neither a bundled policy nor a file that can be read"))?
             }
         };
-        let weights = Checkpoint::from_bytes(&bytes).with_context(|| format!("--init {name}"))?;
+        let weights = read_checkpoint(name, &bytes).with_context(|| format!("--init {name}"))?;
         trainer.begin_with(&weights).with_context(|| format!("--init {name}"))?;
     }
     Ok(trainer)
@@ -120,28 +120,6 @@ fn snapshot_of(out: &Path) -> PathBuf {
 fn checkpoint_of(snapshot: &Path) -> Option<PathBuf> {
     let out = PathBuf::from(snapshot.to_str()?.strip_suffix(SNAPSHOT)?);
     out.extension().is_some_and(|extension| extension == "safetensors").then_some(out)
-}
-
-/// The stop flag of the trainer, which ctrl-c and SIGTERM set. The second signal ends the process at once.
-struct Stop {
-    flag: Arc<AtomicBool>,
-    /// The exit status of the signal.
-    code: Arc<AtomicU8>,
-}
-
-impl Stop {
-    fn new() -> anyhow::Result<Self> {
-        let stop = Self { flag: Arc::default(), code: Arc::default() };
-        let (flag, code) = (Arc::clone(&stop.flag), Arc::clone(&stop.code));
-        let mut signals = StopSignals::new()?;
-        tokio::spawn(async move {
-            code.store(signals.next().await, Ordering::Relaxed);
-            flag.store(true, Ordering::Release);
-            errln!("stopping after the work in progress; a second signal ends at once, without a snapshot of it");
-            std::process::exit(signals.next().await.into());
-        });
-        Ok(stop)
-    }
 }
 
 /// Writes of one file, which must not end training: a failure is told, and the next write is another try.
@@ -211,7 +189,7 @@ impl Run {
         })
     }
 
-    fn train(mut self, stop: &Stop, threads: usize) -> anyhow::Result<()> {
+    fn train(mut self, stop: &StopFlag, threads: usize) -> anyhow::Result<()> {
         while let Some(event) = self.trainer.next() {
             if let Some((_, curve)) = &mut self.curve {
                 curve.push(&event.rows());
@@ -241,7 +219,7 @@ impl Run {
         }
         self.bar.finish_and_clear();
         if !self.trainer.finished() {
-            return Err(self.stopped(stop.code.load(Ordering::Relaxed))?.into());
+            return Err(self.stopped(stop.code())?.into());
         }
         let best = match self.finish() {
             Ok(best) => best,
