@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use rand::RngExt;
 use serde_json::{Value, json};
 use uuid::Uuid;
 
@@ -11,8 +10,7 @@ use super::{check_dependency, publication};
 use crate::jobs::memory::check as check_memory;
 use crate::jobs::spec::JobRequest;
 use crate::jobs::{experiment_jobs, sweep, sweep_jobs};
-use crate::learner::Interval;
-use crate::rng;
+use crate::learner::MeanOverSeeds;
 use crate::service::keys::Caller;
 use crate::service::policies::Publisher;
 use crate::service::{App, Error};
@@ -97,21 +95,20 @@ pub(super) async fn result(app: &App, sweep: &Job) -> Result<Value, Error> {
     Ok(json!({"jobs": jobs.len(), "states": states, "points": points.collect::<Vec<_>>()}))
 }
 
-/// The best and the last value of a metric, as means with 95 % bootstrap intervals over the jobs that have succeeded.
+/// The best and the last value of a metric, as means with 95 % intervals over the jobs that have succeeded, as `qedgix jobs compare`
+/// has them.
 fn means(name: &str, jobs: &[&Job], metrics: &BTreeMap<i64, Vec<(String, MetricSummary)>>) -> Option<Value> {
     let done = jobs.iter().filter(|job| job.state == JobState::Succeeded);
     let summaries: Vec<MetricSummary> = done
         .filter_map(|job| metrics.get(&job.row_id)?.iter().find(|(metric, _)| metric == name).map(|(_, summary)| *summary))
         .collect();
-    let interval = |values: Vec<f64>| (!values.is_empty()).then(|| interval(&values));
-    let best = interval(summaries.iter().filter_map(|summary| summary.best).collect());
-    let last = interval(summaries.iter().filter_map(|summary| summary.last).collect());
+    let mean = |values: Vec<f64>| {
+        MeanOverSeeds::of(&values).map(|MeanOverSeeds { mean, interval }| {
+            let [low, high] = [0, 1].map(|end| interval.map(|interval| interval[end]));
+            json!({"mean": mean, "low": low, "high": high})
+        })
+    };
+    let best = mean(summaries.iter().filter_map(|summary| summary.best).collect());
+    let last = mean(summaries.iter().filter_map(|summary| summary.last).collect());
     (best.is_some() || last.is_some()).then(|| json!({"seeds": summaries.len(), "best": best, "last": last}))
-}
-
-fn interval(values: &[f64]) -> Interval {
-    let n = values.len();
-    let mean = values.iter().sum::<f64>() / n as f64;
-    let mut draw = rng::stream(0, "bootstrap", 0);
-    Interval::of_resamples(mean, || (0..n).map(|_| values[draw.random_range(0..n)]).sum::<f64>() / n as f64)
 }
