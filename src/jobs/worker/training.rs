@@ -13,6 +13,7 @@ use crate::checkpoint::{self, Checkpoint};
 use crate::invalid::Invalid;
 use crate::jobs::Directive;
 use crate::jobs::experiment_jobs::RunReport;
+use crate::jobs::metric_names::SPEED;
 use crate::learner::{Evaluation, Event, TrainConfig, Trainer};
 use crate::store::WorkerResult;
 use crate::wire::v1::CheckpointKind;
@@ -234,7 +235,7 @@ impl CurveSampler {
             }
             let now = Instant::now();
             let seconds = (now - self.last_point.1).as_secs_f64();
-            rows.push((done.env_steps, "env_steps_per_s", (done.env_steps - self.last_point.0) as f64 / seconds));
+            rows.push((done.env_steps, SPEED, (done.env_steps - self.last_point.0) as f64 / seconds));
             self.last_point = (done.env_steps, now);
         }
         rows

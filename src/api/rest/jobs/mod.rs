@@ -306,7 +306,7 @@ enum Format {
 #[into_params(parameter_in = Query)]
 struct MetricsQuery {
     /// Only this metric.
-    #[param(nullable = false, example = "eval/mean_aoi")]
+    #[param(schema_with = schemas::metric_name, required = false, example = "eval/mean_aoi")]
     name: Option<String>,
     #[serde(default)]
     #[param(inline)]
