@@ -139,7 +139,7 @@ fn try_train(
     while let Some(event) = trainer.next() {
         let rows = curve.rows(&event);
         let ends =
-            stop_rule.as_mut().is_some_and(|rule| rows.iter().any(|&(step, name, value)| rule.observes(name, step, value)));
+            stop_rule.as_mut().and_then(|rule| rows.iter().find_map(|&(step, name, value)| rule.observes(name, step, value)));
         if !rows.is_empty() {
             reports.push(Report::Metrics { step: trainer.env_steps(), rows });
         }
@@ -159,11 +159,11 @@ fn try_train(
             }
             _ => {}
         }
-        if ends {
+        if let Some(reason) = ends {
             tracing::info!(step = trainer.env_steps(), "training ends early");
             let last = trainer.checkpoint()?;
             reports.checkpoint(CheckpointKind::Last, &last);
-            return Ok((WorkerResult::Succeeded, trained(&trainer, Some(last), begun)?));
+            return Ok((WorkerResult::EndedEarly { reason }, trained(&trainer, Some(last), begun)?));
         }
         if last_snapshot.elapsed() >= snapshot_every && !reports.snapshot_pending.load(Ordering::Acquire) {
             reports.snapshot(&trainer);

@@ -27,7 +27,7 @@ pub(super) struct JobSummary {
     /// Pending action of a running job; null if there is none.
     #[schema(required = true)]
     wanted: Option<PendingAction>,
-    /// Why the job failed, or why its last attempt ended.
+    /// Why the job failed, why its training ended early, or why its last attempt ended.
     #[schema(required = true)]
     reason: Option<String>,
     progress: Progress,
