@@ -5,8 +5,9 @@ use serde_json::{Value, json};
 use super::spec::JobRequest;
 use super::sweep::{MAX_JOBS, MAX_SEEDS, request_at};
 use super::webhooks;
-use crate::invalid::{Invalid, in_range};
-use crate::store::{JobKind, JobSpec};
+use crate::invalid::{Invalid, count_in_range, in_range};
+use crate::store::{JobKind, JobLimits, JobSpec};
+use crate::train_config::TrainConfig;
 
 /// Longest name of a sweep: the names of its jobs have a number at the end.
 pub(super) const MAX_NAME: usize = 58;
@@ -56,8 +57,13 @@ pub fn resolve(mut request: JobRequest, cpu_budget: usize) -> Result<Sweep, Inva
         }
     }
     let first = jobs.first().expect("there is at least one combination and one seed");
-    let work = jobs.iter().filter_map(|job| job.config.as_ref()).map(|config| config.training.steps).fold(0, u64::saturating_add);
-    let document = json!({"points": points, "seeds": seeds});
+    let work = jobs.iter().filter_map(|job| job.config.as_ref()).map(TrainConfig::total_steps).fold(0, u64::saturating_add);
+    // With these, the same sweep can be submitted again.
+    let base = json!({
+        "algorithm": request.algorithm, "preset": request.preset, "environment": request.environment, "training": request.training,
+        "seed": first_seed,
+    });
+    let document = json!({"points": points, "seeds": seeds, "base": base});
     let (kind, sweep) = (JobKind::Sweep, Some(document));
     let spec = JobSpec { kind, name, webhooks, config: None, sweep, work, point: None, ..first.clone() };
     Ok(Sweep { spec, jobs })
@@ -78,7 +84,7 @@ mod tests {
             "sweep": {"grid": {"training.learning_rate": [0.001, 0.002], "algorithm": ["vdn", "qmix"]}, "seeds": 3},
         });
         let Sweep { spec, jobs } = resolve_json(document).unwrap();
-        assert_eq!((spec.kind, spec.work, jobs.len()), (JobKind::Sweep, 12_000, 12));
+        assert_eq!((spec.kind, spec.work, jobs.len()), (JobKind::Sweep, 12 * 1280, 12));
         let configs: Vec<_> = jobs.iter().map(|job| job.config.clone().unwrap()).collect();
         assert_eq!(configs.iter().map(|config| config.seed).collect::<Vec<_>>(), [5, 6, 7].repeat(4));
         assert_eq!(configs[3].training.learning_rate, 0.002);

@@ -128,7 +128,7 @@ pub(super) struct UnreadableSpec {
 pub(in crate::api::rest) struct Progress {
     /// Environment steps done.
     step: u64,
-    /// Environment steps to do.
+    /// Environment steps to do, in whole iterations.
     steps: u64,
     /// Environment steps per second; null if they were not measured, or the job does not run.
     #[schema(required = true)]
