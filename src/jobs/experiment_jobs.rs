@@ -130,7 +130,9 @@ pub fn resolve(mut request: JobRequest, cpu_budget: usize) -> Result<Sweep, Inva
     });
     let jobs: Vec<JobSpec> = jobs.collect();
     let experiment = Some(Value::Object(document));
-    let spec = JobSpec { kind: JobKind::Experiment, name, config: None, experiment, work, ..template };
+    // Without a limit of the request, each job has its own.
+    let limits = JobLimits { memory, ..template.limits };
+    let spec = JobSpec { kind: JobKind::Experiment, name, limits, config: None, experiment, work, ..template };
     Ok(Sweep { spec, jobs })
 }
 

@@ -95,7 +95,7 @@ async fn weights_that_do_not_fit_are_refused_with_the_field_that_differs() {
         assert_eq!(refused(&server, &init(fields.clone())).await, field, "{fields}");
     }
     let sweep = json!({"kind": "sweep", "sweep": {"grid": {"algorithm": ["vdn", "rgcn"]}}});
-    assert_eq!(refused(&server, &init(sweep)).await, "sweep.jobs[1].algorithm");
+    assert_eq!(refused(&server, &init(sweep)).await, "sweep.grid.algorithm[1]");
     let evaluation = json!({"kind": "evaluate", "init": {"policy": "base"}, "evaluation": {"policies": ["sweep"]}});
     assert_eq!(refused(&server, &evaluation).await, "init");
     // A fleet of another size is no obstacle for agents that fly any.

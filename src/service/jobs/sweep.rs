@@ -7,6 +7,7 @@ use uuid::Uuid;
 
 use super::init::InitialWeights;
 use super::{check_dependency, publication};
+use crate::invalid::Invalid;
 use crate::jobs::memory::check as check_memory;
 use crate::jobs::spec::JobRequest;
 use crate::jobs::{experiment_jobs, sweep, sweep_jobs};
@@ -34,16 +35,21 @@ pub(super) async fn submit(
         Some(init) => Some(InitialWeights::find(app, caller, init).await?),
         None => None,
     };
-    let budget = app.scheduler.cpu_budget();
-    let (mut sweep, jobs) = match request.kind {
-        Some(JobKind::Experiment) => (experiment_jobs::resolve(request, budget)?, "experiment.runs"),
-        _ => (sweep_jobs::resolve(request, budget)?, "sweep.jobs"),
+    let (budget, varied) = (app.scheduler.cpu_budget(), request.sweep.clone());
+    let mut sweep = match request.kind {
+        Some(JobKind::Experiment) => experiment_jobs::resolve(request, budget)?,
+        _ => sweep_jobs::resolve(request, budget)?,
     };
+    let points = sweep.spec.sweep.as_ref().and_then(|sweep| sweep["points"].as_array()).cloned().unwrap_or_default();
     app.webhooks.check(&sweep.spec.webhooks)?;
     let memory = app.scheduler.config().memory;
     let mut beginning = None;
     for (i, job) in sweep.jobs.iter_mut().enumerate() {
-        let at = |e: crate::invalid::Invalid| e.with_prefix(&format!("{jobs}[{i}]"));
+        let point = job.point.map_or(i, |point| point as usize);
+        let at = |e: Invalid| match (&varied, points.get(point).and_then(Value::as_object)) {
+            (Some(varied), Some(fields)) => varied.named_as_requested(point, fields, e),
+            _ => e.with_prefix(&format!("experiment.runs[{i}]")),
+        };
         if let Some(weights) = &weights {
             beginning = Some(weights.put_into(job).map_err(at)?);
         }
@@ -52,6 +58,8 @@ pub(super) async fn submit(
         }
         publication::check(app, caller, job).await?;
     }
+    // All jobs begin with the same weights.
+    sweep.spec.init = sweep.jobs.first().and_then(|job| job.init.clone());
     for (i, needed) in sweep.spec.after.iter().enumerate() {
         check_dependency(app, caller, i, *needed).await?;
     }
