@@ -158,7 +158,9 @@ async fn a_failed_job_is_continued_from_its_snapshot() {
     server.reaches(&id, "failed").await;
 
     let few = server.request(Method::POST, &path).json(&json!({"steps": 1}));
-    assert_eq!(expect(few, StatusCode::BAD_REQUEST).await["field"], "steps");
+    let problem = expect(few, StatusCode::BAD_REQUEST).await;
+    let expected = format!("steps: got 1, expected a number from 380 to {}", TrainConfig::MAX_STEPS - step);
+    assert_eq!(problem["detail"], format!("{expected}: the snapshot of the job is at step 20 of 400"));
     let mut grpc = server.jobs().await;
     let request = v1::ContinueJobRequest { id: id.clone(), steps: 1000, idempotency_key: String::new() };
     let job = grpc.continue_job(request).await.unwrap().into_inner();
