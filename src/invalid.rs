@@ -28,6 +28,8 @@ pub enum InvalidKind {
     Schema,
     /// The schema has no field of this name.
     UnknownField,
+    /// A request has no parameter of this name.
+    UnknownParameter,
 }
 
 impl Invalid {
@@ -59,6 +61,11 @@ impl Invalid {
     /// The schema has no `field`; `expected` lists the fields that exist.
     pub fn unknown_field(field: impl Into<String>, expected: impl Into<String>) -> Self {
         Self { kind: InvalidKind::UnknownField, ..Self::missing(field, expected) }
+    }
+
+    /// A request has no parameter of the name `field`; `expected` lists those that exist: HTTP status 400, code `invalid_argument`.
+    pub fn unknown_parameter(field: impl Into<String>, expected: impl Into<String>) -> Self {
+        Self { kind: InvalidKind::UnknownParameter, ..Self::missing(field, expected) }
     }
 
     /// The error of a serde `parser` that failed at `path` (empty: the document itself).
@@ -97,14 +104,14 @@ impl Invalid {
 
     /// Whether the input does not match its schema.
     pub fn is_schema(&self) -> bool {
-        self.kind != InvalidKind::Value
+        matches!(self.kind, InvalidKind::Schema | InvalidKind::UnknownField)
     }
 
     /// The accepted word that the value, or the name of the unknown field, is nearest to: `expected` is a list `one of a, b, ...`.
     pub fn suggestion(&self) -> Option<&str> {
         let (_, known) = self.expected.split_once("one of ")?;
         let word = match self.kind {
-            InvalidKind::UnknownField => self.field.rsplit('.').next()?,
+            InvalidKind::UnknownField | InvalidKind::UnknownParameter => self.field.rsplit('.').next()?,
             _ => self.value.as_deref()?.trim_matches('"'),
         };
         nearest(word, known.split(", "))
@@ -123,6 +130,7 @@ impl Display for Invalid {
         let Self { field, value, expected, kind } = self;
         match (kind, value) {
             (InvalidKind::UnknownField, _) => write!(f, "{field}: unknown field, expected {expected}")?,
+            (InvalidKind::UnknownParameter, _) => write!(f, "{field}: unknown parameter, expected {expected}")?,
             (_, Some(value)) => write!(f, "{field}: got {value}, expected {expected}")?,
             (_, None) => write!(f, "{field}: missing, expected {expected}")?,
         }
@@ -223,6 +231,17 @@ where
     Err(Invalid::new(field, &value, format!("a number from {} to {}", ends[0], ends[1])))
 }
 
+/// Checks that a list has a number of `items` (`policies`) in `range`.
+///
+/// # Errors
+/// [`Invalid`] if it has fewer or more.
+pub fn count_in_range(field: &str, count: usize, range: std::ops::RangeInclusive<usize>, items: &str) -> Result<(), Invalid> {
+    if range.contains(&count) {
+        return Ok(());
+    }
+    Err(Invalid::new(field, format!("{count} {items}"), format!("from {} to {}", range.start(), range.end())))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -233,6 +252,8 @@ mod tests {
         assert_eq!(message(Invalid::new("uavs", 5000, "at most 4096")), "uavs: got 5000, expected at most 4096");
         assert_eq!(message(Invalid::missing("scene", "a scene")), "scene: missing, expected a scene");
         assert_eq!(message(Invalid::unknown_field("job.x", "one of a, b")), "job.x: unknown field, expected one of a, b");
+        let none = count_in_range("policies", 0, 1..=32, "policies").unwrap_err();
+        assert_eq!(message(none), "policies: got 0 policies, expected from 1 to 32");
     }
 
     #[test]

@@ -9,7 +9,7 @@ import { go, link, setOptions } from './route.js';
 import { Action, Bar, Card, copy, Empty, ErrorBox, Field, Loaded, Loading, run, State, Tabs, Title, useLoad } from './ui.js';
 import { Evaluation, SweepJobs } from './report.js';
 import { Edit } from './edit.js';
-import { command, commands, makesJobs, useTimeLeft, why } from './jobs.js';
+import { command, commands, makesJobs, share, useTimeLeft, why } from './jobs.js';
 
 /** The views of a job of each kind; the first one is shown if the address names none. */
 const VIEWS = {
@@ -105,7 +105,7 @@ function Summary({ job, left }) {
   const { step, steps } = job.progress;
   const reason = why(job);
   return html`<${Card}>
-    <${Bar} value=${steps ? step / steps : 0} label="Progress" />
+    <${Bar} value=${share(job)} label="Progress" />
     <dl class="facts wide">
       <div><dt>Progress</dt><dd>${number(step)} of ${number(steps)} steps${left != null ? html`, <strong>${duration(left)} left</strong>` : ''}</dd></div>
       <div><dt>Algorithm</dt><dd><span class="swatch" style=${{ background: algorithmColour(job.algorithm) }}></span> ${[job.kind && job.kind !== 'train' ? job.kind : null, job.algorithm, job.preset && `preset ${job.preset}`, job.seed != null && `seed ${job.seed}`].filter(Boolean).join(', ')}</dd></div>

@@ -38,7 +38,8 @@ export async function command(job, verb) {
   return run(() => (verb === 'delete' ? remove(`/v1/jobs/${job.id}`) : post(`/v1/jobs/${job.id}/${verb}`)), `${name} ${DONE[verb]}.`);
 }
 
-const share = (job) => (job.progress.steps ? Math.min(job.progress.step / job.progress.steps, 1) : 0);
+/** Share of a job that is done; one that succeeded is done, however early it ended. */
+export const share = (job) => (job.state === 'succeeded' ? 1 : job.progress.steps ? Math.min(job.progress.step / job.progress.steps, 1) : 0);
 
 /** Seconds until a running job has done all steps, by the speed since it was first seen here, else since it started. */
 export function useTimeLeft() {
@@ -62,7 +63,7 @@ export function useTimeLeft() {
 export function why(job) {
   if (job.state === 'queued') return job.waiting?.reason ?? job.reason ?? '';
   if (job.unreadable) return job.unreadable.reason;
-  return job.state === 'failed' || job.state === 'paused' || job.state === 'cancelled' ? (job.reason ?? '') : '';
+  return job.state === 'running' ? '' : (job.reason ?? '');
 }
 
 /** How jobs are sorted: [option of the address, name]. */
@@ -147,7 +148,7 @@ function Row({ job, left, selected, select, reload }) {
       ${Object.entries(job.labels ?? {}).map(([k, v]) => html`<span class="label">${k}=${v}</span>`)}</td>
     <td data-name="State"><${State} state=${job.state} wanted=${job.wanted} />${reason && html`<div class="faint small reason">${reason}</div>`}</td>
     <td data-name="Progress" class="progress"><${Bar} value=${share(job)} label=${`Progress of ${name}`} />
-      <div class="faint small">${Math.floor(100 * share(job))} % of ${short(job.progress.steps)} steps${left != null ? html`, <strong>${duration(left)} left</strong>` : ''}${job.policy ? html`, <a href=${link(['policies', job.policy.split(':')[0]])}>${job.policy}</a>` : ''}</div></td>
+      <div class="faint small">${job.progress.step < job.progress.steps && job.state === 'succeeded' ? short(job.progress.step) : `${Math.floor(100 * share(job))} %`} of ${short(job.progress.steps)} steps${left != null ? html`, <strong>${duration(left)} left</strong>` : ''}${job.policy ? html`, <a href=${link(['policies', job.policy.split(':')[0]])}>${job.policy}</a>` : ''}</div></td>
     <td class="number" data-name="Best mean AoI">${number(job.metrics['eval/mean_aoi']?.best)}</td>
     <td data-name="Submitted" title=${clock(job.created_at)} class="nowrap">${ago(job.created_at)}</td>
     <td class="row-actions">${commands(job).map(([verb, label]) => html`<${Action} class="small" command=${() => command(job, verb).then(reload)} aria-label=${`${label} ${name}`}>${label}<//>`)}

@@ -4,6 +4,7 @@ import { html } from './htm-preact-3.1.1.js';
 import { all, get } from './api.js';
 import { Curves } from './curves.js';
 import { number, short } from './format.js';
+import { share } from './jobs.js';
 import { algorithmColour } from './palette.js';
 import { link } from './route.js';
 import { Bar, Card, Empty, Loaded, State, useLoad } from './ui.js';
@@ -56,6 +57,6 @@ export function SweepJobs({ id, options, ended }) {
   return html`<${Loaded} of=${list} what="the jobs of this job">${(jobs) => (jobs.length ? html`<${Curves} jobs=${jobs.filter((job) => job.progress.step > 0)} options=${options} first="parallel" />
       <${Card} title=${`${jobs.length} jobs`}><div class="scroll"><table class="stack"><thead><tr><th scope="col">Job</th><th scope="col">State</th><th scope="col">Progress</th></tr></thead>
         <tbody>${jobs.map((job) => html`<tr key=${job.id}><td><a href=${link(['jobs', job.id])}>${job.name ?? job.id.slice(-6)}</a> <span class="faint small">seed ${job.seed}</span></td><td><${State} state=${job.state} wanted=${job.wanted} /></td>
-          <td class="progress"><${Bar} value=${job.progress.steps ? job.progress.step / job.progress.steps : 0} label="Progress" /><span class="faint small">${short(job.progress.step)} of ${short(job.progress.steps)} steps</span></td></tr>`)}</tbody></table></div><//>`
+          <td class="progress"><${Bar} value=${share(job)} label="Progress" /><span class="faint small">${short(job.progress.step)} of ${short(job.progress.steps)} steps</span></td></tr>`)}</tbody></table></div><//>`
     : html`<${Card}><${Empty} title="It has made no job yet." /><//>`)}<//>`;
 }

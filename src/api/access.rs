@@ -164,6 +164,34 @@ mod tests {
     }
 
     #[test]
+    fn every_method_is_documented() {
+        let document = include_str!("../../docs/security.md");
+        let row = |scope: Scope| {
+            let start = format!("| `{}` |", scope.name());
+            document.lines().find(|line| line.starts_with(&start)).unwrap_or_else(|| panic!("no row {start}"))
+        };
+        let of_inference = |service: &str| service.starts_with("inference.") || service.starts_with("grpc.");
+        for (service, methods, requirement) in GRPC {
+            let Requirement::Scope(scope) = requirement else { continue };
+            // The table has the metadata of models and reflection in words.
+            if of_inference(service) && *requirement == READ {
+                continue;
+            }
+            for method in methods.split(' ') {
+                assert!(row(*scope).contains(&format!("`{method}`")), "{scope:?} lacks {method}");
+            }
+        }
+        // And names nothing that requires another scope.
+        for scope in [Scope::Read, Scope::Act, Scope::Jobs, Scope::Admin] {
+            for method in row(scope).split('`').skip(1).step_by(2).filter(|word| word.starts_with(char::is_uppercase)) {
+                let mut rules = GRPC.iter().filter(|(_, methods, _)| methods.split(' ').any(|m| m == method)).peekable();
+                assert!(rules.peek().is_some(), "{method} does not exist");
+                assert!(rules.all(|(_, _, requirement)| *requirement == Requirement::Scope(scope)), "{method} as {scope:?}");
+            }
+        }
+    }
+
+    #[test]
     fn no_method_or_route_is_listed_twice() {
         for table in [GRPC, REST] {
             let mut all: Vec<_> =

@@ -15,8 +15,8 @@ use crate::service::keys::{self, CreatedKey, KeyInfo, NewKey, Scopes};
 /// Flags of `keys`.
 #[derive(Args, Debug)]
 #[command(
-    after_help = "Scopes: read (lists, details, metrics), act (Act, sessions, environments, inference), jobs (submit, cancel, pause, \
-                        resume, delete), admin (policies and aliases, and everything above).
+    after_help = "Scopes: read (lists, details, metrics), act (Act, sessions, environments, inference), jobs (submit, edit, cancel, \
+                        pause, resume, retry, continue, delete), admin (policies and aliases, and everything above).
 
 Once a data directory has a key, its server requires a key from every caller. A running server notices changes within about a
 second.

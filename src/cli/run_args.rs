@@ -28,7 +28,8 @@ pub struct RunArgs {
     /// Slots per episode [preset: 80]
     #[arg(long, env = "QEDGIX_SLOTS")]
     pub slots: Option<usize>,
-    /// Environment steps to train for, as 400000, 400_000 or 4e5 [preset: 2050000]
+    /// Environment steps to train for, as 400000, 400_000 or 4e5; rounded up to whole iterations of all environments, as 2000 to 2560
+    /// with 8 environments of 80 slots [preset: 2050000]
     #[arg(long, env = "QEDGIX_STEPS", value_parser = count)]
     pub steps: Option<u64>,
     /// Seed of every random stream [default: 1]

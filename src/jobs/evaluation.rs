@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use crate::env::EnvConfig;
-use crate::invalid::{Invalid, in_range};
+use crate::invalid::{Invalid, count_in_range, in_range};
 use crate::learner::{Comparison, Disturbance, LostUav, SizingTarget, layout_list};
 use crate::policy::baselines;
 use crate::train_config::parse_environment;
@@ -51,7 +51,9 @@ pub struct PlanRequest {
 
 impl PlanRequest {
     fn resolve(self, policies: usize, disturbance: &Disturbance) -> Result<SizingTarget, Invalid> {
-        in_range("policies", policies, 1..=1)?;
+        if policies != 1 {
+            return Err(Invalid::new("policies", format!("{policies} policies"), "one policy, whose fleet is sized"));
+        }
         if *disturbance != Disturbance::default() {
             let expected = "no lose and no position_noise: a plan has losses of its own (failures)";
             return Err(Invalid::new("plan", "a value beside a disturbance", expected));
@@ -89,7 +91,7 @@ impl EvaluationRequest {
     /// The first field that is not accepted.
     pub fn resolve(self, environment: &Map<String, Value>) -> Result<EvaluationSpec, Invalid> {
         let Self { policies, layouts, episodes, lose, position_noise, plan } = self;
-        in_range("evaluation.policies", policies.len(), 1..=MAX_POLICIES)?;
+        count_in_range("evaluation.policies", policies.len(), 1..=MAX_POLICIES, "policies")?;
         let mut environment = parse_environment(Value::Object(environment.clone()))?;
         // Rewards are not part of an evaluation.
         environment.reward_scale = None;

@@ -110,7 +110,7 @@ pub fn resolve(mut request: JobRequest, cpu_budget: usize) -> Result<Sweep, Inva
     let mut work = 0_u64;
     let first_of_point = |i: usize| experiment.runs[..i].iter().all(|run| run.point != experiment.runs[i].point);
     let jobs = experiment.runs.iter().enumerate().map(|(i, run)| {
-        work = work.saturating_add(run.config.training.steps);
+        work = work.saturating_add(run.config.total_steps());
         let baselines = if first_of_point(i) { experiment.baselines.clone() } else { Vec::new() };
         let environment = experiment.points[run.point].environment.clone();
         let report = RunReport { layouts: experiment.layouts.clone(), episodes, baselines, environment };
@@ -130,7 +130,9 @@ pub fn resolve(mut request: JobRequest, cpu_budget: usize) -> Result<Sweep, Inva
     });
     let jobs: Vec<JobSpec> = jobs.collect();
     let experiment = Some(Value::Object(document));
-    let spec = JobSpec { kind: JobKind::Experiment, name, config: None, experiment, work, ..template };
+    // Without a limit of the request, each job has its own.
+    let limits = JobLimits { memory, ..template.limits };
+    let spec = JobSpec { kind: JobKind::Experiment, name, limits, config: None, experiment, work, ..template };
     Ok(Sweep { spec, jobs })
 }
 
@@ -153,7 +155,7 @@ mod tests {
             "overrides": {"training": {"steps": 100}},
         });
         let Sweep { spec, jobs } = resolve_json(&document).unwrap();
-        assert_eq!((spec.kind, spec.work, jobs.len()), (JobKind::Experiment, 800, 8));
+        assert_eq!((spec.kind, spec.work, jobs.len()), (JobKind::Experiment, 8 * 640, 8));
         let reports: Vec<RunReport> =
             jobs.iter().map(|job| serde_json::from_value(job.report.clone().unwrap()).unwrap()).collect();
         let with_baselines: Vec<usize> = (0..8).filter(|i| !reports[*i].baselines.is_empty()).collect();

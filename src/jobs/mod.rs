@@ -11,6 +11,7 @@ pub mod experiment_jobs;
 mod launched;
 mod local;
 pub mod memory;
+pub mod metric_names;
 mod scheduler;
 mod slurm;
 pub mod spec;

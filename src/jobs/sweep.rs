@@ -4,8 +4,9 @@ use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
-use crate::invalid::{Invalid, in_range};
+use crate::invalid::{Invalid, InvalidKind, count_in_range, in_range};
 use crate::rng;
+use crate::train_config::field_name;
 
 /// Most jobs of a sweep.
 pub const MAX_JOBS: usize = 500;
@@ -66,15 +67,42 @@ impl SweepRequest {
     /// # Errors
     /// The first field that is not accepted.
     pub(super) fn points(&self) -> Result<Vec<Point>, Invalid> {
-        let points = match (&self.grid, &self.list, &self.random) {
-            (Some(grid), None, None) => grid_points(grid)?,
-            (None, Some(list), None) => list.clone(),
-            (None, None, Some(random)) => random.points()?,
-            _ => return Err(Invalid::missing("sweep.grid", "exactly one of grid, list and random")),
-        };
-        in_range("sweep.points", points.len(), 1..=MAX_JOBS)?;
-        Ok(points)
+        let given = [("grid", self.grid.is_some()), ("list", self.list.is_some()), ("random", self.random.is_some())];
+        let mut given = given.into_iter().filter_map(|(name, given)| given.then_some(name));
+        if let (Some(first), Some(second)) = (given.next(), given.next()) {
+            let value = format!("a value beside sweep.{first}");
+            return Err(Invalid::new(format!("sweep.{second}"), value, "exactly one of grid, list and random"));
+        }
+        match (&self.grid, &self.list, &self.random) {
+            (Some(grid), ..) => grid_points(grid),
+            (_, Some(list), _) => list_points(list),
+            (.., Some(random)) => random.points(),
+            _ => Err(Invalid::missing("sweep.grid", "exactly one of grid, list and random")),
+        }
     }
+
+    /// An error of the job at `point`, the combination `i`, with the field as this request names it.
+    pub fn named_as_requested(&self, i: usize, point: &Point, error: Invalid) -> Invalid {
+        let found = point.iter().find_map(|(path, value)| Some((path, value, rest_within(&error.field, path)?)));
+        // A field that the sweep does not vary has the name that it has in the request.
+        let Some((path, value, rest)) = found else { return error };
+        let values = self.grid.as_ref().and_then(|grid| grid.get(path)?.as_array());
+        let at = values.and_then(|values| values.iter().position(|v| v == value));
+        let field = match at {
+            Some(_) if error.kind == InvalidKind::UnknownField && rest.is_empty() => format!("sweep.grid.{path}"),
+            Some(at) => format!("sweep.grid.{path}[{at}]{rest}"),
+            None if self.list.is_some() => format!("sweep.list[{i}].{path}{rest}"),
+            None => format!("sweep.random.fields.{path}{rest}"),
+        };
+        Invalid { field, ..error }
+    }
+}
+
+/// What of `field` follows `path`, which may have a symbol of the paper; `None`: another field.
+fn rest_within<'a>(field: &'a str, path: &str) -> Option<&'a str> {
+    let name = path.split_once('.').map(|(section, name)| format!("{section}.{}", field_name(name)));
+    let rest = field.strip_prefix(path).or_else(|| field.strip_prefix(name?.as_str()))?;
+    (rest.is_empty() || rest.starts_with(['.', '['])).then_some(rest)
 }
 
 /// The values of a field of a grid.
@@ -83,11 +111,23 @@ fn choices<'a>(field: &str, values: &'a Value) -> Result<&'a Vec<Value>, Invalid
     values.as_array().filter(|values| !values.is_empty()).ok_or_else(invalid)
 }
 
+/// The place of the first item that is equal to one before it. Its jobs would be equal, too.
+fn repeated<T: PartialEq>(items: &[T]) -> Option<usize> {
+    (1..items.len()).find(|&i| items[..i].contains(&items[i]))
+}
+
 fn grid_points(grid: &Map<String, Value>) -> Result<Vec<Point>, Invalid> {
+    if grid.is_empty() {
+        return Err(Invalid::new("sweep.grid", "no field", "the values of at least one field"));
+    }
     let mut points = vec![Point::new()];
     for (field, values) in grid {
-        let values = choices(&format!("sweep.grid.{field}"), values)?;
-        in_range("sweep.points", points.len().saturating_mul(values.len()), 1..=MAX_JOBS)?;
+        let path = format!("sweep.grid.{field}");
+        let values = choices(&path, values)?;
+        count_in_range("sweep.grid", points.len().saturating_mul(values.len()), 1..=MAX_JOBS, "combinations")?;
+        if let Some(i) = repeated(values) {
+            return Err(Invalid::new(format!("{path}[{i}]"), &values[i], "each value once"));
+        }
         let with = |point: &Point, value: &Value| {
             let mut point = point.clone();
             point.insert(field.clone(), value.clone());
@@ -98,12 +138,27 @@ fn grid_points(grid: &Map<String, Value>) -> Result<Vec<Point>, Invalid> {
     Ok(points)
 }
 
+fn list_points(list: &[Point]) -> Result<Vec<Point>, Invalid> {
+    count_in_range("sweep.list", list.len(), 1..=MAX_JOBS, "combinations")?;
+    if let Some(i) = list.iter().position(Map::is_empty) {
+        return Err(Invalid::new(format!("sweep.list[{i}]"), "no field", "the value of at least one field"));
+    }
+    if let Some(i) = repeated(list) {
+        return Err(Invalid::new(format!("sweep.list[{i}]"), Value::Object(list[i].clone()), "each combination once"));
+    }
+    Ok(list.to_vec())
+}
+
 impl RandomSweep {
+    /// The combinations that are drawn, each once.
     fn points(&self) -> Result<Vec<Point>, Invalid> {
         in_range("sweep.random.samples", self.samples, 1..=MAX_JOBS as u64)?;
+        if self.fields.is_empty() {
+            return Err(Invalid::new("sweep.random.fields", "no field", "what at least one field is drawn from"));
+        }
         let draw = |sample| {
             let mut draw = rng::stream(self.seed.unwrap_or(1), "sweep", sample);
-            let values = self.fields.iter().map(|(field, from)| {
+            let values = self.fields.iter().map(|(field, from)| -> Result<_, Invalid> {
                 let path = format!("sweep.random.fields.{field}");
                 let value = match from {
                     Value::Array(_) => {
@@ -114,9 +169,17 @@ impl RandomSweep {
                 };
                 Ok((field.clone(), value))
             });
-            values.collect()
+            values.collect::<Result<Point, Invalid>>()
         };
-        (0..self.samples).map(draw).collect()
+        let mut points = Vec::new();
+        for sample in 0..self.samples {
+            let point = draw(sample)?;
+            // Few values are drawn more than once; the jobs would be equal.
+            if !points.contains(&point) {
+                points.push(point);
+            }
+        }
+        Ok(points)
     }
 }
 

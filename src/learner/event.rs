@@ -65,6 +65,21 @@ pub struct Iteration {
 }
 
 impl Event {
+    /// The names of the metrics of [`Event::rows`].
+    pub const METRICS: [&str; 11] = [
+        "epsilon",
+        "train/mean_aoi",
+        "loss",
+        "grad_norm",
+        "q_tot",
+        "eval/mean_aoi",
+        "eval/p95_aoi",
+        "eval/peak_aoi",
+        "eval/coverage",
+        "eval/fairness",
+        "eval-v1/mean_aoi",
+    ];
+
     /// The event as metrics: (environment step, name, value), with the names used by servers and CSV files.
     pub fn rows(&self) -> Vec<(u64, &'static str, f64)> {
         match self {

@@ -2,8 +2,7 @@
 
 use crate::store::MetricRow;
 
-/// The metric with the environment steps per second.
-pub(super) const SPEED: &str = "env_steps_per_s";
+pub(super) use crate::jobs::metric_names::SPEED;
 
 /// How far a job had come when it reported metrics.
 #[derive(Clone, Copy, Debug, PartialEq)]

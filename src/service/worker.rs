@@ -247,13 +247,19 @@ pub async fn finish(app: &App, lease: Lease, result: WorkerResult, document: Opt
         }
     }
     let document = document.as_deref();
-    let job = match result {
-        WorkerResult::Succeeded => match new_version(app, lease).await {
+    let result = match result {
+        WorkerResult::EndedEarly { reason } => WorkerResult::EndedEarly { reason: first_characters(&reason) },
+        WorkerResult::Failed { reason, permanent } => WorkerResult::Failed { reason: first_characters(&reason), permanent },
+        result => result,
+    };
+    let job = match &result {
+        WorkerResult::Succeeded | WorkerResult::EndedEarly { .. } => match new_version(app, lease).await {
             Ok(Some((version, promotion))) => {
                 let promotion = promotion.map(|rule| promotion_of(rule, document)).transpose()?;
-                policies::publish_and_end(app, version, policies::JobResult { promotion, document }, lease).await?
+                policies::publish_and_end(app, version, policies::JobResult { ended: &result, promotion, document }, lease)
+                    .await?
             }
-            Ok(None) => end(app, lease, &WorkerResult::Succeeded, document).await?,
+            Ok(None) => end(app, lease, &result, document).await?,
             // Another attempt would fail with the same checkpoint.
             Err(Error::Invalid(e)) => {
                 let reason = format!("the policy cannot be published: {e}");
@@ -261,16 +267,17 @@ pub async fn finish(app: &App, lease: Lease, result: WorkerResult, document: Opt
             }
             Err(e) => return Err(e),
         },
-        WorkerResult::Stopped => end(app, lease, &WorkerResult::Stopped, None).await?,
-        WorkerResult::Failed { reason, permanent } => {
-            let reason = reason.chars().take(2000).collect();
-            end(app, lease, &WorkerResult::Failed { reason, permanent }, None).await?
-        }
+        WorkerResult::Stopped | WorkerResult::Failed { .. } => end(app, lease, &result, None).await?,
     };
     let job = job.ok_or_else(|| attempt_ended(lease))?;
     tracing::info!(job = %job.id, attempt = lease.attempt, state = %job.state, reason = job.reason, "attempt ended");
     app.scheduler.job_changed(lease.job_row);
     Ok(())
+}
+
+/// What is stored of a reason.
+fn first_characters(reason: &str) -> String {
+    reason.chars().take(2000).collect()
 }
 
 /// Ends the attempt without publishing anything.

@@ -53,6 +53,11 @@ pub struct LeaseRecord {
 pub enum WorkerResult {
     /// All environment steps are completed.
     Succeeded,
+    /// Training ended before all steps were done, as the job asks for: a success.
+    EndedEarly {
+        /// Why.
+        reason: String,
+    },
     /// The worker stopped early because of a directive. The pending action of the job is applied; without one the job is queued
     /// again.
     Stopped,
@@ -96,7 +101,7 @@ pub struct Attempt {
     pub ended_at: Option<Timestamp>,
     /// How the attempt ended.
     pub outcome: Option<AttemptOutcome>,
-    /// Why the attempt failed.
+    /// Why the attempt failed, or ended early.
     pub reason: Option<String>,
     /// Last output of the worker. While the worker runs, it is stored with a delay of a second.
     pub log: String,
@@ -142,10 +147,10 @@ async fn end(db: &mut SqliteConnection, ended: EndedAttempt<'_>) -> Result<Optio
     let max_attempts = limits.max_attempts.unwrap_or(max_attempts);
     // An acknowledged cancel wins, even over a worker that succeeded before it noticed.
     let (outcome, state) = match (result, job.pending_action) {
-        (WorkerResult::Succeeded | WorkerResult::Stopped, Some(PendingAction::Cancel)) => {
+        (WorkerResult::Succeeded | WorkerResult::EndedEarly { .. } | WorkerResult::Stopped, Some(PendingAction::Cancel)) => {
             (AttemptOutcome::Cancelled, JobState::Cancelled)
         }
-        (WorkerResult::Succeeded, _) => (AttemptOutcome::Succeeded, JobState::Succeeded),
+        (WorkerResult::Succeeded | WorkerResult::EndedEarly { .. }, _) => (AttemptOutcome::Succeeded, JobState::Succeeded),
         (WorkerResult::Stopped, Some(PendingAction::Pause)) => (AttemptOutcome::Paused, JobState::Paused),
         (WorkerResult::Stopped, None) => (AttemptOutcome::Interrupted, JobState::Queued),
         (WorkerResult::Failed { .. }, Some(PendingAction::Cancel)) => (AttemptOutcome::Failed, JobState::Cancelled),
@@ -158,7 +163,11 @@ async fn end(db: &mut SqliteConnection, ended: EndedAttempt<'_>) -> Result<Optio
             (AttemptOutcome::Failed, state)
         }
     };
-    let reason = if let WorkerResult::Failed { reason, .. } = result { Some(reason.as_str()) } else { None };
+    let reason = match result {
+        WorkerResult::Failed { reason, .. } => Some(reason.as_str()),
+        WorkerResult::EndedEarly { reason } if state == JobState::Succeeded => Some(reason.as_str()),
+        _ => None,
+    };
     let sql = "UPDATE attempts SET ended_at = ?3, outcome = ?4, reason = ?5 WHERE job = ?1 AND number = ?2";
     sqlx::query(sql)
         .bind(lease.job_row)

@@ -111,6 +111,15 @@ impl Store {
         Ok(found)
     }
 
+    /// Whether any job has a metric of this name.
+    ///
+    /// # Errors
+    /// [`Error`](super::Error) when the database fails.
+    pub async fn has_metric(&self, name: &str) -> Result<bool> {
+        let sql = "SELECT 1 FROM metric_summaries WHERE name = ? LIMIT 1";
+        Ok(sqlx::query(sql).bind(name).fetch_optional(&self.read).await?.is_some())
+    }
+
     /// The summaries of the first `limit` metrics of a job, by name.
     ///
     /// # Errors

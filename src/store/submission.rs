@@ -13,6 +13,7 @@ use super::specs::JobSpec;
 use super::transitions::{Transition, count_blockers, transition};
 use super::webhooks::insert_webhooks;
 use super::{Job, JobId, JobState, Result, Snapshot, Store, corrupt};
+use crate::train_config::TrainConfig;
 
 /// A job to submit.
 #[derive(Clone, Debug)]
@@ -142,7 +143,7 @@ pub(super) async fn insert(tx: &mut SqliteConnection, new: &NewJob) -> Result<Jo
         .bind(config.as_ref().and_then(|config| text_of(&config.algorithm)))
         .bind(config.as_ref().and_then(|config| text_of(&config.preset)))
         .bind(config.as_ref().map(|config| config.seed.to_string()))
-        .bind(config.as_ref().map_or(*work, |config| config.training.steps) as i64)
+        .bind(config.as_ref().map_or(*work, TrainConfig::total_steps) as i64)
         .execute(&mut *tx)
         .await?
         .last_insert_rowid();

@@ -73,8 +73,25 @@ pub(super) fn overridden<T: Serialize + DeserializeOwned>(
 ) -> Result<T, Invalid> {
     let mut fields = serde_json::to_value(base).expect("a configuration is plain data");
     let known: Vec<String> = fields.as_object().into_iter().flatten().map(|(name, _)| name.clone()).collect();
+    let defaults = fields.clone();
+    let names_in = |outer: &str| -> Vec<&String> { defaults[outer].as_object().into_iter().flat_map(Map::keys).collect() };
+    let unknown = |path: String, known: &[&String]| {
+        let known: Vec<&str> = known.iter().map(|name| name.as_str()).collect();
+        Invalid::unknown_field(path, format!("one of {}", known.join(", ")))
+    };
     for (key, value) in patch {
         let name = field_name(key);
+        // A path into an object replaces one of its fields. Paths come after their object in a patch, which is ordered.
+        if let Some((outer, inner)) = key.split_once('.').filter(|(outer, _)| !names_in(outer).is_empty()) {
+            if !names_in(outer).iter().any(|name| *name == inner) {
+                return Err(unknown(format!("{section}.{key}"), &names_in(outer)));
+            }
+            fields[outer][inner] = value.clone();
+            if let Err(e) = T::deserialize(&fields) {
+                return Err(Invalid::schema(format!("{section}.{key}"), value, expectation(&e)));
+            }
+            continue;
+        }
         if !known.iter().any(|k| k == name) {
             return Err(Invalid::unknown_field(format!("{section}.{key}"), format!("one of {}", known.join(", "))));
         }
@@ -83,8 +100,54 @@ pub(super) fn overridden<T: Serialize + DeserializeOwned>(
         }
         fields[name] = value.clone();
         if let Err(e) = T::deserialize(&fields) {
+            // Of an object, the field inside that is wrong.
+            for (inner, value) in value.as_object().filter(|_| !names_in(name).is_empty()).into_iter().flatten() {
+                if !names_in(name).contains(&inner) {
+                    return Err(unknown(format!("{section}.{key}.{inner}"), &names_in(name)));
+                }
+                fields[name] = Map::from_iter([(inner.clone(), value.clone())]).into();
+                if let Err(e) = T::deserialize(&fields) {
+                    return Err(Invalid::schema(format!("{section}.{key}.{inner}"), value, expectation(&e)));
+                }
+            }
             return Err(Invalid::schema(format!("{section}.{key}"), value, expectation(&e)));
         }
     }
     Ok(serde_json::from_value(fields).expect("checked field by field"))
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::train_config::{Algorithm, Preset, TrainConfig};
+
+    fn resolve(training: Value) -> Result<TrainConfig, Invalid> {
+        let Value::Object(training) = training else { unreachable!("an object") };
+        TrainConfig::resolve(Algorithm::Qmix, Preset::Practical, &Map::new(), &training, 1)
+    }
+
+    #[test]
+    fn paths_lead_into_objects() {
+        let vary = resolve(json!({"vary.uavs": [2, 4], "vary": {"uavs": [1, 2], "users": [3, 5]}})).unwrap().training.vary;
+        assert_eq!((vary.uavs, vary.users), (Some([2, 4]), Some([3, 5])));
+        assert_eq!(resolve(json!({"vary.uavs": [2, 4]})).unwrap().training.vary.uavs, Some([2, 4]));
+    }
+
+    #[test]
+    fn errors_name_the_field_inside_of_an_object() {
+        for (training, message) in [
+            (json!({"vary": {"uav": [2, 3]}}), "training.vary.uav: unknown field, expected one of "),
+            (json!({"vary.uav": [2, 3]}), "training.vary.uav: unknown field, expected one of "),
+            (json!({"vary": {"users": [3, 5], "uavs": "many"}}), "training.vary.uavs: got \"many\", expected "),
+            (json!({"vary.uavs": 3}), "training.vary.uavs: got 3, expected "),
+            (json!({"vary": 3}), "training.vary: got 3, expected an object"),
+            (json!({"gamma.x": 3}), "training.gamma.x: unknown field, expected one of "),
+        ] {
+            let refused = resolve(training).unwrap_err().to_string();
+            assert!(refused.starts_with(message), "{refused}");
+        }
+        assert!(resolve(json!({"vary": {"uav": [2, 3]}})).unwrap_err().to_string().ends_with("did you mean uavs?"));
+    }
 }

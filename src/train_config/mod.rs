@@ -238,6 +238,14 @@ impl TrainConfig {
         Ok(policy.with_advice_margin(t.advice_margin as f32).with_trained(trained))
     }
 
+    /// Environment steps after which training ends: the steps rounded up to whole iterations of all environments. Where training
+    /// draws the number of slots, the steps themselves: the end depends on the draws.
+    pub fn total_steps(&self) -> u64 {
+        let (t, slots) = (&self.training, self.environment.slots);
+        let iteration = if t.vary.slots.is_some() { 1 } else { (t.envs * slots).max(1) as u64 };
+        t.steps.div_ceil(iteration).saturating_mul(iteration)
+    }
+
     /// The sizes of the agents.
     pub fn dims(&self) -> Dims {
         let env = &self.environment;
@@ -384,6 +392,18 @@ mod tests {
             let training = resolve(Preset::Practical, without).unwrap().training;
             assert_eq!((training.advice, training.advice_margin), (Advice::None, 0.0));
         }
+    }
+
+    #[test]
+    fn steps_are_rounded_up_to_whole_iterations() {
+        let mut config = TrainConfig::preset(Algorithm::Qedgix, Preset::Practical);
+        for (steps, total) in [(1, 640), (640, 640), (2000, 2560), (u64::MAX, u64::MAX)] {
+            config.training.steps = steps;
+            assert_eq!(config.total_steps(), total, "{steps}");
+        }
+        config.training.vary.slots = Some([10, 20]);
+        config.training.steps = 2000;
+        assert_eq!(config.total_steps(), 2000);
     }
 
     #[test]

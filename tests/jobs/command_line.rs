@@ -280,3 +280,70 @@ async fn exit_statuses_tell_that_a_job_goes_on_or_failed() {
     let watched = within(watching.wait_with_output()).await.unwrap();
     assert_eq!(watched.status.code(), Some(3), "{}", String::from_utf8_lossy(&watched.stderr));
 }
+
+/// The fields of a job that decide what it does, and those of the jobs that it has made.
+async fn what_it_does(bed: &Bed, id: &str) -> Value {
+    let fields = |job: &Value| {
+        let fields = [
+            "kind",
+            "labels",
+            "notes",
+            "threads",
+            "priority",
+            "max_attempts",
+            "timeout",
+            "backoff",
+            "memory",
+            "stop",
+            "init",
+            "publish",
+            "algorithm",
+            "preset",
+            "environment",
+            "training",
+            "evaluation",
+            "experiment",
+            "seed",
+            "point",
+        ];
+        fields.map(|field| job[field].clone())
+    };
+    let mut all = vec![fields(&bed.json(&["jobs", "show", id]).await)];
+    let made = bed.rest.get(&format!("/v1/jobs?parent={id}&sort=created")).await["jobs"].clone();
+    for job in made.as_array().unwrap() {
+        all.push(fields(&bed.json(&["jobs", "show", job["id"].as_str().unwrap()]).await));
+    }
+    json!(all)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_exported_of_every_kind_runs_the_same_jobs_again() {
+    let bed = Bed::start().await;
+    let start = json!({"name": "weights", "stop": {"metric": "eval/mean_aoi", "at_most": 1e9}});
+    bed.write("job.json", &super::harness::with(&start));
+    bed.ok(&["jobs", "submit", "--file", "job.json", "--watch"]).await;
+    let swept =
+        |sweep: Value| super::harness::with(&json!({"kind": "sweep", "seed": 7, "init": {"policy": "weights"}, "sweep": sweep}));
+    let lost = json!({"policies": ["sweep"], "episodes": 2, "lose": {"uav": 1, "slot": 20}, "position_noise": 0.02});
+    let planned = json!({"policies": ["sweep"], "episodes": 2, "plan": {"target_p95": 70, "max_uavs": 2, "failures": true}});
+    let runs = json!({
+        "title": "t", "figure": "parameter", "seeds": [1, 2], "episodes": 2, "layouts": "valid-v1", "baselines": ["sweep"],
+        "run": {"environment": {"uavs": 2, "slots": 8}, "training": {"steps": 200, "eval_every": 200, "eval_episodes": 2}},
+        "series": [{"name": "VDN", "algorithm": "vdn"}], "points": [{"name": "2 users", "x": 2, "environment": {"users": 2}}],
+    });
+    for (name, request) in [
+        ("train", super::harness::with(&json!({"seed": 3, "init": {"policy": "weights"}, "priority": 2, "labels": {"a": "b"}}))),
+        ("evaluate", json!({"kind": "evaluate", "environment": {"users": 3}, "evaluation": lost})),
+        ("mixed", json!({"kind": "evaluate", "evaluation": {"policies": ["sweep"], "episodes": 1, "layouts": "eval-mixed-v2"}})),
+        ("plan", json!({"kind": "evaluate", "environment": {"users": 12}, "evaluation": planned})),
+        ("grid", swept(json!({"grid": {"training.gamma": [0.5, 0.9], "training.buffer": [20, 30]}, "seeds": 2}))),
+        ("random", swept(json!({"random": {"samples": 2, "fields": {"training.gamma": {"low": 0.5, "high": 0.9}}}}))),
+        ("experiment", json!({"kind": "experiment", "experiment": runs})),
+    ] {
+        bed.write("job.json", &request);
+        let id = bed.ok(&["jobs", "submit", "--file", "job.json"]).await;
+        bed.ok(&["jobs", "export", &id, "--out", name]).await;
+        let again = bed.ok(&["jobs", "submit", "--file", &format!("{name}/config.json")]).await;
+        assert_eq!(what_it_does(&bed, &again).await, what_it_does(&bed, &id).await, "{name}");
+    }
+}

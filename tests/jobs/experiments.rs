@@ -76,7 +76,7 @@ async fn an_experiment_has_the_report_of_the_command() {
     server.crash().await;
     let server = start().await;
     let job = server.reaches(&id, "succeeded").await;
-    assert_eq!((&job["kind"], &job["progress"]["steps"]), (&json!("experiment"), &json!(1600)));
+    assert_eq!((&job["kind"], &job["progress"]["steps"]), (&json!("experiment"), &json!(4 * 448)));
     assert_eq!(job["experiment"]["overrides"], json!({"training": {"steps": 400}}));
     for _ in 0..2 {
         let result = server.get(&format!("/v1/jobs/{id}/result")).await;

@@ -79,6 +79,8 @@ async fn jobs_are_filtered_by_what_they_are() {
         ("created_after=yesterday", "created_after"),
         ("sort=age", "sort"),
         ("metrics=a%20b", "metrics"),
+        ("metrics=loss,eval/mean_ao", "metrics"),
+        ("sort=best:eval/mean_ao", "sort"),
         ("sort=name&page_token=7", "page_token"),
         ("page_token=a~7", "page_token"),
     ] {
@@ -129,7 +131,7 @@ async fn jobs_are_sorted_by_the_best_and_the_last_value_of_a_metric() {
         ("-last:eval/mean_aoi", [1, 0, 3, 2]),
         ("-best:eval/coverage", [1, 0, 3, 2]),
         ("last:eval/coverage", [1, 0, 3, 2]),
-        ("last:unknown", [3, 2, 1, 0]),
+        ("last:epsilon", [3, 2, 1, 0]),
     ] {
         let expected = expected.map(|i: usize| ids[i].clone());
         assert_eq!(list(&server, &format!("sort={sort}")).await, expected, "{sort}");

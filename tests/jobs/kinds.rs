@@ -195,7 +195,7 @@ async fn a_sweep_follows_its_jobs_and_they_follow_it() {
 
     let wrong = json!({"kind": "sweep", "sweep": {"grid": {"training.gamma": [2.0]}}});
     let problem = expect(server.request(Method::POST, "/v1/jobs").json(&wrong), StatusCode::BAD_REQUEST).await;
-    assert_eq!(problem["field"], "sweep.points[0].training.gamma");
+    assert_eq!(problem["field"], "sweep.grid.training.gamma[0]");
     let mut grpc = server.jobs().await;
     let spec = qedgix::api::convert::structs::to_struct(&with(&json!({"kind": "sweep"})));
     let status = grpc.submit_job(v1::SubmitJobRequest { spec, ..Default::default() }).await.unwrap_err();

@@ -122,10 +122,18 @@ async fn training_ends_early() {
     let id = server.submit(&with(&early)).await;
     let job = server.reaches(&id, "succeeded").await;
     assert_eq!((&job["progress"]["step"], &job["policy"]), (&json!(0), &json!("early:1")));
+    assert_eq!(job["reason"], "stopped early: eval/mean_aoi is at most 1000000000");
+    let result = server.request(Method::GET, &format!("/v1/jobs/{id}/result"));
+    let problem = expect(result, StatusCode::CONFLICT).await;
+    assert_eq!(problem["detail"], format!("job {id} has no result; a training job has one only with publish.alias"));
     assert_eq!(job["stop"], json!({"metric": "eval/mean_aoi", "at_most": 1e9, "at_least": null, "patience": null}));
     let never = with(&json!({"stop": {"metric": "eval/mean_aoi", "at_most": -1, "patience": 100}}));
     let job = server.reaches(&server.submit(&never).await, "succeeded").await;
-    assert_eq!(job["progress"]["step"], job["progress"]["steps"]);
+    assert_eq!((&job["progress"]["step"], &job["reason"]), (&job["progress"]["steps"], &Value::Null));
+    // Iterations of 8 episodes with 10 slots are whole.
+    let rounded = with(&json!({"training": {"steps": 50}}));
+    let job = server.reaches(&server.submit(&rounded).await, "succeeded").await;
+    assert_eq!((&job["progress"]["step"], &job["progress"]["steps"]), (&json!(80), &json!(80)));
 }
 
 #[tokio::test]

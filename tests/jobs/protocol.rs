@@ -74,6 +74,9 @@ async fn repeated_metrics_are_stored_once() {
     assert_eq!(json!(rows), json!([["epsilon", 20, 1.0], ["loss", 20, 0.5], ["loss", 40, 0.25], ["loss", 60, 0.125]]));
     assert_eq!(server.get(&format!("/v1/jobs/{id}")).await["progress"]["step"], 60);
 
+    let unknown = server.request(Method::GET, &format!("/v1/jobs/{id}/metrics?name=los"));
+    let problem = expect(unknown, StatusCode::BAD_REQUEST).await;
+    assert!(problem["detail"].as_str().unwrap().ends_with("did you mean loss?"), "{problem}");
     let page = server.get(&format!("/v1/jobs/{id}/metrics?name=loss&page_size=2")).await;
     let token = page["next_page_token"].as_str().unwrap();
     let rest = server.get(&format!("/v1/jobs/{id}/metrics?name=loss&page_size=2&page_token={token}")).await;

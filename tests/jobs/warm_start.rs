@@ -95,7 +95,7 @@ async fn weights_that_do_not_fit_are_refused_with_the_field_that_differs() {
         assert_eq!(refused(&server, &init(fields.clone())).await, field, "{fields}");
     }
     let sweep = json!({"kind": "sweep", "sweep": {"grid": {"algorithm": ["vdn", "rgcn"]}}});
-    assert_eq!(refused(&server, &init(sweep)).await, "sweep.jobs[1].algorithm");
+    assert_eq!(refused(&server, &init(sweep)).await, "sweep.grid.algorithm[1]");
     let evaluation = json!({"kind": "evaluate", "init": {"policy": "base"}, "evaluation": {"policies": ["sweep"]}});
     assert_eq!(refused(&server, &evaluation).await, "init");
     // A fleet of another size is no obstacle for agents that fly any.
@@ -158,7 +158,9 @@ async fn a_failed_job_is_continued_from_its_snapshot() {
     server.reaches(&id, "failed").await;
 
     let few = server.request(Method::POST, &path).json(&json!({"steps": 1}));
-    assert_eq!(expect(few, StatusCode::BAD_REQUEST).await["field"], "steps");
+    let problem = expect(few, StatusCode::BAD_REQUEST).await;
+    let expected = format!("steps: got 1, expected a number from 380 to {}", TrainConfig::MAX_STEPS - step);
+    assert_eq!(problem["detail"], format!("{expected}: the snapshot of the job is at step 20 of 400"));
     let mut grpc = server.jobs().await;
     let request = v1::ContinueJobRequest { id: id.clone(), steps: 1000, idempotency_key: String::new() };
     let job = grpc.continue_job(request).await.unwrap().into_inner();

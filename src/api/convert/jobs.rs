@@ -241,7 +241,8 @@ impl TryFrom<v1::FinishRequest> for WorkerResult {
 
     fn try_from(request: v1::FinishRequest) -> Result<Self, Invalid> {
         match request.outcome() {
-            v1::Outcome::Succeeded => Ok(Self::Succeeded),
+            v1::Outcome::Succeeded if request.reason.is_empty() => Ok(Self::Succeeded),
+            v1::Outcome::Succeeded => Ok(Self::EndedEarly { reason: request.reason }),
             v1::Outcome::Stopped => Ok(Self::Stopped),
             v1::Outcome::Failed => Ok(Self::Failed { reason: request.reason, permanent: request.permanent }),
             v1::Outcome::Unspecified => {

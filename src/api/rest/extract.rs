@@ -11,14 +11,17 @@ use axum::http::request::Parts;
 use axum::http::{HeaderMap, header};
 use bytes::Bytes;
 use futures::StreamExt;
-use serde::de::DeserializeOwned;
+use jiff::Timestamp;
+use serde::de::{DeserializeOwned, Error as _};
+use serde::{Deserialize, Deserializer};
+use uuid::Uuid;
 
 use crate::api::body::Exchange;
 use crate::api::compression::{Encoding, Inflater};
 pub use crate::api::json::parse;
 pub use crate::api::media_type::{media_type, unsupported};
 use crate::api::offload;
-use crate::invalid::Invalid;
+use crate::invalid::{Invalid, expectation};
 use crate::service::Error;
 
 /// Maximum size of a body, in bytes.
@@ -201,18 +204,55 @@ fn invalid_query(rejection: &QueryRejection, query: &str) -> Invalid {
     type Unreadable = serde_path_to_error::Error<serde::de::value::Error>;
     let unreadable = iter::successors(rejection.source(), |&e| e.source()).find_map(|e| e.downcast_ref::<Unreadable>());
     let named = unreadable.and_then(|e| {
-        let name = e.path().to_string();
-        let (_, value) = query.split('&').filter_map(|pair| pair.split_once('=')).find(|(key, _)| *key == name)?;
-        Some(Invalid::new(name, value, e.inner().to_string()))
+        let (name, message) = (e.path().to_string(), e.inner().to_string());
+        if message.starts_with("unknown field") {
+            return Some(Invalid::unknown_parameter(name, expectation(&message)));
+        }
+        // These belong to the whole query, so only the message names the parameter.
+        let quoted = message.split('`').nth(1);
+        if message.starts_with("missing field") {
+            return Some(Invalid::missing(quoted?, "a value"));
+        }
+        if message.starts_with("duplicate field") {
+            return Some(Invalid::new(quoted?, "two values", "one"));
+        }
+        let (_, value) = query.split('&').map(|pair| pair.split_once('=').unwrap_or((pair, ""))).find(|(key, _)| *key == name)?;
+        Some(Invalid::new(name, value, expected_value(&message)))
     });
     named.unwrap_or_else(|| Invalid::new("query", query, rejection.body_text()))
+}
+
+/// What a parser of the value of a parameter expected.
+fn expected_value(message: &str) -> String {
+    match message {
+        "invalid digit found in string" | "cannot parse integer from empty string" | "number too small to fit in target type" => {
+            "a whole number, 0 or more".to_owned()
+        }
+        "number too large to fit in target type" => "a smaller number".to_owned(),
+        "provided string was not `true` or `false`" => "true or false".to_owned(),
+        _ => expectation(&message),
+    }
+}
+
+/// Reads a parameter that is a time.
+pub fn time<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Timestamp>, D::Error> {
+    let time = String::deserialize(deserializer)?.parse();
+    time.map(Some).map_err(|_| D::Error::custom("expected a time such as 2026-01-31T12:00:00Z"))
+}
+
+/// Reads a parameter that is the id of a job.
+pub fn job_id<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Uuid>, D::Error> {
+    let id = String::deserialize(deserializer)?.parse();
+    id.map(Some).map_err(|_| D::Error::custom("expected the id of a job"))
 }
 
 #[cfg(test)]
 mod tests {
     use std::thread::{self, ThreadId};
 
-    use serde::{Deserialize, Deserializer, de::IgnoredAny};
+    use serde::de::IgnoredAny;
+
+    use crate::store::JobState;
 
     use super::*;
 
@@ -223,6 +263,46 @@ mod tests {
         fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
             IgnoredAny::deserialize(deserializer)?;
             Ok(Self(thread::current().id()))
+        }
+    }
+
+    #[derive(Debug, Deserialize)]
+    #[serde(deny_unknown_fields)]
+    #[expect(dead_code, reason = "only its errors are read")]
+    struct Parameters {
+        state: Option<JobState>,
+        #[serde(default, deserialize_with = "time")]
+        created_after: Option<Timestamp>,
+        #[serde(default, deserialize_with = "job_id")]
+        parent: Option<Uuid>,
+        #[serde(default)]
+        page_size: u32,
+        needed: bool,
+    }
+
+    #[tokio::test]
+    async fn errors_of_queries_are_sentences() {
+        for (query, message) in [
+            ("state=foo", "state: got foo, expected one of queued, running, paused, cancelled, succeeded, failed"),
+            (
+                "state=failled",
+                "state: got failled, expected one of queued, running, paused, cancelled, succeeded, failed; did you mean failed?",
+            ),
+            ("page_size=-1", "page_size: got -1, expected a whole number, 0 or more"),
+            ("page_size=99999999999", "page_size: got 99999999999, expected a smaller number"),
+            ("page_size=1&page_size=2", "page_size: got two values, expected one"),
+            ("created_after=yesterday", "created_after: got yesterday, expected a time such as 2026-01-31T12:00:00Z"),
+            ("parent=nope", "parent: got nope, expected the id of a job"),
+            ("needed=yes", "needed: got yes, expected true or false"),
+            ("state=failed", "needed: missing, expected a value"),
+            (
+                "stat=failed",
+                "stat: unknown parameter, expected one of state, created_after, parent, page_size, needed; did you mean state?",
+            ),
+        ] {
+            let request = Request::get(format!("/?{query}")).body(axum::body::Body::empty()).unwrap();
+            let refused = Query::<Parameters>::from_request_parts(&mut request.into_parts().0, &()).await.unwrap_err();
+            assert_eq!(refused.to_string(), message, "{query}");
         }
     }
 

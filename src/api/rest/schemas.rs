@@ -13,6 +13,7 @@ use utoipa::openapi::schema::Schema;
 use utoipa::{PartialSchema, ToSchema};
 
 use crate::api::config_schemas::schema;
+use crate::jobs::metric_names;
 
 /// Name of a policy or an alias.
 macro_rules! name {
@@ -76,12 +77,23 @@ pub(super) fn label_filter() -> RefOr<Schema> {
 
 /// Order of a list of jobs.
 pub(super) fn job_order() -> RefOr<Schema> {
-    string("^(-?(created|name|(best|last):[A-Za-z0-9_/.-]{1,63}))?$")
+    string(&format!("^(-?(created|name|(best|last):({})))?$", any_metric()))
 }
 
 /// Names of metrics, separated by commas.
 pub(super) fn metric_names() -> RefOr<Schema> {
-    string("^([A-Za-z0-9_/.-]{1,63}(,[A-Za-z0-9_/.-]{1,63}){0,15})?$")
+    let name = any_metric();
+    string(&format!("^(({name})(,({name})){{0,15}})?$"))
+}
+
+/// Name of a metric of training jobs.
+pub(super) fn metric_name() -> RefOr<Schema> {
+    schema(json!({"type": "string", "enum": metric_names::all().collect::<Vec<_>>()}))
+}
+
+/// The names of all metrics of training jobs as alternatives of a pattern; none has a character with another meaning there.
+fn any_metric() -> String {
+    metric_names::all().collect::<Vec<_>>().join("|")
 }
 
 /// Page token of a list of jobs: a row id, after the name or value by which the list is sorted.

@@ -18,10 +18,15 @@ use crate::cli::figures::FigureArgs;
 use crate::cli::output::{errln, outln};
 use crate::cli::rest::{items, query, text};
 use crate::cli::table::text_table;
+use crate::invalid::Invalid;
+use crate::jobs::metric_names;
+use crate::learner::MeanOverSeeds;
 use crate::plot::{Chart, Series, lines};
 
 /// Metrics whose best value is the largest.
 const LARGEST: [&str; 4] = ["eval/coverage", "eval/fairness", "q_tot", "env_steps_per_s"];
+/// Most metrics that a server shows of a job.
+const SHOWN_METRICS: usize = 100;
 /// Most jobs that are compared.
 const MAX_JOBS: usize = 1000;
 
@@ -70,19 +75,12 @@ struct Group {
     differs: BTreeMap<String, Value>,
     seeds: Vec<Option<u64>>,
     jobs: Vec<String>,
-    best: Option<Mean>,
-    last: Option<Mean>,
+    best: Option<MeanOverSeeds>,
+    last: Option<MeanOverSeeds>,
     #[serde(skip)]
     name: String,
     #[serde(skip)]
     curves: Vec<Vec<[f64; 2]>>,
-}
-
-/// A mean with its 95 % interval; none of one value.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-struct Mean {
-    mean: f64,
-    interval: Option<[f64; 2]>,
 }
 
 /// Runs the command.
@@ -97,10 +95,14 @@ pub(super) async fn run(client: &Client, args: CompareArgs, print_json: bool) ->
     if ids.is_empty() || ids.len() > MAX_JOBS {
         bail!("{} jobs; expected 1 to {MAX_JOBS}: ids, or a filter such as --label", ids.len());
     }
+    let mut found = Vec::new();
+    for id in &ids {
+        found.push(client.get(&format!("/v1/jobs/{id}")).await?);
+    }
+    check_metric(&args.metric, &found)?;
     let mut jobs = Vec::new();
-    for id in ids {
-        let job = client.get(&format!("/v1/jobs/{id}")).await?;
-        jobs.push(compared(&job, curve(client, &id, &args.metric).await?, is_largest_best(&args.metric)));
+    for (id, job) in ids.iter().zip(&found) {
+        jobs.push(compared(job, curve(client, id, &args.metric).await?, is_largest_best(&args.metric)));
     }
     let fields = mark_differences(&mut jobs);
     let groups = group(&jobs);
@@ -118,6 +120,17 @@ pub(super) async fn run(client: &Client, args: CompareArgs, print_json: bool) ->
         errln!("curves: {}", figure.display());
     }
     Ok(())
+}
+
+/// Checks that one of the jobs has the metric, unless none of them has any yet.
+fn check_metric(metric: &str, jobs: &[Value]) -> Result<(), Invalid> {
+    let names: BTreeSet<&str> =
+        jobs.iter().filter_map(|job| job["metrics"].as_object()).flat_map(|metrics| metrics.keys().map(String::as_str)).collect();
+    // A job shows so many metrics, and may have more.
+    if names.is_empty() || names.len() >= SHOWN_METRICS || names.contains(metric) {
+        return Ok(());
+    }
+    Err(metric_names::unknown("--metric", metric, names))
 }
 
 /// The same ids, with the jobs of sweeps and experiments in place of these.
@@ -207,8 +220,8 @@ fn group(jobs: &[Compared]) -> Vec<Group> {
             differs: first.differs.clone(),
             seeds: members.iter().map(|job| job.seed).collect(),
             jobs: members.iter().map(|job| job.id.clone()).collect(),
-            best: mean(&values(|job| job.best)),
-            last: mean(&values(|job| job.last)),
+            best: MeanOverSeeds::of(&values(|job| job.best)),
+            last: MeanOverSeeds::of(&values(|job| job.last)),
             name,
             curves: members.iter().map(|job| job.curve.clone()).filter(|curve| !curve.is_empty()).collect(),
         }
@@ -291,28 +304,6 @@ fn last_word(field: &str) -> &str {
     field.rsplit('.').next().unwrap_or(field)
 }
 
-/// The mean of values with its 95 % interval; none without values.
-fn mean(values: &[f64]) -> Option<Mean> {
-    let n = values.len();
-    let mean = (n > 0).then(|| values.iter().sum::<f64>() / n as f64)?;
-    let interval = (n > 1).then(|| {
-        let variance = values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / (n - 1) as f64;
-        let half = quantile(n - 1) * (variance / n as f64).sqrt();
-        [mean - half, mean + half]
-    });
-    Some(Mean { mean, interval })
-}
-
-/// The 0.975 quantile of Student's t distribution.
-fn quantile(degrees: usize) -> f64 {
-    const TABLE: [f64; 30] = [
-        12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160, 2.145, 2.131, 2.120, 2.110,
-        2.101, 2.093, 2.086, 2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042,
-    ];
-    // Beyond the table, the first terms of the expansion around the normal distribution.
-    TABLE.get(degrees.saturating_sub(1)).copied().unwrap_or_else(|| 1.96 + 2.37 / degrees as f64)
-}
-
 fn cell(value: Option<[f64; 2]>, index: usize) -> String {
     value.map_or_else(|| "-".to_owned(), |value| if index == 0 { format!("{:.0}", value[0]) } else { format!("{:.2}", value[1]) })
 }
@@ -335,7 +326,7 @@ fn job_table(metric: &str, fields: &[String], jobs: &[Compared]) -> String {
 fn group_table(metric: &str, fields: &[String], groups: &[Group]) -> String {
     let mut header = fields.to_vec();
     header.extend(["seeds".to_owned(), format!("{metric}: best"), "95 %".to_owned(), "last".to_owned(), "95 %".to_owned()]);
-    let cells = |mean: Option<Mean>| {
+    let cells = |mean: Option<MeanOverSeeds>| {
         let interval = mean.and_then(|mean| mean.interval).map(|[low, high]| format!("{low:.2} to {high:.2}"));
         [mean.map_or_else(|| "-".to_owned(), |mean| format!("{:.2}", mean.mean)), interval.unwrap_or_else(|| "-".to_owned())]
     };
@@ -390,6 +381,14 @@ mod tests {
     }
 
     #[test]
+    fn a_metric_that_no_job_has_is_refused() {
+        let jobs = [json!({"metrics": {"eval/mean_aoi": {}, "loss": {}}}), json!({"metrics": {}})];
+        assert!(check_metric("loss", &jobs).is_ok() && check_metric("los", &jobs[1..]).is_ok());
+        let refused = check_metric("los", &jobs).unwrap_err().to_string();
+        assert_eq!(refused, "--metric: got \"los\", expected one of eval/mean_aoi, loss; did you mean loss?");
+    }
+
+    #[test]
     fn jobs_that_differ_in_the_seed_are_one_group() {
         let mut jobs = vec![
             job(1, 0.1, &[[0.0, 9.0], [50.0, 1.0], [100.0, 4.0]]),
@@ -405,7 +404,7 @@ mod tests {
         let best = groups[0].best.unwrap();
         let [low, high] = best.interval.unwrap();
         assert!((best.mean - 2.0).abs() < 1e-12 && (low + 10.706).abs() < 1e-9 && (high - 14.706).abs() < 1e-9, "{best:?}");
-        assert_eq!(groups[1].best, Some(Mean { mean: 8.0, interval: None }));
+        assert_eq!(groups[1].best, Some(MeanOverSeeds { mean: 8.0, interval: None }));
         let chart = chart("eval/mean_aoi", &groups);
         assert_eq!(chart.series[0].points, [[0.0, 9.0], [50.0, 2.0]]);
         assert_eq!(chart.series[0].band.as_ref().unwrap()[1], [1.0, 3.0]);
@@ -447,12 +446,5 @@ mod tests {
         assert_eq!(legend(jobs.collect()), expected);
         let seeds = vec![one(1, Some("x"), 0.1), one(2, Some("y"), 0.1)];
         assert_eq!(legend(seeds), ["qmix"]);
-    }
-
-    #[test]
-    fn the_quantile_falls_to_that_of_the_normal_distribution() {
-        let all: Vec<f64> = (1..500).map(quantile).collect();
-        assert!(all.windows(2).all(|pair| pair[1] <= pair[0]), "{all:?}");
-        assert!((quantile(100) - 1.984).abs() < 1e-3 && (quantile(1_000_000) - 1.96).abs() < 1e-3);
     }
 }

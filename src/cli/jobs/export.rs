@@ -108,7 +108,35 @@ fn config(job: &Value) -> Value {
             config.insert("init".into(), json!({source: job["init"][source]}));
         }
     }
+    if job["evaluation"].is_object() {
+        let (evaluation, environment) = evaluation(&job["evaluation"]);
+        config.extend([("evaluation".into(), evaluation), ("environment".into(), environment)]);
+    }
+    if job["sweep"].is_object() {
+        config.extend(sweep(&job["sweep"]));
+    }
     config.into()
+}
+
+/// The request of an evaluation, and its environment.
+fn evaluation(stored: &Value) -> (Value, Value) {
+    let mut request = Map::new();
+    for field in ["policies", "layouts", "episodes", "plan"] {
+        request.insert(field.into(), stored[field].clone());
+    }
+    for field in ["lose", "position_noise"] {
+        request.insert(field.into(), stored["disturbance"][field].clone());
+    }
+    request.retain(|_, value| !value.is_null());
+    (request.into(), stored["environment"].clone())
+}
+
+/// The fields of the request of a sweep: its combinations, and what all of its jobs share. Older servers did not store that.
+fn sweep(stored: &Value) -> Map<String, Value> {
+    let mut request: Map<_, _> = stored["base"].as_object().cloned().unwrap_or_default();
+    request.retain(|_, value| !value.is_null());
+    request.insert("sweep".into(), json!({"list": stored["points"], "seeds": stored["seeds"]}));
+    request
 }
 
 /// The attempts of a job in the order of their begin.

@@ -181,9 +181,9 @@ fn done(job: &Value) -> String {
     (step.saturating_mul(100)).checked_div(steps).map_or_else(|| "-".to_owned(), |share| format!("{} %", share.min(100)))
 }
 
-/// Why the job waits or has failed.
+/// Why the job waits, has failed or ended early.
 fn why(job: &Value) -> String {
-    const LONGEST: usize = 48;
+    const LONGEST: usize = 72;
     let reason = job["waiting"]["reason"].as_str().or(job["reason"].as_str()).unwrap_or("");
     let line = reason.lines().next().unwrap_or_default();
     if line.chars().count() <= LONGEST { line.to_owned() } else { line.chars().take(LONGEST).chain("...".chars()).collect() }

@@ -177,8 +177,9 @@ impl Run {
             file.map(|file| (Guarded::new(&path), file))
         });
         errln!("{}", serde_json::to_string(trainer.config())?);
+        tell_rounding(trainer.config());
         Ok(Self {
-            bar: progress::bar(trainer.config().training.steps, "steps"),
+            bar: progress::bar(trainer.config().total_steps(), "steps"),
             out: Guarded::new(&out),
             snapshot: Guarded::new(&snapshot),
             curve: curve.transpose()?,
@@ -240,7 +241,7 @@ impl Run {
         let training = &self.trainer.config().training;
         match event {
             Event::Iteration(i) => {
-                self.bar.set_position(i.env_steps.min(training.steps));
+                self.bar.set_position(i.env_steps);
                 self.bar.set_message(format!("epsilon {:.2}, train {:.1}", i.epsilon, i.mean_aoi));
             }
             Event::Evaluation(Evaluation { env_steps, metrics }) => {
@@ -314,6 +315,17 @@ impl Run {
             let _ = write!(command, " --metrics {}", file.path.display());
         }
         Ok(Exit::new(code, format!("stopped at step {step}; to continue: {command}")))
+    }
+}
+
+/// Says that more steps are trained than were asked for, because iterations are whole.
+fn tell_rounding(config: &TrainConfig) {
+    let (steps, total) = (config.training.steps, config.total_steps());
+    if steps < total {
+        let (envs, slots) = (config.training.envs, config.environment.slots);
+        let iterations = total / (envs * slots) as u64;
+        let plural = if iterations == 1 { "" } else { "s" };
+        errln!("{steps} steps are rounded up to {total}: {iterations} iteration{plural} of {envs} environments x {slots} slots");
     }
 }
 

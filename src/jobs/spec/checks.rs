@@ -2,8 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use crate::invalid::{Invalid, in_range};
-use crate::store::{EarlyStop, JobId, JobLimits, is_metric_name};
+use crate::invalid::{Invalid, count_in_range, in_range};
+use crate::jobs::metric_names;
+use crate::store::{EarlyStop, JobId, JobLimits};
 
 /// Least and most memory of a job that can be asked for, in bytes: 1 MiB and 1 PiB.
 pub(super) const MIN_MEMORY: u64 = 1 << 20;
@@ -26,7 +27,7 @@ pub(super) fn resolve_limits(
 }
 
 pub(super) fn resolve_dependencies(ids: Vec<String>) -> Result<Vec<JobId>, Invalid> {
-    in_range("after", ids.len(), 0..=MAX_AFTER)?;
+    count_in_range("after", ids.len(), 0..=MAX_AFTER, "jobs")?;
     let mut jobs = Vec::new();
     for (i, id) in ids.iter().enumerate() {
         let job = JobId::parse(id).ok_or_else(|| Invalid::new(format!("after[{i}]"), format!("{id:?}"), "the id of a job"))?;
@@ -40,8 +41,8 @@ pub(super) fn resolve_dependencies(ids: Vec<String>) -> Result<Vec<JobId>, Inval
 
 pub(super) fn check_stop(stop: &EarlyStop) -> Result<(), Invalid> {
     let EarlyStop { metric, at_most, at_least, patience } = stop;
-    if !is_metric_name(metric) {
-        return Err(Invalid::new("stop.metric", format!("{metric:?}"), "the name of a metric, such as eval/mean_aoi"));
+    if !metric_names::is_known(metric) {
+        return Err(metric_names::unknown("stop.metric", metric, metric_names::all()));
     }
     for (field, limit) in [("stop.at_most", at_most), ("stop.at_least", at_least)] {
         if let Some(limit) = limit.filter(|limit| !limit.is_finite()) {

@@ -351,6 +351,7 @@ mod tests {
             (json!({"after": [null]}), "after[0]", true),
             (json!({"stop": {"metric": "loss"}}), "stop.at_most", false),
             (json!({"stop": {"metric": "a b", "patience": 1}}), "stop.metric", false),
+            (json!({"stop": {"metric": "eval/mean_ao", "patience": 1}}), "stop.metric", false),
             (json!({"stop": {"metric": "loss", "patience": 0}}), "stop.patience", false),
             (json!({"stop": {"metric": "loss", "atmost": 0}}), "stop.atmost", true),
             (json!({"notes": "a\u{0}b"}), "notes", false),
@@ -360,6 +361,12 @@ mod tests {
             let e = resolve(document.clone()).expect_err("must be refused");
             assert_eq!((e.field.as_str(), e.is_schema()), (field, schema), "{document}: {e}");
         }
+    }
+
+    #[test]
+    fn the_nearest_metric_is_suggested() {
+        let refused = resolve(json!({"stop": {"metric": "eval/mean_ao", "patience": 1}})).unwrap_err().to_string();
+        assert!(refused.ends_with("did you mean eval/mean_aoi?"), "{refused}");
     }
 
     #[test]

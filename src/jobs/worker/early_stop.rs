@@ -23,11 +23,12 @@ impl StopRule {
         stop
     }
 
-    /// Whether training ends with this value. A value that is reported again after training has resumed counts once.
-    pub(super) fn observes(&mut self, name: &str, step: u64, value: f64) -> bool {
+    /// Why training ends with this value; `None`: it goes on. A value that is reported again after training has resumed counts
+    /// once.
+    pub(super) fn observes(&mut self, name: &str, step: u64, value: f64) -> Option<String> {
         let EarlyStop { metric, at_most, at_least, patience } = &self.rule;
         if name != metric {
-            return false;
+            return None;
         }
         if self.last.is_none_or(|last| step > last) {
             self.last = Some(step);
@@ -38,9 +39,13 @@ impl StopRule {
                 self.since += 1;
             }
         }
-        at_most.is_some_and(|limit| value <= limit)
-            || at_least.is_some_and(|limit| value >= limit)
-            || patience.is_some_and(|patience| self.since >= patience)
+        let at_most = at_most.filter(|limit| value <= *limit).map(|limit| format!("is at most {limit}"));
+        let at_least = at_least.filter(|limit| value >= *limit).map(|limit| format!("is at least {limit}"));
+        let patience = patience.filter(|patience| self.since >= *patience).map(|patience| {
+            let plural = if patience == 1 { "" } else { "s" };
+            format!("was not better for {patience} value{plural}")
+        });
+        at_most.or(at_least).or(patience).map(|why| format!("stopped early: {metric} {why}"))
     }
 }
 
@@ -55,14 +60,17 @@ mod tests {
     #[test]
     fn limits_and_patience_end_training() {
         let mut stop = StopRule::new(EarlyStop { at_most: Some(5.0), ..rule("loss") }, &[]);
-        assert!(!stop.observes("loss", 1, 6.0) && !stop.observes("q_tot", 1, 1.0) && !stop.observes("loss", 2, f64::NAN));
-        assert!(stop.observes("loss", 3, 5.0));
+        let values = [("loss", 1, 6.0), ("q_tot", 1, 1.0), ("loss", 2, f64::NAN)];
+        assert!(values.into_iter().all(|(name, step, value)| stop.observes(name, step, value).is_none()));
+        assert_eq!(stop.observes("loss", 3, 5.0).as_deref(), Some("stopped early: loss is at most 5"));
         let mut stop = StopRule::new(EarlyStop { at_least: Some(0.5), ..rule("eval/coverage") }, &[]);
-        assert!(!stop.observes("eval/coverage", 1, 0.4) && stop.observes("eval/coverage", 2, 0.5));
+        assert_eq!(stop.observes("eval/coverage", 1, 0.4), None);
+        assert_eq!(stop.observes("eval/coverage", 2, 0.5).as_deref(), Some("stopped early: eval/coverage is at least 0.5"));
         let mut stop = StopRule::new(EarlyStop { patience: Some(2), ..rule("eval/coverage") }, &[]);
         let values = [0.1, 0.3, 0.2, 0.3];
-        let ends: Vec<bool> = (1..).zip(values).map(|(step, value)| stop.observes("eval/coverage", step, value)).collect();
-        assert_eq!(ends, [false, false, false, true]);
+        let ends: Vec<_> = (1..).zip(values).map(|(step, value)| stop.observes("eval/coverage", step, value)).collect();
+        let reason = "stopped early: eval/coverage was not better for 2 values".to_owned();
+        assert_eq!(ends, [None, None, None, Some(reason)]);
     }
 
     #[test]
@@ -73,7 +81,7 @@ mod tests {
             // The value at the step of the snapshot may be computed again.
             for first in [resumed_at.max(1) - 1, resumed_at] {
                 let mut stop = StopRule::new(limit.clone(), &values[..resumed_at]);
-                let end = values[first..].iter().find(|(step, value)| stop.observes("loss", *step, *value));
+                let end = values[first..].iter().find(|(step, value)| stop.observes("loss", *step, *value).is_some());
                 assert_eq!(end.map(|(step, _)| *step), Some(if first == 4 { 50 } else { 40 }));
             }
         }

@@ -187,6 +187,7 @@ pub async fn run(assignment: Assignment) -> Result<(), Error> {
     };
     let (outcome, reason, permanent) = match result {
         WorkerResult::Succeeded => (v1::Outcome::Succeeded, String::new(), false),
+        WorkerResult::EndedEarly { reason } => (v1::Outcome::Succeeded, reason, false),
         WorkerResult::Stopped => (v1::Outcome::Stopped, String::new(), false),
         WorkerResult::Failed { reason, permanent } => (v1::Outcome::Failed, reason, permanent),
     };

@@ -13,6 +13,7 @@ use crate::checkpoint::{self, Checkpoint};
 use crate::invalid::Invalid;
 use crate::jobs::Directive;
 use crate::jobs::experiment_jobs::RunReport;
+use crate::jobs::metric_names::SPEED;
 use crate::learner::{Evaluation, Event, TrainConfig, Trainer};
 use crate::store::WorkerResult;
 use crate::wire::v1::CheckpointKind;
@@ -138,7 +139,7 @@ fn try_train(
     while let Some(event) = trainer.next() {
         let rows = curve.rows(&event);
         let ends =
-            stop_rule.as_mut().is_some_and(|rule| rows.iter().any(|&(step, name, value)| rule.observes(name, step, value)));
+            stop_rule.as_mut().and_then(|rule| rows.iter().find_map(|&(step, name, value)| rule.observes(name, step, value)));
         if !rows.is_empty() {
             reports.push(Report::Metrics { step: trainer.env_steps(), rows });
         }
@@ -158,11 +159,11 @@ fn try_train(
             }
             _ => {}
         }
-        if ends {
+        if let Some(reason) = ends {
             tracing::info!(step = trainer.env_steps(), "training ends early");
             let last = trainer.checkpoint()?;
             reports.checkpoint(CheckpointKind::Last, &last);
-            return Ok((WorkerResult::Succeeded, trained(&trainer, Some(last), begun)?));
+            return Ok((WorkerResult::EndedEarly { reason }, trained(&trainer, Some(last), begun)?));
         }
         if last_snapshot.elapsed() >= snapshot_every && !reports.snapshot_pending.load(Ordering::Acquire) {
             reports.snapshot(&trainer);
@@ -234,7 +235,7 @@ impl CurveSampler {
             }
             let now = Instant::now();
             let seconds = (now - self.last_point.1).as_secs_f64();
-            rows.push((done.env_steps, "env_steps_per_s", (done.env_steps - self.last_point.0) as f64 / seconds));
+            rows.push((done.env_steps, SPEED, (done.env_steps - self.last_point.0) as f64 / seconds));
             self.last_point = (done.env_steps, now);
         }
         rows

@@ -118,8 +118,16 @@ pub(super) async fn continued(
             step: snapshot.step,
             sha256: snapshot.sha256.clone(),
         };
-        let steps = snapshot.step.saturating_add(request.steps);
-        in_range("steps", steps, config.training.steps..=most)?;
+        let least = config.training.steps.saturating_sub(snapshot.step).max(1);
+        let room = most.saturating_sub(snapshot.step);
+        if !(least..=room).contains(&request.steps) {
+            let expected = format!(
+                "a number from {least} to {room}: the snapshot of the job is at step {} of {}",
+                snapshot.step, config.training.steps
+            );
+            return Err(Invalid::new("steps", request.steps, expected).into());
+        }
+        let steps = snapshot.step + request.steps;
         let training = Training { steps, ..config.training.clone() };
         let config = TrainConfig { training, ..config };
         let spec = JobSpec { init: Some(init), limits: enough_memory(&spec, &config), config: Some(config), ..spec };

@@ -6,6 +6,7 @@ use jiff::Timestamp;
 
 use super::view::{JobView, views};
 use crate::invalid::{Invalid, in_range};
+use crate::jobs::metric_names;
 use crate::jobs::spec::check_name;
 use crate::service::keys::Caller;
 use crate::service::paging::{MAX_BYTES, parse_number};
@@ -54,6 +55,12 @@ pub async fn list(app: &App, caller: &Caller, request: ListRequest, page: &PageR
     let limit = page.usual_limit()?;
     let order = parse_order(&request.sort)?;
     let metrics = parse_metrics(&request.metrics)?;
+    for name in &metrics {
+        check_exists(app, "metrics", name).await?;
+    }
+    if let JobSort::Best(name) | JobSort::Last(name) = &order.by {
+        check_exists(app, "sort", name).await?;
+    }
     let after = page.parse_token(|token| parse_cursor(&order.by, token))?;
     let mut filter = request.filter()?;
     filter.owner = caller.sees().and_then(Owner::id).map(str::to_owned);
@@ -107,6 +114,14 @@ fn parse_labels(list: &str) -> Result<BTreeMap<String, Option<String>>, Invalid>
 fn parse_metrics(list: &str) -> Result<Vec<String>, Invalid> {
     in_range("metrics", items(list).count(), 0..=MAX_METRICS)?;
     items(list).map(|name| check_metric("metrics", name)).collect()
+}
+
+/// Checks that jobs report a metric of this name, or have done so under another version.
+async fn check_exists(app: &App, field: &str, name: &str) -> Result<(), Error> {
+    if metric_names::is_known(name) || app.store.has_metric(name).await? {
+        return Ok(());
+    }
+    Err(metric_names::unknown(field, name, metric_names::all()).into())
 }
 
 fn check_metric(field: &str, name: &str) -> Result<String, Invalid> {

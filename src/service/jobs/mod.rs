@@ -6,15 +6,16 @@ mod init;
 mod listing;
 mod logs;
 mod publication;
+mod results;
 mod retention;
 mod sweep;
 mod view;
 
 use uuid::Uuid;
 
-pub use evaluation::result;
 pub use listing::{ListRequest, list};
 pub use logs::{LogLines, follow_logs, logs};
+pub use results::result;
 pub use retention::delete_old;
 pub use view::{JobView, Waiting};
 
@@ -25,6 +26,7 @@ use super::{App, Error, Page, PageRequest};
 use crate::error_code::ErrorCode;
 use crate::invalid::Invalid;
 use crate::jobs::memory::check as check_memory;
+use crate::jobs::metric_names;
 use crate::jobs::spec::{self, ContinueRequest, EditRequest, JobRequest};
 use crate::store::{
     ActionResult, Beginning, Checkpoint, Job, JobAction, JobId, JobKind, JobSpec, JobState, MetricCursor, MetricRow, NewJob,
@@ -252,7 +254,8 @@ pub async fn change(app: &App, caller: &Caller, id: &str, action: JobAction) -> 
 /// Metrics of a job in order of name and step, 10 000 rows to a page by default.
 ///
 /// # Errors
-/// [`Error::NotFound`]: there is no such job. [`Error::Invalid`]: the page size is over 100 000, or the token is invalid.
+/// [`Error::NotFound`]: there is no such job. [`Error::Invalid`]: the page size is over 100 000, the token is invalid, or the job has no
+/// metric of this name and training jobs report none.
 pub async fn metrics(
     app: &App,
     caller: &Caller,
@@ -263,6 +266,12 @@ pub async fn metrics(
     let (limit, after) = (page.limit(10_000, 100_000)?, page.parse_token(parse_metric_cursor)?);
     let job = get(app, caller, id).await?;
     let mut rows = app.store.metrics(job.id, name, after.as_ref(), limit as u32 + 1).await?;
+    if let Some(name) = name.filter(|name| rows.is_empty() && after.is_none() && !metric_names::is_known(name)) {
+        let reported = app.store.job_metric_summaries(job.row_id, view::MAX_METRICS).await?;
+        let reported: Vec<&str> = reported.iter().map(|(name, _)| name.as_str()).collect();
+        let known = if reported.is_empty() { metric_names::all().collect() } else { reported };
+        return Err(metric_names::unknown("name", name, known).into());
+    }
     let more = rows.len() > limit;
     rows.truncate(limit);
     Ok(Page::new(rows, more, |row| format!("{}@{}", row.name, row.step)))

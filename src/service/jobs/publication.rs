@@ -16,7 +16,8 @@ pub(super) async fn check(app: &App, caller: &Caller, spec: &JobSpec) -> Result<
     let rule = spec.publish.clone().unwrap_or_default();
     let name = rule.policy.as_ref().or(spec.name.as_ref());
     if let Some(name) = name {
-        policies::check_publishable(name)?;
+        let field = if rule.policy.is_some() { "publish.policy" } else { "name" };
+        policies::check_publishable(name).map_err(|e| Invalid { field: field.into(), ..e })?;
         policies::check_owner(app, &Publisher::from(caller), name).await?;
     }
     let Some(alias) = &rule.alias else { return Ok(()) };

@@ -2,17 +2,16 @@
 
 use std::collections::BTreeMap;
 
-use rand::RngExt;
 use serde_json::{Value, json};
 use uuid::Uuid;
 
 use super::init::InitialWeights;
 use super::{check_dependency, publication};
+use crate::invalid::Invalid;
 use crate::jobs::memory::check as check_memory;
 use crate::jobs::spec::JobRequest;
 use crate::jobs::{experiment_jobs, sweep, sweep_jobs};
-use crate::learner::Interval;
-use crate::rng;
+use crate::learner::MeanOverSeeds;
 use crate::service::keys::Caller;
 use crate::service::policies::Publisher;
 use crate::service::{App, Error};
@@ -36,16 +35,21 @@ pub(super) async fn submit(
         Some(init) => Some(InitialWeights::find(app, caller, init).await?),
         None => None,
     };
-    let budget = app.scheduler.cpu_budget();
-    let (mut sweep, jobs) = match request.kind {
-        Some(JobKind::Experiment) => (experiment_jobs::resolve(request, budget)?, "experiment.runs"),
-        _ => (sweep_jobs::resolve(request, budget)?, "sweep.jobs"),
+    let (budget, varied) = (app.scheduler.cpu_budget(), request.sweep.clone());
+    let mut sweep = match request.kind {
+        Some(JobKind::Experiment) => experiment_jobs::resolve(request, budget)?,
+        _ => sweep_jobs::resolve(request, budget)?,
     };
+    let points = sweep.spec.sweep.as_ref().and_then(|sweep| sweep["points"].as_array()).cloned().unwrap_or_default();
     app.webhooks.check(&sweep.spec.webhooks)?;
     let memory = app.scheduler.config().memory;
     let mut beginning = None;
     for (i, job) in sweep.jobs.iter_mut().enumerate() {
-        let at = |e: crate::invalid::Invalid| e.with_prefix(&format!("{jobs}[{i}]"));
+        let point = job.point.map_or(i, |point| point as usize);
+        let at = |e: Invalid| match (&varied, points.get(point).and_then(Value::as_object)) {
+            (Some(varied), Some(fields)) => varied.named_as_requested(point, fields, e),
+            _ => e.with_prefix(&format!("experiment.runs[{i}]")),
+        };
         if let Some(weights) = &weights {
             beginning = Some(weights.put_into(job).map_err(at)?);
         }
@@ -54,6 +58,8 @@ pub(super) async fn submit(
         }
         publication::check(app, caller, job).await?;
     }
+    // All jobs begin with the same weights.
+    sweep.spec.init = sweep.jobs.first().and_then(|job| job.init.clone());
     for (i, needed) in sweep.spec.after.iter().enumerate() {
         check_dependency(app, caller, i, *needed).await?;
     }
@@ -97,21 +103,20 @@ pub(super) async fn result(app: &App, sweep: &Job) -> Result<Value, Error> {
     Ok(json!({"jobs": jobs.len(), "states": states, "points": points.collect::<Vec<_>>()}))
 }
 
-/// The best and the last value of a metric, as means with 95 % bootstrap intervals over the jobs that have succeeded.
+/// The best and the last value of a metric, as means with 95 % intervals over the jobs that have succeeded, as `qedgix jobs compare`
+/// has them.
 fn means(name: &str, jobs: &[&Job], metrics: &BTreeMap<i64, Vec<(String, MetricSummary)>>) -> Option<Value> {
     let done = jobs.iter().filter(|job| job.state == JobState::Succeeded);
     let summaries: Vec<MetricSummary> = done
         .filter_map(|job| metrics.get(&job.row_id)?.iter().find(|(metric, _)| metric == name).map(|(_, summary)| *summary))
         .collect();
-    let interval = |values: Vec<f64>| (!values.is_empty()).then(|| interval(&values));
-    let best = interval(summaries.iter().filter_map(|summary| summary.best).collect());
-    let last = interval(summaries.iter().filter_map(|summary| summary.last).collect());
+    let mean = |values: Vec<f64>| {
+        MeanOverSeeds::of(&values).map(|MeanOverSeeds { mean, interval }| {
+            let [low, high] = [0, 1].map(|end| interval.map(|interval| interval[end]));
+            json!({"mean": mean, "low": low, "high": high})
+        })
+    };
+    let best = mean(summaries.iter().filter_map(|summary| summary.best).collect());
+    let last = mean(summaries.iter().filter_map(|summary| summary.last).collect());
     (best.is_some() || last.is_some()).then(|| json!({"seeds": summaries.len(), "best": best, "last": last}))
-}
-
-fn interval(values: &[f64]) -> Interval {
-    let n = values.len();
-    let mean = values.iter().sum::<f64>() / n as f64;
-    let mut draw = rng::stream(0, "bootstrap", 0);
-    Interval::of_resamples(mean, || (0..n).map(|_| values[draw.random_range(0..n)]).sum::<f64>() / n as f64)
 }

@@ -10,7 +10,7 @@ use crate::service::{App, Error};
 use crate::store::{Job, JobSpec, JobState, ListedJob, MetricSummary, UnreadableSpec};
 
 /// Most metrics that a single job shows. Lists show those that are asked for.
-const MAX_METRICS: u32 = 100;
+pub(super) const MAX_METRICS: u32 = 100;
 
 /// A job, and what is known of it at the moment.
 #[derive(Clone, Debug, PartialEq)]

@@ -6,6 +6,7 @@ use super::aliases::check_alias;
 use crate::jobs::worker::RivalComparison;
 use crate::policy::baselines;
 use crate::serving::{PolicySpec, Registry};
+use crate::store::WorkerResult;
 
 /// The move of an alias when a job succeeds.
 #[derive(Clone, Debug)]
@@ -20,6 +21,8 @@ pub(in crate::service) struct Promotion {
 
 /// What a job that succeeds leaves besides its policy.
 pub(in crate::service) struct JobResult<'a> {
+    /// How its last attempt ended.
+    pub ended: &'a WorkerResult,
     /// The move of an alias, which is then its result.
     pub promotion: Option<Promotion>,
     /// The result as JSON.

@@ -15,7 +15,7 @@ use crate::service::keys::{Caller, Scope};
 use crate::service::{App, Error, checkpoints};
 use crate::serving::bundled::BUNDLED;
 use crate::serving::{PolicyRef, PolicySpec, Registry, VersionSelector, check_name};
-use crate::store::{EndedAttempt, Job, Lease, NewPolicyVersion, PublishedPolicy, WorkerResult};
+use crate::store::{EndedAttempt, Job, Lease, NewPolicyVersion, PublishedPolicy};
 
 /// The checkpoint to publish.
 #[derive(Debug)]
@@ -138,14 +138,15 @@ pub(in crate::service) async fn publish_and_end(
 ) -> Result<Option<Job>, Error> {
     let (max_attempts, now) = (app.scheduler.config().max_attempts, app.clock.now());
     let name = version.name.clone();
-    let (promotion, document) = (result.promotion, result.document.map(str::to_owned));
+    let JobResult { ended, promotion, document } = result;
+    let (result, document) = (ended.clone(), document.map(str::to_owned));
     let job = one_at_a_time(app, async move |PolicyStores { store, registry }| {
         // Policies do not change between the decision and the transaction.
         let decision = promotion.as_ref().map(|p| (p, p.decide(&registry, &version.name, &version.parsed.digest)));
         let alias = decision.as_ref().filter(|(_, decision)| decision.is_ok()).map(|(promotion, _)| promotion.alias.as_str());
         let document = decision.as_ref().map(|(promotion, decision)| promotion.document(decision).to_string()).or(document);
         let (new, document) = (version.row(now, alias), document.as_deref());
-        let ended = EndedAttempt { lease, result: &WorkerResult::Succeeded, publish: Some(new), document, max_attempts, now };
+        let ended = EndedAttempt { lease, result: &result, publish: Some(new), document, max_attempts, now };
         let Some((job, published)) = store.end_attempt(ended).await? else { return Ok(None) };
         if let Some(published) = published {
             version.register(&registry, published, alias);

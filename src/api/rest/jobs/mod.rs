@@ -16,7 +16,7 @@ use utoipa::{IntoParams, ToSchema};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::extract::{Json, Path, Query};
+use super::extract::{self, Json, Path, Query};
 use super::openapi::{BadBody, BadRequest, Conflict, Draining, NotFound};
 use super::schemas;
 use crate::api::errors::log_internal;
@@ -127,12 +127,15 @@ struct ListQuery {
     #[param(schema_with = schemas::label_filter, required = false, example = "team=a,urgent")]
     labels: String,
     /// Only jobs that the job with this id has made.
+    #[serde(default, deserialize_with = "extract::job_id")]
     #[param(nullable = false)]
     parent: Option<uuid::Uuid>,
     /// Only jobs that were submitted at or after this time.
+    #[serde(default, deserialize_with = "extract::time")]
     #[param(nullable = false, example = "2026-01-31T00:00:00Z")]
     created_after: Option<Timestamp>,
     /// Only jobs that were submitted before this time.
+    #[serde(default, deserialize_with = "extract::time")]
     #[param(nullable = false, example = "2026-02-28T00:00:00Z")]
     created_before: Option<Timestamp>,
     /// `created`, `name`, `best:METRIC` or `last:METRIC`, after `-` in descending order; default: `-created`. Jobs without the name
@@ -303,7 +306,7 @@ enum Format {
 #[into_params(parameter_in = Query)]
 struct MetricsQuery {
     /// Only this metric.
-    #[param(nullable = false, example = "eval/mean_aoi")]
+    #[param(schema_with = schemas::metric_name, required = false, example = "eval/mean_aoi")]
     name: Option<String>,
     #[serde(default)]
     #[param(inline)]

@@ -252,7 +252,7 @@ pub(super) struct Sweep {
     #[schema(schema_with = grid)]
     grid: Option<Map<String, Value>>,
     /// The combinations themselves.
-    #[schema(value_type = Option<Vec<Object>>, max_items = 500)]
+    #[schema(value_type = Option<Vec<Object>>, min_items = 1, max_items = 500)]
     list: Option<Vec<Map<String, Value>>>,
     /// Combinations that are drawn.
     random: Option<RandomSweep>,
@@ -289,7 +289,9 @@ impl From<Sweep> for SweepRequest {
 }
 
 fn grid() -> RefOr<Schema> {
-    schema(json!({"type": ["object", "null"], "additionalProperties": {"type": "array", "minItems": 1}}))
+    schema(
+        json!({"type": ["object", "null"], "minProperties": 1, "additionalProperties": {"type": "array", "minItems": 1, "uniqueItems": true}}),
+    )
 }
 
 /// Policies to compare on a frozen list of layouts, as `qedgix evaluate` does.
@@ -360,7 +362,7 @@ fn layout_lists() -> RefOr<Schema> {
 #[serde(deny_unknown_fields, remote = "Self")]
 pub(super) struct EarlyStop {
     /// The metric that is observed.
-    #[schema(pattern = "^[A-Za-z0-9_/.-]{1,63}$", example = "eval/mean_aoi")]
+    #[schema(schema_with = schemas::metric_name)]
     metric: String,
     /// A value is at most this.
     at_most: Option<f64>,

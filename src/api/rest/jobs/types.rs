@@ -27,7 +27,7 @@ pub(super) struct JobSummary {
     /// Pending action of a running job; null if there is none.
     #[schema(required = true)]
     wanted: Option<PendingAction>,
-    /// Why the job failed, or why its last attempt ended.
+    /// Why the job failed, why its training ended early, or why its last attempt ended.
     #[schema(required = true)]
     reason: Option<String>,
     progress: Progress,
@@ -128,7 +128,7 @@ pub(super) struct UnreadableSpec {
 pub(in crate::api::rest) struct Progress {
     /// Environment steps done.
     step: u64,
-    /// Environment steps to do.
+    /// Environment steps to do, in whole iterations.
     steps: u64,
     /// Environment steps per second; null if they were not measured, or the job does not run.
     #[schema(required = true)]
@@ -159,7 +159,7 @@ pub(super) struct Job {
     timeout: Option<u64>,
     /// Seconds between a failed attempt and the next one.
     backoff: u64,
-    /// Most memory of the worker in bytes; null: no limit.
+    /// Most memory of the worker in bytes; null: no limit, or, of a sweep or an experiment, that of each of its jobs.
     #[schema(required = true)]
     memory: Option<u64>,
     /// URLs to which the server sends a message when the job ends.
@@ -184,7 +184,8 @@ pub(super) struct Job {
     /// What a job of the kind `evaluate` compares; null for other kinds.
     #[schema(value_type = Option<Object>, required = true)]
     evaluation: Option<Value>,
-    /// The combinations and the number of seeds of a sweep; null for other kinds.
+    /// Of a sweep, the combinations (`points`), the number of `seeds`, and the fields that its jobs share, as submitted (`base`); null
+    /// for other kinds.
     #[schema(value_type = Option<Object>, required = true)]
     sweep: Option<Value>,
     /// What an experiment compares; null for other kinds.
