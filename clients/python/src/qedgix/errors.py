@@ -199,8 +199,8 @@ def family(code: str, status: int = 13) -> type[QedgixError]:
     return known or (Internal if status == 13 else _GRPC.get(status, (Internal, ""))[0])
 
 
-def from_grpc(error: grpc.RpcError) -> QedgixError:
-    """The exception of a call that failed."""
+def from_grpc(error: grpc.RpcError, peer: str) -> QedgixError:
+    """The exception of a call that failed. `peer` says in an error that no server has sent where the call went."""
     # Every error of a call is also the call, which has these methods.
     call: Any = error
     status: int = call.code().value[0]
@@ -210,7 +210,7 @@ def from_grpc(error: grpc.RpcError) -> QedgixError:
     details: dict[str, Any] = {"request_id": metadata.get("x-request-id", "")}
     if not code:
         kind, code = _GRPC.get(status, (Internal, "internal"))
-        return kind(message, code=code, **details)
+        return kind(f"{peer}: {message}", code=code, **details)
     for key, value in call.trailing_metadata() or ():
         if key == "grpc-status-details-bin":
             details.update(_details(value))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from .._files import replace_file
 from .._progress import JobBar
-from ..errors import DeadlineExceeded, JobEnded, NotFound, QedgixError, Unavailable, from_http
+from ..errors import DeadlineExceeded, JobEnded, NotFound, QedgixError, from_http
 from ..results import Attempt, Checkpoint, JobEvent, Metric, Metrics, given_instant, instant
 from ._platform import sleep
 from .transport import Transport
@@ -218,7 +218,7 @@ class Job:
                             kind = data = event_id = ""
                             yield event
             except (httpx.TransportError, OSError) as error:
-                failure = Unavailable(str(error) or type(error).__name__, code="unavailable")
+                failure = self._transport.http_failure(error)
             except QedgixError as error:
                 failure = error
             if deadline is not None and monotonic() >= deadline:
@@ -257,7 +257,7 @@ class Job:
             DeadlineExceeded: it has not ended within `timeout`. It goes on; wait again.
             Unavailable: there was no server for `patience` seconds.
         """
-        deadline = None if timeout is None else monotonic() + timeout
+        deadline = None if timeout is None else self._transport.settings.deadline(timeout)
         with JobBar(self.name or self.id, self.steps, enabled=progress) as bar:
             for event in self._follow(0, patience, deadline):
                 bar.show(event)

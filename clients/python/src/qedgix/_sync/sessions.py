@@ -18,7 +18,6 @@ from ..errors import (
     QedgixError,
     Unavailable,
     from_act_error,
-    from_grpc,
 )
 from ..observations import Observation, put
 from ..results import Decision, PolicyRef, SessionInfo, SessionWarning
@@ -306,7 +305,7 @@ class ActStream:
         if not self._pending:
             raise RuntimeError("there is no request without an answer")
         settings = self._transport.settings
-        deadline = monotonic() + (settings.timeout if timeout is None else timeout)
+        deadline = settings.deadline(timeout)
         attempt = 1
         while True:
             failure: QedgixError
@@ -317,11 +316,11 @@ class ActStream:
                 assert self._raw is not None
                 result = self._raw.read(settings.retry.limit(deadline - monotonic()))
             except TimeoutError:
-                failure = DeadlineExceeded("no answer in time", code="deadline_exceeded")
+                failure = DeadlineExceeded(f"{settings.grpc_peer}: no answer in time", code="deadline_exceeded")
             except EOFError:
-                failure = Unavailable("the stream has ended", code="unavailable")
+                failure = Unavailable(f"{settings.grpc_peer}: the stream has ended", code="unavailable")
             except grpc.RpcError as error:
-                failure = from_grpc(error)
+                failure = self._transport.failure(error)
             else:
                 if result.WhichOneof("result") == "response":
                     fleet, _ = self._pending.popleft()
@@ -370,7 +369,7 @@ def act_batch(
     """See `Client.act_batch`."""
     if len({id(fleet) for fleet, _ in slots}) < len(slots):
         raise InvalidArgument("a fleet has several slots in one batch", code="invalid_argument", field="slots")
-    deadline = monotonic() + (transport.settings.timeout if timeout is None else timeout)
+    deadline = transport.settings.deadline(timeout)
     requests = [fleet.request(observation, q_values=q_values) for fleet, observation in slots]
     results: list[Decision | QedgixError | None] = [None] * len(slots)
     open_slots = list(range(len(slots)))
