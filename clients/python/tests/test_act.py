@@ -263,6 +263,68 @@ def test_wrong_dicts_are_refused(client, observation):
 def test_threads_share_a_client(server):
     client = qedgix.Client(server.grpc, server.http)
     wanted = [expected(client, "qedgix", seed) for seed in range(4)]
+def test_a_fleet_without_users(client):
+    uavs = np.full((2, 2), 0.5)
+    for observation in (
+        qedgix.Scene(uavs, []),
+        qedgix.Scene(uavs, [], [], user_ids=[]),
+        qedgix.Scene(uavs, {}, {}),
+        qedgix.Scene(uavs, np.zeros((0, 2)), np.zeros(0)),
+        qedgix.Graph.from_arrays([], [], [], positions=uavs),
+        qedgix.Graph.from_arrays(np.zeros((0, 2), int), np.zeros((0, 2)), np.zeros(0), positions=uavs),
+    ):
+        assert len(client.act(observation, policy="random").headings) == 2
+    assert client.act_batch([]) == []
+
+
+@pytest.mark.parametrize(
+    ("call", "field"),
+    [
+        (lambda client: client.session("qedgix", seed=-1), "seed"),
+        (lambda client: client.session("qedgix", seed=1 << 64), "seed"),
+        (lambda client: client.session("qedgix", session_id=5), "session_id"),
+        (lambda client: client.session("qedgix", run_id=5), "run_id"),
+        (lambda client: client.session(5), "policy"),
+        (lambda client: client.get_session(5), "session_id"),
+        (lambda client: client.local_session("qedgix", seed=-1), "seed"),
+        (lambda client: client.local_session("qedgix", recurrent_state="text"), "recurrent_state"),
+        (lambda client: client.local_session("qedgix", step=-1), "step"),
+        (lambda client: client.uav("qedgix", 1, uav_ids=["a"], user_ids=[]), "uav_id"),
+        (lambda client: client.uav("qedgix", "a", uav_ids=["a", 1], user_ids=[]), "uav_ids[1]"),
+        (lambda client: client.uav("qedgix", "a", uav_ids=["a"], user_ids=5), "user_ids"),
+        (lambda client: client.uav("qedgix", "a", uav_ids=["a"], user_ids=[], seed=-1), "seed"),
+        (lambda client: client.uav("qedgix", "a", uav_ids=["a"], user_ids=[]).decide(["text"]), "messages"),
+        (lambda client: client.act(Fleet(0).scene(), policy="sweep", timeout="soon"), "timeout"),
+        (lambda client: client.policies.get(5), "policy"),
+        (lambda client: client.jobs.submit(idempotency_key=5), "idempotency_key"),
+    ],
+)
+def test_arguments_of_another_type_are_named(client, call, field):
+    with pytest.raises(qedgix.InvalidArgument) as refused:
+        call(client)
+    error = refused.value
+    assert error.field == field and error.expected and not error.request_id
+
+
+def test_a_session_that_was_never_opened_says_so(connect):
+    # There is no server: nothing is sent.
+    client = connect("127.0.0.1:1")
+    session = client.session("qedgix")
+    scene = Fleet(0).scene()
+    stream = client.stream()
+    for call in (
+        lambda: session.act(scene),
+        lambda: client.act_batch([(session, scene)]),
+        lambda: stream.send(session, scene),
+        lambda: session.policy,
+        lambda: session.warnings,
+    ):
+        with pytest.raises(qedgix.FailedPrecondition, match=r"not open; use `.*with client\.session") as refused:
+            call()
+        assert refused.value.code == "not_open" and isinstance(refused.value, RuntimeError)
+    stream.close()
+
+
     client.close()
     with qedgix.Client(server.grpc, server.http) as client, ThreadPoolExecutor(4) as pool:
         # Nothing is connected yet.

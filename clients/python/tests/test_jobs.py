@@ -6,6 +6,7 @@ import hashlib
 import math
 import sys
 
+import numpy as np
 import pytest
 
 import qedgix
@@ -222,3 +223,7 @@ def test_times_and_values_that_are_missing():
     assert instant("2026-11-22T12:04:18.472905123Z").microsecond == 472905
     row = {"name": "loss", "step": 1, "value": None, "at": "2026-11-22T12:04:18.4Z"}
     assert math.isnan(qedgix.Metric.of(row).value)
+        ("training.learning_rate", {"training": {"learning_rate": float("nan")}}),
+        ("training.learning_rate", {"training": {"learning_rate": np.float32(np.inf)}}),
+        ("sweep.grid.seed[1]", {"kind": "sweep", "sweep": {"grid": {"seed": [1, {2}]}}}),
+        ("labels", {"labels": {None: "a"}}),

@@ -103,8 +103,12 @@ class AlreadyExists(QedgixError):
     """Something with this name exists and differs from what was asked for."""
 
 
-class FailedPrecondition(QedgixError):
-    """The state of the resource does not allow the operation: `wrong_step`, `session_expired`, `episode_over`, and others."""
+class FailedPrecondition(QedgixError, RuntimeError):
+    """The state of the resource does not allow the operation: `wrong_step`, `session_expired`, `episode_over`, and others.
+
+    The client itself raises it before a request, with the code `not_open`: the session or the environment was never opened; or
+    `failed_precondition`: the calls of a stream or an environment have another order.
+    """
 
 
 class ResourceExhausted(QedgixError):
@@ -266,6 +270,11 @@ def from_http(response: httpx.Response) -> QedgixError:
         request_id=request_id,
         **{name: problem.get(name) for name in names},
     )
+
+
+def out_of_order(message: str, code: str = "failed_precondition") -> FailedPrecondition:
+    """A call that cannot be made yet."""
+    return FailedPrecondition(message, code=code)
 
 
 def invalid(field: str, value: object, expected: str) -> InvalidArgument:

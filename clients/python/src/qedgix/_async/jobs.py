@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from .._files import replace_file
 from .._progress import JobBar
+from .._values import text
 from ..errors import DeadlineExceeded, JobEnded, NotFound, QedgixError, from_http
 from ..results import Attempt, Checkpoint, JobEvent, Metric, Metrics, given_instant, instant
 from ._platform import sleep
@@ -365,7 +366,7 @@ class AsyncJobs:
             **more,
         }
         body = {field: value for field, value in fields.items() if value is not None}
-        headers = {"idempotency-key": idempotency_key or uuid.uuid4().hex}
+        headers = {"idempotency-key": text("idempotency_key", idempotency_key or uuid.uuid4().hex)}
         return AsyncJob(self._transport, await self._transport.json("POST", "/v1/jobs", json=body, headers=headers))
 
     async def get(self, job_id: str) -> AsyncJob:

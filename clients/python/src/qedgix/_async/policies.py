@@ -10,6 +10,7 @@ from urllib.parse import quote
 
 from .._files import replace_file
 from .._progress import UploadBar
+from .._values import text
 from ..results import AliasMove, Policy, PolicyRef, PolicyVersion, given_instant
 from .transport import AsyncTransport
 
@@ -155,4 +156,4 @@ async def _parts(content: bytes, bar: UploadBar) -> AsyncIterator[bytes]:
 
 
 def _path(*parts: str) -> str:
-    return "/v1/policies/" + "/".join(quote(part, safe="@:") for part in parts)
+    return "/v1/policies/" + "/".join(quote(text("policy", part), safe="@:") for part in parts)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import grpc
 
 from .._settings import Retry, Settings
+from .._values import plain
 from ..errors import DeadlineExceeded, NotFound, QedgixError, Unavailable, from_grpc, from_http, invalid
 from ._platform import Channel, HttpClient, RawStream, open_channel, sleep
 
@@ -181,6 +182,7 @@ class AsyncTransport:
         import httpx
 
         deadline = self.settings.deadline(timeout)
+        body = plain("", json)
         given = {name: value for name, value in (params or {}).items() if value is not None}
         attempt = 1
         while True:
@@ -193,7 +195,7 @@ class AsyncTransport:
                     path,
                     params=given,
                     headers=headers,
-                    json=json,
+                    json=body,
                     content=content() if content else None,
                     timeout=max(limit, 0.001),
                 )

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 import grpc
 
 from .._settings import Retry, Settings
+from .._values import plain
 from ..errors import DeadlineExceeded, NotFound, QedgixError, Unavailable, from_grpc, from_http, invalid
 from ._platform import Channel, HttpClient, RawStream, open_channel, sleep
 
@@ -182,6 +183,7 @@ class Transport:
         import httpx
 
         deadline = self.settings.deadline(timeout)
+        body = plain("", json)
         given = {name: value for name, value in (params or {}).items() if value is not None}
         attempt = 1
         while True:
@@ -194,7 +196,7 @@ class Transport:
                     path,
                     params=given,
                     headers=headers,
-                    json=json,
+                    json=body,
                     content=content() if content else None,
                     timeout=max(limit, 0.001),
                 )
