@@ -238,8 +238,20 @@ def test_what_is_not_accepted_is_named(client):
         (lambda: qedgix.Graph({"a": {2: (0, 0, 1)}}), "graph.detections[a].ids"),
         (lambda: qedgix.Graph({"a": {"u": (0,)}}, {"u": 1}), "graph.detections[a][u]"),
         (lambda: qedgix.Graph({"a": {}}, {}, {}), "graph.positions[a]"),
-        (lambda: qedgix.Graph.from_arrays([[0, 9]], [[0, 0]], [1], uavs=1), "graph.edge_index"),
-        (lambda: qedgix.Graph.from_arrays([[1, 0]], [[0, 0]], [1], uavs=1), "graph.edge_index"),
+        (lambda: qedgix.Graph({"a": {}}, positions={"a": (0, 0), "A": (0, 0)}), "graph.positions[A]"),
+        (lambda: qedgix.Graph({"a": {}}, speeds={"A": 1}), "graph.speeds[A]"),
+        (lambda: qedgix.Graph({"a": {}}, endurance={"A": 10}), "graph.endurance[A]"),
+        (lambda: qedgix.Graph({"a": {}}, positions=np.zeros((1, 2))), "graph.positions"),
+        (lambda: qedgix.Graph(["a"]), "graph.detections"),
+        (lambda: qedgix.Graph({"a": [("u", 0, 0)]}), "graph.detections[a]"),
+        (lambda: qedgix.Graph.from_arrays([[0, 9]], [[0, 0]], [1], uavs=1), "graph.edge_index[0]"),
+        (lambda: qedgix.Graph.from_arrays([[1, 0]], [[0, 0]], [1], uavs=1), "graph.edge_index[0]"),
+        (lambda: qedgix.Graph.from_arrays([[0, 1.7]], [[0, 0]], [1], uavs=1), "graph.edge_index[0]"),
+        (lambda: qedgix.Graph.from_arrays([[0, 1], [0, np.nan]], [[0, 0]] * 2, [1], uavs=1), "graph.edge_index[1]"),
+        (lambda: qedgix.Graph.from_arrays([[0, np.inf]], [[0, 0]], [1], uavs=1), "graph.edge_index[0]"),
+        (lambda: qedgix.Graph.from_arrays([[0, 1], [0, 1]], [[0, 0]] * 2, [1], uavs=1), "graph.edge_index[1]"),
+        (lambda: qedgix.Graph.from_arrays([], [], [1], uavs=1.5), "uavs"),
+        (lambda: qedgix.Scene(np.zeros((3, 0)), []), "scene.uavs"),
         (lambda: qedgix.Graph.from_arrays([[0, 1]], [[0, 0]] * 2, [1], uavs=1), "graph.edge_relative"),
         (lambda: qedgix.Graph.from_arrays([], [], [[1]], uavs=1), "graph.aoi"),
         (lambda: qedgix.Graph.from_arrays([], [], [1], uavs=2, positions=[[0, 0]]), "graph.positions"),
@@ -251,18 +263,6 @@ def test_observations_are_checked_before_they_are_sent(make, field):
     assert refused.value.field == field and refused.value.expected
 
 
-@pytest.mark.parametrize(
-    "observation", [{"uavs": [{"name": "a"}]}, {"nodes": [{"id": 3}]}, {"nodes": 5}, {"users": {"a"}}, 5, None]
-)
-def test_wrong_dicts_are_refused(client, observation):
-    with pytest.raises(qedgix.InvalidArgument) as refused:
-        client.act(observation, policy="sweep")
-    assert refused.value.field in ("scene", "graph", "observation")
-
-
-def test_threads_share_a_client(server):
-    client = qedgix.Client(server.grpc, server.http)
-    wanted = [expected(client, "qedgix", seed) for seed in range(4)]
 def test_a_fleet_without_users(client):
     uavs = np.full((2, 2), 0.5)
     for observation in (
@@ -325,6 +325,18 @@ def test_a_session_that_was_never_opened_says_so(connect):
     stream.close()
 
 
+@pytest.mark.parametrize(
+    "observation", [{"uavs": [{"name": "a"}]}, {"nodes": [{"id": 3}]}, {"nodes": 5}, {"users": {"a"}}, 5, None]
+)
+def test_wrong_dicts_are_refused(client, observation):
+    with pytest.raises(qedgix.InvalidArgument) as refused:
+        client.act(observation, policy="sweep")
+    assert refused.value.field in ("scene", "graph", "observation")
+
+
+def test_threads_share_a_client(server):
+    client = qedgix.Client(server.grpc, server.http)
+    wanted = [expected(client, "qedgix", seed) for seed in range(4)]
     client.close()
     with qedgix.Client(server.grpc, server.http) as client, ThreadPoolExecutor(4) as pool:
         # Nothing is connected yet.
