@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
+import builtins
 import json
 import os
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from time import monotonic
@@ -142,6 +143,22 @@ class Job:
             FailedPrecondition: `wrong_state`: the job has ended otherwise.
         """
         return self._change("retry", ())
+
+    def continue_(self, steps: int, *, idempotency_key: str | None = None) -> Job:
+        """Trains further than a training job that has ended, in a new job with the same configuration, name and labels. The new
+        job begins with the snapshot of this one if that is kept, or else with its last weights.
+
+        Args:
+            steps: environment steps to train further.
+            idempotency_key: a second call with this key returns the same job. Default: a random key.
+
+        Raises:
+            FailedPrecondition: `wrong_state`: the job has not ended.
+        """
+        headers = _key(idempotency_key)
+        body = {"steps": steps}
+        document = self._transport.json("POST", f"{self._path}/continue", json=body, headers=headers)
+        return Job(self._transport, document)
 
     def edit(self, **fields: Any) -> Self:
         """Changes `name`, `labels`, `priority` or `notes` of the job. None: the default; a label that is None is removed.
@@ -367,8 +384,8 @@ class Jobs:
             **more,
         }
         body = {field: value for field, value in fields.items() if value is not None}
-        headers = {"idempotency-key": text("idempotency_key", idempotency_key or uuid.uuid4().hex)}
-        return Job(self._transport, self._transport.json("POST", "/v1/jobs", json=body, headers=headers))
+        document = self._transport.json("POST", "/v1/jobs", json=body, headers=_key(idempotency_key))
+        return Job(self._transport, document)
 
     def get(self, job_id: str) -> Job:
         """A job.
@@ -378,7 +395,55 @@ class Jobs:
         """
         return Job(self._transport, {"id": job_id}).refresh()
 
-    def list(self, state: str | None = None) -> list[Job]:
-        """All jobs, or those in a state, newest first. `config` of a listed job lacks environment and training."""
-        rows = self._transport.pages("/v1/jobs", "jobs", state=state)
+    def list(
+        self,
+        state: str | None = None,
+        *,
+        kind: str | None = None,
+        algorithm: str | None = None,
+        name: str | None = None,
+        labels: Mapping[str, str | None] | None = None,
+        parent: str | None = None,
+        created_after: datetime | None = None,
+        created_before: datetime | None = None,
+        sort: str | None = None,
+        metrics: Sequence[str] = (),
+        limit: int | None = None,
+    ) -> builtins.list[Job]:
+        """All jobs to which every given filter applies. `config` of a listed job lacks environment and training.
+
+        Args:
+            state: queued, running, paused, cancelled, succeeded or failed.
+            kind: train, evaluate, sweep or experiment.
+            algorithm: qmix, vdn, iql, qedgix, agggnn or rgcn.
+            name: a name; with `*` at the end, the beginning of names.
+            labels: labels that a job has, with their values; None: any value.
+            parent: id of the job that has made the jobs, such as a sweep.
+            created_after: when jobs were submitted at the earliest. A time without a zone is that of this machine.
+            created_before: before when they were submitted.
+            sort: `created`, `name`, `best:METRIC` or `last:METRIC`, after `-` in descending order. Default: `-created`.
+            metrics: at most 16 metrics whose best and last values `document["metrics"]` of each job has.
+            limit: maximum number of jobs. Default: all.
+
+        Raises:
+            InvalidArgument: a filter is not accepted.
+        """
+        filters = {
+            "state": state,
+            "kind": kind,
+            "algorithm": algorithm,
+            "name": name,
+            "labels": None if labels is None else ",".join(k if v is None else f"{k}={v}" for k, v in labels.items()),
+            "parent": parent,
+            "created_after": None if created_after is None else created_after.astimezone().isoformat(),
+            "created_before": None if created_before is None else created_before.astimezone().isoformat(),
+            "sort": sort,
+            "metrics": ",".join(metrics) or None,
+        }
+        rows = self._transport.pages("/v1/jobs", "jobs", limit=limit, **filters)
         return [Job(self._transport, row) for row in rows]
+
+
+def _key(idempotency_key: str | None) -> dict[str, str]:
+    """The header that names a submission."""
+    return {"idempotency-key": text("idempotency_key", idempotency_key or uuid.uuid4().hex)}

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 import grpc
 
 from .._settings import Retry, Settings
-from .._values import plain
+from .._values import plain, whole
 from ..errors import DeadlineExceeded, NotFound, QedgixError, Unavailable, from_grpc, from_http, invalid
 from ._platform import Channel, HttpClient, RawStream, open_channel, sleep
 
@@ -222,16 +222,19 @@ class Transport:
         response = self.request(method, path, **options)
         return cast("dict[str, Any]", response.json())
 
-    def pages(self, path: str, items: str, **params: Any) -> list[dict[str, Any]]:
-        """All items of a list, page by page."""
+    def pages(self, path: str, items: str, *, limit: int | None = None, **params: Any) -> list[dict[str, Any]]:
+        """All items of a list, or the first `limit` (from 1), page by page."""
+        if limit is not None:
+            limit = whole("limit", limit, 1, 2**63 - 1)
+            params["page_size"] = min(limit, 1000)
         found: list[dict[str, Any]] = []
         token = None
         while True:
             page = self.json("GET", path, params={**params, "page_token": token})
             found += page[items]
             token = page["next_page_token"]
-            if not token:
-                return found
+            if not token or (limit is not None and len(found) >= limit):
+                return found[:limit]
 
     def close(self) -> None:
         """Closes the connections."""
