@@ -252,6 +252,7 @@ def test_what_is_not_accepted_is_named(client):
         (lambda: qedgix.Graph.from_arrays([[0, 1], [0, 1]], [[0, 0]] * 2, [1], uavs=1), "graph.edge_index[1]"),
         (lambda: qedgix.Graph.from_arrays([], [], [1], uavs=1.5), "uavs"),
         (lambda: qedgix.Scene(np.zeros((3, 0)), []), "scene.uavs"),
+        (lambda: qedgix.Scene(np.zeros((1, 2)), [], uav_ids="a"), "scene.uavs.ids"),
         (lambda: qedgix.Graph.from_arrays([[0, 1]], [[0, 0]] * 2, [1], uavs=1), "graph.edge_relative"),
         (lambda: qedgix.Graph.from_arrays([], [], [[1]], uavs=1), "graph.aoi"),
         (lambda: qedgix.Graph.from_arrays([], [], [1], uavs=2, positions=[[0, 0]]), "graph.positions"),
@@ -275,6 +276,9 @@ def test_a_fleet_without_users(client):
     ):
         assert len(client.act(observation, policy="random").headings) == 2
     assert client.act_batch([]) == []
+    with pytest.raises(qedgix.InvalidArgument) as refused:
+        client.act(qedgix.Scene([], []), policy="random")
+    assert refused.value.field == "scene"
 
 
 @pytest.mark.parametrize(
@@ -295,7 +299,20 @@ def test_a_fleet_without_users(client):
         (lambda client: client.uav("qedgix", "a", uav_ids=["a"], user_ids=[], seed=-1), "seed"),
         (lambda client: client.uav("qedgix", "a", uav_ids=["a"], user_ids=[]).decide(["text"]), "messages"),
         (lambda client: client.act(Fleet(0).scene(), policy="sweep", timeout="soon"), "timeout"),
+        (lambda client: client.session("qedgix", frame=1000), "frame"),
+        (lambda client: client.session("qedgix", world={"speed": 1}), "world"),
+        (lambda client: client.session("qedgix", constraints={}), "constraints"),
+        (lambda client: client.act_batch([Fleet(0).scene()]), "slots[0]"),
+        (lambda client: client.act_batch(5), "slots"),
+        (lambda client: client.uav("qedgix", "a", uav_ids=["a"], user_ids=[]).decide(5), "messages"),
+        (lambda client: client.uav("qedgix", "a", uav_ids=["a"], user_ids=[]).encode([]), "detections"),
+        (lambda client: client.uav("qedgix", "a", uav_ids=["a"], user_ids=[]).encode({5: (0, 0)}), "detections"),
         (lambda client: client.policies.get(5), "policy"),
+        (lambda client: client.policies.upload("name", 5), "checkpoint"),
+        (lambda client: client.jobs.submit(idempotency_key="\u00fc"), "idempotency_key"),
+        (lambda client: client.jobs.list(labels="team=a"), "labels"),
+        (lambda client: client.jobs.list(created_after="today"), "created_after"),
+        (lambda client: client.jobs.list(metrics="loss"), "metrics"),
         (lambda client: client.jobs.submit(idempotency_key=5), "idempotency_key"),
     ],
 )

@@ -123,6 +123,9 @@ def test_addresses_are_checked(connect, address):
         with pytest.raises(qedgix.InvalidArgument) as refused:
             connect(*addresses)
         assert refused.value.field == field
+    with pytest.raises(qedgix.InvalidArgument) as refused:
+        connect("h:1", 8080)
+    assert (refused.value.field, refused.value.value) == ("http", "8080")
 
 
 def test_half_a_client_certificate_is_refused(connect):

@@ -191,6 +191,7 @@ def test_wrong_arguments_are_named(server):
         ({"render_mode": "human"}, "render_mode"),
         ({"environment": {"slots": 5}, "max_cycles": 6}, "max_cycles"),
         ({"environment": {"uavs": 0}}, "environment"),
+        ({"environment": 5}, "environment"),
     ]:
         with pytest.raises(qedgix.InvalidArgument) as refused:
             qedgix.parallel_env(server.grpc, **options)

@@ -12,7 +12,7 @@ from ._observer import Observer
 from ._render import render
 from ._sync.client import Client
 from ._sync.environments import Environment
-from ._values import whole
+from ._values import instance, mapping, whole
 from .errors import FailedPrecondition, NotFound, invalid, out_of_order
 from .results import EnvironmentState
 
@@ -43,7 +43,7 @@ class Hosted:
         auto_reset: bool,
         own_position: bool,
     ) -> None:
-        config = dict(environment or {})
+        config = {} if environment is None else dict(mapping("environment", environment))
         if max_cycles is not None:
             given = config.pop("K", config.get("slots", max_cycles))
             if given != max_cycles:
@@ -52,7 +52,7 @@ class Hosted:
         self._environment_config, self._count, self._auto_reset = config, count, auto_reset
         self._own_client = isinstance(server, str)
         self.seed = random_seed() if seed is None else whole("seed", seed, 0, MAX_SEED)
-        self.client = Client(server) if isinstance(server, str) else server
+        self.client = Client(server) if isinstance(server, str) else instance("server", server, Client)
         self._next_episode = 0
         try:
             self._environment = self._create()

@@ -11,7 +11,7 @@ from google.protobuf.descriptor import FieldDescriptor
 
 from .errors import invalid
 
-M = TypeVar("M")
+T = TypeVar("T")
 
 _ACCEPTED = {
     FieldDescriptor.CPPTYPE_UINT64: "a whole number, 0 to 2^64 - 1",
@@ -21,7 +21,7 @@ _ACCEPTED = {
 }
 
 
-def made(kind: type[M], **values: Any) -> M:
+def made(kind: type[T], **values: Any) -> T:
     """A message with these fields; None leaves a field out.
 
     Raises:
@@ -66,9 +66,40 @@ def texts(field: str, values: Any) -> list[str]:
     Raises:
         InvalidArgument: one is not, or they are not several.
     """
+    return [text(f"{field}[{i}]", value) for i, value in enumerate(several(field, values))]
+
+
+def several(field: str, values: Any) -> list[Any]:
+    """Values in a list, a tuple or something else that has several; not the letters of a text.
+
+    Raises:
+        InvalidArgument: they are not several.
+    """
     if isinstance(values, (str, bytes)) or not isinstance(values, Iterable):
-        raise invalid(field, _shown(values), "a list, each a str")
-    return [text(f"{field}[{i}]", value) for i, value in enumerate(values)]
+        raise invalid(field, _shown(values), "a list")
+    return list(values)
+
+
+def mapping(field: str, given: Any) -> Mapping[Any, Any]:
+    """A mapping.
+
+    Raises:
+        InvalidArgument: it is none.
+    """
+    if not isinstance(given, Mapping):
+        raise invalid(field, _shown(given), "a mapping")
+    return given
+
+
+def instance(field: str, value: Any, kind: type[T]) -> T:
+    """A value of a class.
+
+    Raises:
+        InvalidArgument: it is of another one.
+    """
+    if not isinstance(value, kind):
+        raise invalid(field, _shown(value), f"a {kind.__module__.partition('.')[0]}.{kind.__name__}")
+    return value
 
 
 def number(field: str, value: Any) -> float:

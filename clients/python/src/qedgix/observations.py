@@ -8,7 +8,7 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ._values import whole
+from ._values import mapping, several, whole
 from .errors import invalid
 from .v1 import policy_pb2 as pb
 
@@ -59,6 +59,8 @@ class Scene:
 
     def fill(self, scene: pb.Scene) -> None:
         """Writes the scene to a message."""
+        # A scene without nodes is one, too.
+        scene.SetInParent()
         add_uav, add_user = scene.uavs.add, scene.users.add
         for name, (x, y) in zip(self._uav_ids, self._uavs):
             add_uav(id=name, x=x, y=y)
@@ -112,11 +114,11 @@ class Graph:
         endurance: Mapping[str, float] | None = None,
     ) -> None:
         message = pb.Graph()
-        _texts("graph.uavs", _mapping("graph.detections", detections))
-        users = {} if aoi is None else dict(_mapping("graph.aoi", aoi))
+        _texts("graph.uavs", mapping("graph.detections", detections))
+        users = {} if aoi is None else dict(mapping("graph.aoi", aoi))
         _texts("graph.users", users)
         for field, of_uavs in (("positions", positions), ("speeds", speeds), ("endurance", endurance)):
-            for name in () if of_uavs is None else _mapping(f"graph.{field}", of_uavs):
+            for name in () if of_uavs is None else mapping(f"graph.{field}", of_uavs):
                 if name not in detections:
                     raise invalid(f"graph.{field}[{name}]", name, "a UAV of `detections`")
         for name, targets in detections.items():
@@ -127,7 +129,7 @@ class Graph:
                 node.speed = _number(f"graph.speeds[{name}]", speeds[name])
             if endurance is not None and name in endurance:
                 node.endurance_seconds = _number(f"graph.endurance[{name}]", endurance[name])
-            _texts(f"graph.detections[{name}]", _mapping(f"graph.detections[{name}]", targets))
+            _texts(f"graph.detections[{name}]", mapping(f"graph.detections[{name}]", targets))
             for target, seen in targets.items():
                 field = f"graph.detections[{name}][{target}]"
                 if target in detections:
@@ -267,9 +269,10 @@ def _default_ids(prefix: str, count: int) -> tuple[str, ...]:
 def _ids(field: str, given: Sequence[str] | None, count: int, prefix: str) -> Sequence[str]:
     if given is None:
         return _default_ids(prefix, count)
-    if len(given) != count:
-        raise invalid(f"{field}.ids", len(given), f"{count} ids")
-    return _texts(field, given)
+    ids = several(f"{field}.ids", given)
+    if len(ids) != count:
+        raise invalid(f"{field}.ids", len(ids), f"{count} ids")
+    return _texts(field, ids)
 
 
 def _texts(field: str, ids: Iterable[str]) -> Sequence[str]:
@@ -306,12 +309,6 @@ def _index(field: str, number: float, count: int, expected: str) -> int:
     if not 0 <= number < count or number != int(number):
         raise invalid(field, number, f"{expected}, 0 to {count - 1}")
     return int(number)
-
-
-def _mapping(field: str, given: Any) -> Mapping[Any, Any]:
-    if not isinstance(given, Mapping):
-        raise invalid(field, type(given).__name__, "a mapping from ids")
-    return given
 
 
 def _column(field: str, numbers: ArrayLike, count: int | None) -> list[float]:

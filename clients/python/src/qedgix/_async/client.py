@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from .._client import BaseClient
 from .._settings import Settings
-from .._values import made, text, texts
+from .._values import made, several, text, texts
 from ..errors import QedgixError
 from ..observations import Observation
 from ..results import Decision, SessionInfo
@@ -228,7 +228,7 @@ class AsyncClient(BaseClient):
         Raises:
             QedgixError: the whole call failed.
         """
-        return await sessions.act_batch(self._transport, list(slots), q_values, timeout)
+        return await sessions.act_batch(self._transport, several("slots", slots), q_values, timeout)
 
     def stream(self) -> AsyncActStream:
         """A stream for `async with`: slots of many fleets without a call for each."""

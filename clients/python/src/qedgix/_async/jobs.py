@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from .._files import replace_file
 from .._progress import JobBar
-from .._values import text
-from ..errors import DeadlineExceeded, JobEnded, NotFound, QedgixError, from_http
+from .._values import instance, mapping, text, texts
+from ..errors import DeadlineExceeded, JobEnded, NotFound, QedgixError, from_http, invalid
 from ..results import Attempt, Checkpoint, JobEvent, Metric, Metrics, given_instant, instant
 from ._platform import sleep
 from .transport import AsyncTransport
@@ -432,12 +432,12 @@ class AsyncJobs:
             "kind": kind,
             "algorithm": algorithm,
             "name": name,
-            "labels": None if labels is None else ",".join(k if v is None else f"{k}={v}" for k, v in labels.items()),
+            "labels": None if labels is None else _labels(labels),
             "parent": parent,
-            "created_after": None if created_after is None else created_after.astimezone().isoformat(),
-            "created_before": None if created_before is None else created_before.astimezone().isoformat(),
+            "created_after": None if created_after is None else _instant("created_after", created_after),
+            "created_before": None if created_before is None else _instant("created_before", created_before),
             "sort": sort,
-            "metrics": ",".join(metrics) or None,
+            "metrics": ",".join(texts("metrics", metrics)) or None,
         }
         rows = await self._transport.pages("/v1/jobs", "jobs", limit=limit, **filters)
         return [AsyncJob(self._transport, row) for row in rows]
@@ -445,4 +445,16 @@ class AsyncJobs:
 
 def _key(idempotency_key: str | None) -> dict[str, str]:
     """The header that names a submission."""
-    return {"idempotency-key": text("idempotency_key", idempotency_key or uuid.uuid4().hex)}
+    key = text("idempotency_key", idempotency_key or uuid.uuid4().hex)
+    if not (key.isascii() and key.isprintable()):
+        raise invalid("idempotency_key", repr(key), "printable characters of ASCII")
+    return {"idempotency-key": key}
+
+
+def _labels(labels: Mapping[str, str | None]) -> str:
+    """The filter for jobs with all of these labels."""
+    return ",".join(name if value is None else f"{name}={value}" for name, value in mapping("labels", labels).items())
+
+
+def _instant(field: str, time: datetime) -> str:
+    return instance(field, time, datetime).astimezone().isoformat()

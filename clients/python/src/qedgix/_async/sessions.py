@@ -18,6 +18,7 @@ from ..errors import (
     QedgixError,
     Unavailable,
     from_act_error,
+    invalid,
     out_of_order,
 )
 from ..observations import Observation, put
@@ -78,7 +79,7 @@ class AsyncFleet:
             Unavailable, ResourceExhausted, DeadlineExceeded: no answer within the deadline.
         """
         request = self.request(observation, q_values=q_values, motion=motion)
-        request.explain = explain
+        request.explain = bool(explain)
         response = await self._transport.call(ACT, request, timeout)
         return self.accept(response)
 
@@ -365,6 +366,9 @@ async def act_batch(
     timeout: float | None,
 ) -> list[Decision | QedgixError]:
     """See `AsyncClient.act_batch`."""
+    for i, slot in enumerate(slots):
+        if not isinstance(slot, (tuple, list)) or len(slot) != 2 or not isinstance(slot[0], AsyncFleet):
+            raise invalid(f"slots[{i}]", repr(slot), "a session and what its fleet observes")
     if len({id(fleet) for fleet, _ in slots}) < len(slots):
         raise InvalidArgument("a fleet has several slots in one batch", code="invalid_argument", field="slots")
     deadline = transport.settings.deadline(timeout)

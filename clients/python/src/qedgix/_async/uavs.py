@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from .._values import made, number
+from .._values import made, mapping, number, several, text
 from ..errors import invalid
 from ..results import Decision
 from ..v1 import policy_pb2 as pb
@@ -69,7 +69,8 @@ class AsyncUav:
             node.position.x, node.position.y = _numbers("position", position, (2,))
         if speed is not None:
             node.speed = number("speed", speed)
-        for target, seen in detections.items():
+        for target, seen in mapping("detections", detections).items():
+            text("detections", target)
             x, y, *aoi = _numbers(f"detections[{target}]", seen, (2, 3))
             node.detections.add(target_id=target, rel_x=x, rel_y=y, aoi=aoi[0] if aoi else None)
         response = await self._transport.call(ENCODE, request, timeout)
@@ -102,7 +103,7 @@ class AsyncUav:
             pb.DecideRequest,
             policy=self._first.policy,
             state=self.state,
-            messages=list(messages),
+            messages=several("messages", messages),
             return_q_values=q_values,
             return_velocity=motion,
             return_waypoint=motion,

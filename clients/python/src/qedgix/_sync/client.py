@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from .._client import BaseClient
 from .._settings import Settings
-from .._values import made, text, texts
+from .._values import made, several, text, texts
 from ..errors import QedgixError
 from ..observations import Observation
 from ..results import Decision, SessionInfo
@@ -229,7 +229,7 @@ class Client(BaseClient):
         Raises:
             QedgixError: the whole call failed.
         """
-        return sessions.act_batch(self._transport, list(slots), q_values, timeout)
+        return sessions.act_batch(self._transport, several("slots", slots), q_values, timeout)
 
     def stream(self) -> ActStream:
         """A stream for `with`: slots of many fleets without a call for each."""

@@ -19,6 +19,7 @@ from ..errors import (
     QedgixError,
     Unavailable,
     from_act_error,
+    invalid,
     out_of_order,
 )
 from ..observations import Observation, put
@@ -79,7 +80,7 @@ class Fleet:
             Unavailable, ResourceExhausted, DeadlineExceeded: no answer within the deadline.
         """
         request = self.request(observation, q_values=q_values, motion=motion)
-        request.explain = explain
+        request.explain = bool(explain)
         response = self._transport.call(ACT, request, timeout)
         return self.accept(response)
 
@@ -366,6 +367,9 @@ def act_batch(
     timeout: float | None,
 ) -> list[Decision | QedgixError]:
     """See `Client.act_batch`."""
+    for i, slot in enumerate(slots):
+        if not isinstance(slot, (tuple, list)) or len(slot) != 2 or not isinstance(slot[0], Fleet):
+            raise invalid(f"slots[{i}]", repr(slot), "a session and what its fleet observes")
     if len({id(fleet) for fleet, _ in slots}) < len(slots):
         raise InvalidArgument("a fleet has several slots in one batch", code="invalid_argument", field="slots")
     deadline = transport.settings.deadline(timeout)
