@@ -153,12 +153,12 @@ pub fn nearest<'a>(word: &str, known: impl IntoIterator<Item = &'a str>) -> Opti
     others.filter(|(distance, _)| *distance <= (length / 3).max(1)).min_by_key(|(distance, _)| *distance).map(|(_, other)| other)
 }
 
-/// `text` with its very long numbers, such as the 309 digits of 1e308, in scientific form.
+/// `text` with its very long numbers, such as the 309 digits of 1e308, in scientific form. Quoted text stays as it is.
 fn shorten_numbers(text: String) -> String {
     /// Longer than any whole number of 64 bits, and than any other number of 17 digits that is not tiny.
     const MAX_DIGITS: usize = 24;
     let is_digit = |c: char| c.is_ascii_digit() || c == '.';
-    if text.len() <= MAX_DIGITS || text.split(|c| !is_digit(c)).all(|digits| digits.len() <= MAX_DIGITS) {
+    if text.len() <= MAX_DIGITS || text.contains('"') || text.split(|c| !is_digit(c)).all(|digits| digits.len() <= MAX_DIGITS) {
         return text;
     }
     let mut short = String::new();
@@ -166,7 +166,7 @@ fn shorten_numbers(text: String) -> String {
     while !rest.is_empty() {
         let (digits, after) = rest.split_at(rest.find(|c| !is_digit(c)).unwrap_or(rest.len()));
         match digits.parse::<f64>() {
-            Ok(number) if digits.len() > MAX_DIGITS && number.is_finite() => short += &format!("{number:e}"),
+            Ok(number) if digits.len() > MAX_DIGITS && number.is_finite() => short.push_str(&format!("{number:e}")),
             _ => short += digits,
         }
         let (between, after) = after.split_at(after.find(is_digit).unwrap_or(after.len()));

@@ -7,18 +7,18 @@ import { faded, isDark } from './palette.js';
 
 /**
  * Curves over common axes. A curve is `{label, x, y, colour, dash}` and optionally `low` and `high`, its band. The plot follows its
- * data without being made again. `playhead`: where to draw a vertical line.
+ * data without being made again. `share`: whether values are shares, from 0 to 1. `playhead`: where to draw a vertical line.
  */
-export function Chart({ curves, label, height = 320, x: xName = 'environment steps', playhead = null }) {
+export function Chart({ curves, label, height = 320, x: xName = 'environment steps', share = false, playhead = null }) {
   const place = useRef(null);
   const plot = useRef(null);
   const head = useRef(null);
   const dark = isDark();
-  const shape = JSON.stringify([curves.map((c) => [c.label, c.colour, c.dash, !!c.low]), height, dark, label]);
+  const shape = JSON.stringify([curves.map((c) => [c.label, c.colour, c.dash, !!c.low]), height, dark, label, share]);
   const data = joined(curves);
   useEffect(() => {
     const width = () => Math.max(place.current.clientWidth, 200);
-    plot.current = new uPlot(options(curves, { label, height, width: width(), xName, head }), data, place.current);
+    plot.current = new uPlot(options(curves, { label, height, width: width(), xName, share, head }), data, place.current);
     const observer = new ResizeObserver(() => plot.current?.setSize({ width: width(), height }));
     observer.observe(place.current);
     return () => {
@@ -45,7 +45,7 @@ function joined(curves) {
   return uPlot.join(tables);
 }
 
-function options(curves, { label, height, width, xName, head }) {
+function options(curves, { label, height, width, xName, share, head }) {
   const style = getComputedStyle(document.documentElement);
   const [ink, grid] = ['--faint', '--line'].map((name) => style.getPropertyValue(name).trim());
   const font = '12px system-ui, sans-serif';
@@ -67,20 +67,43 @@ function options(curves, { label, height, width, xName, head }) {
   const axis = { stroke: ink, font, labelFont: font, labelSize: 18, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid, width: 1, size: 4 } };
   return {
     width, height, series, bands,
-    scales: { x: { time: false } },
+    scales: { x: { time: false }, y: share ? { range: shares } : {} },
     axes: [
       { ...axis, label: xName, values: (_, all) => all.map((v) => short(v)), size: 34 },
       { ...axis, label: label, size: 58, values: (_, all, i, space, step) => all.map((v) => (v == null ? null : step >= 1000 ? short(v) : v.toFixed(places(step)))) },
     ],
     cursor: { y: false, focus: { prox: 24 }, drag: { x: true, y: false } },
     focus: { alpha: 0.35 },
-    legend: { live: true },
-    hooks: { draw: [(u) => drawHead(u, head.current, ink)] },
+    legend: { live: true, markers: { width: 0, fill: (u, i) => swatch(series[i]) } },
+    hooks: {
+      draw: [(u) => drawHead(u, head.current, ink)],
+      setScale: [(u, key) => { if (key === 'y') u.root.dataset.top = u.scales.y.max; }],
+    },
   };
 }
 
-/** Decimal places that tell marks apart which are `step` apart. */
-const places = (step) => Math.min(Math.max(0, Math.ceil(-Math.log10(step) - 1e-9)), 9);
+/** The axis of shares: it ends at 1, also where a curve lies on 1. */
+function shares(u, least, most) {
+  if (least == null) return [0, 1];
+  const [low, high] = uPlot.rangeNum(least, most, 0.1, true);
+  return [Math.max(low, 0), Math.min(high, 1)];
+}
+
+/** The background that shows colour and dash of a curve in the legend. */
+function swatch({ stroke, dash }) {
+  if (!dash?.length) return stroke;
+  let at = 0;
+  const parts = dash.map((length, i) => `${i % 2 ? 'transparent' : stroke} ${at}px ${at += length}px`);
+  return `repeating-linear-gradient(90deg, ${parts.join(', ')})`;
+}
+
+/** Decimal places of marks that are `step` apart: 2 for 0.25. At most 9. */
+export function places(step) {
+  const rounded = (n) => Math.abs(step * 10 ** n - Math.round(step * 10 ** n)) < step * 10 ** n * 1e-6;
+  let n = 0;
+  while (n < 9 && !rounded(n)) n += 1;
+  return n;
+}
 
 function drawHead(u, x, ink) {
   if (x == null) return;

@@ -4,7 +4,7 @@ import { html, useEffect, useMemo, useRef, useState } from './htm-preact-3.1.1.j
 import { get } from './api.js';
 import { Chart, mean, smooth } from './chart.js';
 import { Parallel, results, Table } from './compare.js';
-import { flatten, METRICS, metricName, setting } from './format.js';
+import { flatten, isShare, METRICS, metricName, setting } from './format.js';
 import { styles } from './palette.js';
 import { setOptions } from './route.js';
 import { Card, Choice, Empty, ErrorBox, Field } from './ui.js';
@@ -164,7 +164,7 @@ export function Curves({ jobs, options, first = 'curves' }) {
     <${ErrorBox} error=${error} />
     ${view === 'table' && html`<${Table} all=${compared} fields=${fields} metric=${metric} options=${options} />`}
     ${view === 'parallel' && html`<${Parallel} all=${compared} fields=${fields} metric=${metric} />`}
-    ${view === 'curves' && html`${drawn.length ? html`<${Chart} curves=${drawn} label=${metricName(metric)} height=${340} />` : html`<${Empty} title=${shown.length ? 'No rows of this metric yet.' : 'No job is selected.'}>
+    ${view === 'curves' && html`${drawn.length ? html`<${Chart} curves=${drawn} label=${metricName(metric)} share=${isShare(metric)} height=${340} />` : html`<${Empty} title=${shown.length ? 'No rows of this metric yet.' : 'No job is selected.'}>
       <p>${shown.length ? 'A curve appears here as soon as the first rows arrive.' : 'Select jobs in the table below; their curves appear here.'}</p><//>`}
     <p class="hint">${jobs.length > MOST ? `The first ${MOST} of ${jobs.length} selected jobs are drawn. ` : ''}${banded ? 'Bands: mean ± one standard deviation over the jobs of the group. ' : ''}${
       drawn.length ? 'Drag to zoom, double-click to see all; a name in the legend hides its curve.' : ''}</p>`}

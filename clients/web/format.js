@@ -78,4 +78,7 @@ export const METRICS = {
   'eval-v1/mean_aoi': 'Mean AoI on the layouts of eval-v1 (slots)',
 };
 
+/** Metrics whose values are shares, from 0 to 1. */
+export const isShare = (name) => ['eval/coverage', 'eval/fairness'].includes(name);
+
 export const metricName = (name) => METRICS[name] ?? name;

@@ -3,7 +3,7 @@
 import { html, useEffect, useRef, useState } from './htm-preact-3.1.1.js';
 import { download, followJob, get, post } from './api.js';
 import { Chart, smooth } from './chart.js';
-import { ago, bytes, clock, duration, flatten, METRICS, metricName, number, setting, short } from './format.js';
+import { ago, bytes, clock, duration, flatten, isShare, METRICS, metricName, number, setting, short } from './format.js';
 import { algorithmColour, colour } from './palette.js';
 import { go, link, setOptions } from './route.js';
 import { Action, Bar, Card, copy, Empty, ErrorBox, Field, Loaded, Loading, run, State, Tabs, Title, useLoad } from './ui.js';
@@ -143,7 +143,7 @@ function AllCurves({ job, events, options }) {
       <button type="button" onClick=${() => run(() => download(`/v1/jobs/${job.id}/metrics?format=csv`, `${job.name ?? job.id}.csv`))}>Save as CSV</button>`}>
       ${main.length ? html`<${Chart} curves=${main} label="Mean AoI (slots)" height=${320} />` : html`<${Empty} title="No metrics yet."><p>The first evaluation appears here soon after the job has started.</p><//>`}
     <//>
-    <div class="grid">${rest.map((name) => html`<${Card} key=${name} title=${metricName(name)}><${Chart} curves=${[of(name, own, name)]} label=${name} height=${210} /><//>`)}</div>`;
+    <div class="grid">${rest.map((name) => html`<${Card} key=${name} title=${metricName(name)}><${Chart} curves=${[of(name, own, name)]} label=${name} share=${isShare(name)} height=${210} /><//>`)}</div>`;
 }
 
 function Configuration({ job }) {

@@ -14,7 +14,7 @@ import { Card, Choice, copy, Empty, ErrorBox, Field, Loaded, Title, useLoad } fr
 const BOUNDS = { uavs: 64, users: 200, slots: 500 };
 const SPEEDS = [2, 5, 10, 20, 40];
 const SHOWN = [['ranges', 'Ranges'], ['links', 'Links'], ['trails', 'Trails'], ['q', 'Q-values']];
-/** First layout of the validation set, on which no policy is trained. */
+/** First layout of `eval-v1`, on which no policy is trained. */
 const FIRST_SEED = 10_000;
 
 const still = () => matchMedia('(prefers-reduced-motion: reduce)').matches;

@@ -12,7 +12,7 @@ use crate::invalid::Invalid;
 /// It is not TOML, or has a value that JSON cannot have; the error names file, field and value.
 pub fn parse(name: &str, text: &str) -> anyhow::Result<Value> {
     let table: toml::Table = toml::from_str(text).with_context(|| name.to_owned())?;
-    Ok(json("", Toml::Table(table)).with_context(|| name.to_owned())?)
+    json("", Toml::Table(table)).with_context(|| name.to_owned())
 }
 
 fn json(path: &str, value: Toml) -> Result<Value, Invalid> {

@@ -220,11 +220,10 @@ impl Flight {
         let differing = pairs.into_iter().filter(|&(_, now, trained, _)| differs(now, trained));
         let warning = |(field, now, trained, unit): (&'static str, f64, f64, f64)| {
             let (now, trained) = (tidy(now * unit), tidy(trained * unit));
-            let mut message = format!("{now} here, {trained} in the world that the policy was made for");
-            if let Some(rule) = policy.rule_in(&self.env).filter(|_| field == "world.detection_range") {
-                message += &format!("; with a range below its training the policy flies exactly as the rule {rule}");
-            }
-            Warning { field, message }
+            let rule = policy.rule_in(&self.env).filter(|_| field == "world.detection_range");
+            let flies = |rule| format!("; with a range below its training the policy flies exactly as the rule {rule}");
+            let flies = rule.map(flies).unwrap_or_default();
+            Warning { field, message: format!("{now} here, {trained} in the world that the policy was made for{flies}") }
         };
         let shape = (self.env.extent != [1.0; 2])
             .then(|| Warning { field: "frame", message: "the area is a rectangle; the policy was made for a square".into() });

@@ -131,6 +131,28 @@ const tests = {
     if (pictures) await page.getByRole('button', { name: 'Show all jobs' }).click();
   },
 
+  async 'curves of one colour differ in the legend as they do in the plot, and shares end at 1'() {
+    const ids = [];
+    for (const [algorithm, seed] of [['vdn', 1], ['vdn', 2], ['iql', 1]]) {
+      const training = { steps: 1000, eval_every: 500, eval_episodes: 8 };
+      ids.push((await main.call('POST', '/v1/jobs', { name: 'web-dashes', algorithm, seed, threads: 1, environment: { uavs: 9, users: 1 }, training })).id);
+    }
+    for (const id of ids) await main.reaches(id, 'succeeded');
+    const page = await open(`${main.url}/#/jobs?jobs=${ids.join(',')}&metric=eval/coverage`);
+    const markers = page.locator('.u-legend .u-series:not(.band-of-curve) .u-marker');
+    await until('three curves are drawn', async () => (await markers.count()) === 4);
+    const swatches = await markers.evaluateAll((all) => all.slice(1).map((one) => one.style.background));
+    assert.equal(new Set(swatches).size, 3, swatches.join('; '));
+    assert.equal(swatches.filter((one) => one.includes('gradient')).length, 1, swatches.join('; '));
+    assert.equal(await page.locator('.chart .uplot').first().getAttribute('data-top'), '1');
+    const decimals = await page.evaluate(async () => {
+      const { places } = await import('/ui/chart.js');
+      return [100, 1, 2.5, 0.5, 0.25, 0.1, 0.02, 1e-7, 1e-12].map(places);
+    });
+    assert.deepEqual(decimals, [0, 0, 1, 1, 2, 1, 2, 7, 9]);
+    if (pictures) await picture(page, 'dashes');
+  },
+
   async 'a waiting job says why, is edited, and is found by kind, label and best value'() {
     const long = await main.submit('web-first', { steps: 50_000_000 });
     await main.reaches(long, 'running');

@@ -238,8 +238,21 @@ def test_what_is_not_accepted_is_named(client):
         (lambda: qedgix.Graph({"a": {2: (0, 0, 1)}}), "graph.detections[a].ids"),
         (lambda: qedgix.Graph({"a": {"u": (0,)}}, {"u": 1}), "graph.detections[a][u]"),
         (lambda: qedgix.Graph({"a": {}}, {}, {}), "graph.positions[a]"),
-        (lambda: qedgix.Graph.from_arrays([[0, 9]], [[0, 0]], [1], uavs=1), "graph.edge_index"),
-        (lambda: qedgix.Graph.from_arrays([[1, 0]], [[0, 0]], [1], uavs=1), "graph.edge_index"),
+        (lambda: qedgix.Graph({"a": {}}, positions={"a": (0, 0), "A": (0, 0)}), "graph.positions[A]"),
+        (lambda: qedgix.Graph({"a": {}}, speeds={"A": 1}), "graph.speeds[A]"),
+        (lambda: qedgix.Graph({"a": {}}, endurance={"A": 10}), "graph.endurance[A]"),
+        (lambda: qedgix.Graph({"a": {}}, positions=np.zeros((1, 2))), "graph.positions"),
+        (lambda: qedgix.Graph(["a"]), "graph.detections"),
+        (lambda: qedgix.Graph({"a": [("u", 0, 0)]}), "graph.detections[a]"),
+        (lambda: qedgix.Graph.from_arrays([[0, 9]], [[0, 0]], [1], uavs=1), "graph.edge_index[0]"),
+        (lambda: qedgix.Graph.from_arrays([[1, 0]], [[0, 0]], [1], uavs=1), "graph.edge_index[0]"),
+        (lambda: qedgix.Graph.from_arrays([[0, 1.7]], [[0, 0]], [1], uavs=1), "graph.edge_index[0]"),
+        (lambda: qedgix.Graph.from_arrays([[0, 1], [0, np.nan]], [[0, 0]] * 2, [1], uavs=1), "graph.edge_index[1]"),
+        (lambda: qedgix.Graph.from_arrays([[0, np.inf]], [[0, 0]], [1], uavs=1), "graph.edge_index[0]"),
+        (lambda: qedgix.Graph.from_arrays([[0, 1], [0, 1]], [[0, 0]] * 2, [1], uavs=1), "graph.edge_index[1]"),
+        (lambda: qedgix.Graph.from_arrays([], [], [1], uavs=1.5), "uavs"),
+        (lambda: qedgix.Scene(np.zeros((3, 0)), []), "scene.uavs"),
+        (lambda: qedgix.Scene(np.zeros((1, 2)), [], uav_ids="a"), "scene.uavs.ids"),
         (lambda: qedgix.Graph.from_arrays([[0, 1]], [[0, 0]] * 2, [1], uavs=1), "graph.edge_relative"),
         (lambda: qedgix.Graph.from_arrays([], [], [[1]], uavs=1), "graph.aoi"),
         (lambda: qedgix.Graph.from_arrays([], [], [1], uavs=2, positions=[[0, 0]]), "graph.positions"),
@@ -249,6 +262,84 @@ def test_observations_are_checked_before_they_are_sent(make, field):
     with pytest.raises(qedgix.InvalidArgument) as refused:
         make()
     assert refused.value.field == field and refused.value.expected
+
+
+def test_a_fleet_without_users(client):
+    uavs = np.full((2, 2), 0.5)
+    for observation in (
+        qedgix.Scene(uavs, []),
+        qedgix.Scene(uavs, [], [], user_ids=[]),
+        qedgix.Scene(uavs, {}, {}),
+        qedgix.Scene(uavs, np.zeros((0, 2)), np.zeros(0)),
+        qedgix.Graph.from_arrays([], [], [], positions=uavs),
+        qedgix.Graph.from_arrays(np.zeros((0, 2), int), np.zeros((0, 2)), np.zeros(0), positions=uavs),
+    ):
+        assert len(client.act(observation, policy="random").headings) == 2
+    assert client.act_batch([]) == []
+    with pytest.raises(qedgix.InvalidArgument) as refused:
+        client.act(qedgix.Scene([], []), policy="random")
+    assert refused.value.field == "scene"
+
+
+@pytest.mark.parametrize(
+    ("call", "field"),
+    [
+        (lambda client: client.session("qedgix", seed=-1), "seed"),
+        (lambda client: client.session("qedgix", seed=1 << 64), "seed"),
+        (lambda client: client.session("qedgix", session_id=5), "session_id"),
+        (lambda client: client.session("qedgix", run_id=5), "run_id"),
+        (lambda client: client.session(5), "policy"),
+        (lambda client: client.get_session(5), "session_id"),
+        (lambda client: client.local_session("qedgix", seed=-1), "seed"),
+        (lambda client: client.local_session("qedgix", recurrent_state="text"), "recurrent_state"),
+        (lambda client: client.local_session("qedgix", step=-1), "step"),
+        (lambda client: client.uav("qedgix", 1, uav_ids=["a"], user_ids=[]), "uav_id"),
+        (lambda client: client.uav("qedgix", "a", uav_ids=["a", 1], user_ids=[]), "uav_ids[1]"),
+        (lambda client: client.uav("qedgix", "a", uav_ids=["a"], user_ids=5), "user_ids"),
+        (lambda client: client.uav("qedgix", "a", uav_ids=["a"], user_ids=[], seed=-1), "seed"),
+        (lambda client: client.uav("qedgix", "a", uav_ids=["a"], user_ids=[]).decide(["text"]), "messages"),
+        (lambda client: client.act(Fleet(0).scene(), policy="sweep", timeout="soon"), "timeout"),
+        (lambda client: client.session("qedgix", frame=1000), "frame"),
+        (lambda client: client.session("qedgix", world={"speed": 1}), "world"),
+        (lambda client: client.session("qedgix", constraints={}), "constraints"),
+        (lambda client: client.act_batch([Fleet(0).scene()]), "slots[0]"),
+        (lambda client: client.act_batch(5), "slots"),
+        (lambda client: client.uav("qedgix", "a", uav_ids=["a"], user_ids=[]).decide(5), "messages"),
+        (lambda client: client.uav("qedgix", "a", uav_ids=["a"], user_ids=[]).encode([]), "detections"),
+        (lambda client: client.uav("qedgix", "a", uav_ids=["a"], user_ids=[]).encode({5: (0, 0)}), "detections"),
+        (lambda client: client.policies.get(5), "policy"),
+        (lambda client: client.policies.upload("name", 5), "checkpoint"),
+        (lambda client: client.jobs.submit(idempotency_key="\u00fc"), "idempotency_key"),
+        (lambda client: client.jobs.list(labels="team=a"), "labels"),
+        (lambda client: client.jobs.list(created_after="today"), "created_after"),
+        (lambda client: client.jobs.list(metrics="loss"), "metrics"),
+        (lambda client: client.jobs.submit(idempotency_key=5), "idempotency_key"),
+    ],
+)
+def test_arguments_of_another_type_are_named(client, call, field):
+    with pytest.raises(qedgix.InvalidArgument) as refused:
+        call(client)
+    error = refused.value
+    assert error.field == field and error.expected and not error.request_id
+
+
+def test_a_session_that_was_never_opened_says_so(connect):
+    # There is no server: nothing is sent.
+    client = connect("127.0.0.1:1")
+    session = client.session("qedgix")
+    scene = Fleet(0).scene()
+    stream = client.stream()
+    for call in (
+        lambda: session.act(scene),
+        lambda: client.act_batch([(session, scene)]),
+        lambda: stream.send(session, scene),
+        lambda: session.policy,
+        lambda: session.warnings,
+    ):
+        with pytest.raises(qedgix.FailedPrecondition, match=r"not open; use `.*with client\.session") as refused:
+            call()
+        assert refused.value.code == "not_open" and isinstance(refused.value, RuntimeError)
+    stream.close()
 
 
 @pytest.mark.parametrize(

@@ -68,19 +68,42 @@ def test_what_is_not_accepted_is_named(client):
         with pytest.raises(qedgix.InvalidArgument) as refused, client.environment(config):
             pass
         assert refused.value.field.startswith(field.partition(".")[0]), refused.value.field
-    for number in ({"count": -1}, {"seed": -1}, {"count": "2"}):
-        with pytest.raises(qedgix.InvalidArgument):
-            client.environment(CONFIG, **number)
+    for field, number in [("count", -1), ("seed", -1), ("count", "2"), ("environment_id", 5)]:
+        with pytest.raises(qedgix.InvalidArgument) as refused:
+            client.environment(CONFIG, **{field: number})
+        assert (refused.value.field, refused.value.value) == (field, repr(number))
+    for config, field in [({"speed": float("nan")}, "environment.speed"), ({"uavs": {1}}, "environment.uavs")]:
+        with pytest.raises(qedgix.InvalidArgument) as refused:
+            client.environment(config)
+        assert refused.value.field == field
     with client.environment(CONFIG) as environment:
         environment.reset()
         for headings in ([0, 8], [0], [[0, 1], [0, 1]]):
             with pytest.raises(qedgix.InvalidArgument) as refused:
                 environment.step(headings)
             assert refused.value.field.startswith("actions")
-        for headings in ([0.5, 1.0], [-1, 0], 3, [[[0, 1]]], "north"):
+        for reset in ({"seed": -1}, {"episode": -1}, {"seed": 0.5}):
+            with pytest.raises(qedgix.InvalidArgument) as refused:
+                environment.reset(**reset)
+            assert [refused.value.field] == list(reset)
+        for headings in ([0.5, 1.0], [-1, 0], 3, [[[0, 1]]], "north", [[0, 1], [0]], [0, 1 << 40]):
             with pytest.raises(qedgix.InvalidArgument) as refused:
                 environment.step(headings)
             assert refused.value.field == "headings"
         assert environment.step([0, 1]).step == 1
-    with pytest.raises(RuntimeError):
-        _ = client.environment(CONFIG).config
+
+
+def test_an_environment_that_was_never_created_says_so(connect):
+    # There is no server: nothing is sent.
+    environment = connect("127.0.0.1:1").environment(CONFIG)
+    for call in (lambda: environment.reset(seed=1), lambda: environment.step([0, 1]), lambda: environment.config):
+        with pytest.raises(qedgix.FailedPrecondition, match=r"not open; use `.*with client\.environment") as refused:
+            call()
+        assert refused.value.code == "not_open"
+
+
+def test_numbers_of_numpy_configure_an_environment(client):
+    config = {"uavs": np.int64(2), "users": np.uint8(3), "speed": np.float32(0.125), "hover": np.bool_(True)}
+    with client.environment(config, count=np.int64(2), seed=np.int64(3)) as environment:
+        assert (environment.config["speed"], environment.headings, environment.count) == (0.125, 9, 2)
+        assert environment.reset(seed=np.int64(5), episode=np.int64(1)).uavs.shape == (2, 2, 2)

@@ -95,12 +95,37 @@ def test_tls_and_client_certificates(make_server, connect, tmp_path):
             client.policies.list()
 
 
+def test_exchanged_addresses_are_told_and_not_tried_again(server, connect):
+    client = connect(server.http, server.grpc, retry=qedgix.Retry(initial=30.0))
+    fleet, scene = client.local_session("sweep"), Fleet(0).scene()
+    with client.stream() as stream:
+        for call in (client.list_sessions, lambda: fleet.act(scene), lambda: stream.act(fleet, scene)):
+            with pytest.raises(qedgix.InvalidArgument, match="this is that of REST") as refused:
+                call()
+            assert (refused.value.field, refused.value.value) == ("grpc", server.http)
+    for call in (client.policies.list, lambda: client.jobs.submit(), lambda: client.jobs.get("job")):
+        with pytest.raises(qedgix.InvalidArgument, match="this is that of gRPC") as refused:
+            call()
+        assert (refused.value.field, refused.value.value) == ("http", server.grpc)
+
+
+def test_an_address_without_a_server_is_in_the_message(connect):
+    client = connect("127.0.0.1:1", "127.0.0.1:2", retry=qedgix.Retry(attempts=1))
+    with pytest.raises(qedgix.Unavailable, match=r"gRPC at 127\.0\.0\.1:1 \(`grpc` of the client\)"):
+        client.list_sessions()
+    with pytest.raises(qedgix.Unavailable, match=r"REST at 127\.0\.0\.1:2 \(`http` of the client\)"):
+        client.policies.list()
+
+
 @pytest.mark.parametrize("address", ["", "host", "host:port", "ftp://host:1", "http://host:1/path", "http://:1", "a b:1:2"])
 def test_addresses_are_checked(connect, address):
     for addresses, field in (((address, "h:1"), "grpc"), (("h:1", address), "http")):
         with pytest.raises(qedgix.InvalidArgument) as refused:
             connect(*addresses)
         assert refused.value.field == field
+    with pytest.raises(qedgix.InvalidArgument) as refused:
+        connect("h:1", 8080)
+    assert (refused.value.field, refused.value.value) == ("http", "8080")
 
 
 def test_half_a_client_certificate_is_refused(connect):

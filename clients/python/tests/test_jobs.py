@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import math
 import sys
+from datetime import timedelta
 
+import numpy as np
 import pytest
 
 import qedgix
@@ -159,11 +161,55 @@ def test_a_sweep_has_a_result(client, name):
     fields = {key: value for key, value in SMALL.items() if key != "algorithm"}
     job = client.jobs.submit(kind="sweep", name=name, sweep={"grid": {"algorithm": ["vdn", "iql"]}, "seeds": 1}, **fields)
     assert job.wait(progress=True).result()
-    children = [one for one in client.jobs.list() if one.document.get("parent") == job.id]
+    children = client.jobs.list(parent=job.id)
     assert [one.state for one in children] == ["succeeded"] * 2
+    assert {one.document["parent"] for one in children} == {job.id}
     for policy in {str(one.policy).partition(":")[0] for one in children}:
         client.policies.delete(policy)
     job.delete()
+
+
+def test_a_list_of_jobs_is_filtered_sorted_and_limited(client, name):
+    names = [f"{name}-{i}" for i in range(3)]
+    fields = {"training": {"steps": np.int64(400), "eval_every": np.int32(200), "learning_rate": np.float32(0.001)}}
+    labels = [{"team": "a"}, {"team": "b"}, {"team": "b", "urgent": ""}]
+    jobs = [client.jobs.submit(**{**SMALL, **fields}, name=names[i], seed=np.int64(i), labels=labels[i]) for i in range(3)]
+    for job in jobs:
+        job.wait()
+    assert jobs[2].config["seed"] == 2 and jobs[2].config["training"]["eval_every"] == 200
+
+    def listed(**filters):
+        return [one.name for one in client.jobs.list(name=f"{name}-*", **filters)]
+
+    assert listed() == names[::-1] and listed(sort="name") == names
+    assert listed(labels={"team": "b"}, sort="created") == names[1:]
+    assert listed(labels={"team": "b", "urgent": None}) == names[2:]
+    assert listed(state="succeeded", kind="train", algorithm="vdn", limit=2) == names[:0:-1]
+    assert listed(kind="sweep") == listed(algorithm="qmix") == listed(parent=jobs[0].id) == []
+    assert listed(created_after=jobs[1].created_at, created_before=jobs[2].created_at) == [names[1]]
+    assert listed(created_after=jobs[2].created_at + timedelta(seconds=1)) == []
+    best = client.jobs.list(name=f"{name}-*", sort="best:eval/mean_aoi", metrics=["eval/mean_aoi"], limit=np.int64(1))
+    assert best[0].document["metrics"]["eval/mean_aoi"]
+    for filters, field in [({"state": "lazy"}, "state"), ({"limit": 0}, "limit"), ({"sort": "size"}, "sort")]:
+        with pytest.raises(qedgix.InvalidArgument) as refused:
+            client.jobs.list(**filters)
+        assert refused.value.field == field
+    for job in jobs:
+        job.delete()
+        client.policies.delete(str(job.name))
+
+
+def test_a_job_that_has_ended_is_continued(client, name):
+    first = client.jobs.submit(**SMALL, name=name).wait()
+    second = first.continue_(np.int64(200), idempotency_key=name)
+    assert first.continue_(200, idempotency_key=name).id == second.id != first.id
+    assert (second.name, second.steps, second.wait().state) == (name, 200, "succeeded")
+    with pytest.raises(qedgix.InvalidArgument) as refused:
+        first.continue_(0)
+    assert refused.value.field == "steps"
+    for job in (first, second):
+        job.delete()
+    client.policies.delete(name)
 
 
 def test_an_idempotency_key_names_a_job(client, name):
@@ -181,6 +227,10 @@ def test_what_is_not_accepted_is_named(client, tmp_path):
         ("training.stepps", {"training": {"stepps": 1}}),
         ("colour", {"colour": "red"}),
         ("threads", {"threads": 0}),
+        ("training.learning_rate", {"training": {"learning_rate": float("nan")}}),
+        ("training.learning_rate", {"training": {"learning_rate": np.float32(np.inf)}}),
+        ("sweep.grid.seed[1]", {"kind": "sweep", "sweep": {"grid": {"seed": [1, {2}]}}}),
+        ("labels", {"labels": {None: "a"}}),
     ]:
         with pytest.raises(qedgix.InvalidArgument) as refused:
             client.jobs.submit(**body)

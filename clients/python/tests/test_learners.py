@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import pickle
 import warnings
 
@@ -190,14 +191,29 @@ def test_wrong_arguments_are_named(server):
         ({"render_mode": "human"}, "render_mode"),
         ({"environment": {"slots": 5}, "max_cycles": 6}, "max_cycles"),
         ({"environment": {"uavs": 0}}, "environment"),
+        ({"environment": 5}, "environment"),
     ]:
         with pytest.raises(qedgix.InvalidArgument) as refused:
             qedgix.parallel_env(server.grpc, **options)
         assert refused.value.field.startswith(field) or refused.value.field == "uavs"
+    for make in (qedgix.parallel_env, qedgix.fleet_env, functools.partial(qedgix.vector_env, count=2)):
+        with pytest.raises(qedgix.InvalidArgument) as refused:
+            make(server.grpc, seed=-1)
+        assert refused.value.field == "seed"
+        env = make(server.grpc, {"uavs": np.int64(2)}, seed=np.int64(3), max_cycles=np.int64(4))
+        for seed in (-1, 0.5, 1 << 60):
+            with pytest.raises(qedgix.InvalidArgument) as refused:
+                env.reset(seed=seed)
+            assert (refused.value.field, refused.value.value) == ("seed", str(seed))
+        env.reset(seed=np.int64(3))
+        env.close()
     env = qedgix.parallel_env(server.grpc)
-    with pytest.raises(RuntimeError):
+    with pytest.raises(qedgix.FailedPrecondition):
         env.state()
     env.reset()
+    with pytest.raises(qedgix.InvalidArgument) as refused:
+        env.step(dict.fromkeys(env.agents, "north"))
+    assert refused.value.field == "actions[uav_0]"
     with pytest.raises(qedgix.InvalidArgument) as refused:
         env.step({"uav_0": 0})
     assert refused.value.field == "actions[uav_1]"

@@ -235,12 +235,18 @@ fn expected_value(message: &str) -> String {
 }
 
 /// Reads a parameter that is a time.
+///
+/// # Errors
+/// It is not a time in the form of RFC 3339.
 pub fn time<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Timestamp>, D::Error> {
     let time = String::deserialize(deserializer)?.parse();
     time.map(Some).map_err(|_| D::Error::custom("expected a time such as 2026-01-31T12:00:00Z"))
 }
 
 /// Reads a parameter that is the id of a job.
+///
+/// # Errors
+/// It is not a UUID.
 pub fn job_id<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Uuid>, D::Error> {
     let id = String::deserialize(deserializer)?.parse();
     id.map(Some).map_err(|_| D::Error::custom("expected the id of a job"))

@@ -117,14 +117,10 @@ impl<'a> Fleet<'a> {
                 Some(found) => found,
                 None => self.place(&order, &mut chosen, &mut left),
             };
-            self.assign(&order, &best.1, &mut chosen);
+            assign(&order, &best.1, &mut chosen);
             tests -= share - left;
             order.iter().for_each(|&i| headings[i] = chosen[i].unwrap_or(headings[i]));
         }
-    }
-
-    fn assign(&self, order: &[usize], headings: &[u8], chosen: &mut [Option<u8>]) {
-        order.iter().zip(headings).for_each(|(&i, &h)| chosen[i] = Some(h));
     }
 
     /// The cost of `headings` of the UAVs in `order`, given those that are chosen outside of the group.
@@ -190,7 +186,7 @@ impl<'a> Fleet<'a> {
                 best = (cost, hovering);
             }
         }
-        self.assign(order, &best.1, chosen);
+        assign(order, &best.1, chosen);
         for _ in 0..MAX_REPAIRS {
             let mut changed = false;
             for &i in order {
@@ -290,6 +286,11 @@ fn neighbours(from: &[Point], reaches: &[f64], min_separation: f64) -> Vec<Vec<u
         }
     }
     near
+}
+
+/// Chooses `headings` for the UAVs in `order`.
+fn assign(order: &[usize], headings: &[u8], chosen: &mut [Option<u8>]) {
+    order.iter().zip(headings).for_each(|(&i, &h)| chosen[i] = Some(h));
 }
 
 /// The connected groups of UAVs that can come too near to each other.

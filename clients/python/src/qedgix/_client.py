@@ -94,8 +94,10 @@ def _file(given: str | os.PathLike[str] | None, variable: str) -> Path | None:
 
 def _url(field: str, address: str, scheme: str) -> str:
     """`http://HOST:PORT` or `https://HOST:PORT`."""
-    text = address if "://" in address else f"{scheme}://{address}"
     expected = "HOST:PORT, http://HOST:PORT or https://HOST:PORT"
+    if not isinstance(address, str):
+        raise invalid(field, repr(address), expected)
+    text = address if "://" in address else f"{scheme}://{address}"
     try:
         parts = urlsplit(text)
         complete = parts.port is not None

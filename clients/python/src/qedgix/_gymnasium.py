@@ -13,8 +13,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from ._hosted import Hosted
+from ._hosted import MAX_SEED, Hosted
 from ._sync.client import Client
+from ._values import whole
 from .errors import invalid
 from .results import Arrays, EnvironmentState
 
@@ -69,9 +70,9 @@ class QedgixVectorEnv(VectorEnv[Floats, Headings, NDArray[Any]]):
         Raises:
             InvalidArgument: a list of seeds is not consecutive.
         """
-        if seed is not None and not isinstance(seed, int):
+        if isinstance(seed, (Sequence, np.ndarray)):
             seeds = list(seed)
-            first = seeds[0] if seeds else None
+            first = None if not seeds or seeds[0] is None else whole("seed[0]", seeds[0], 0, MAX_SEED)
             if seeds != ([None] * self.num_envs if first is None else list(range(first, first + self.num_envs))):
                 raise invalid("seed", seeds, f"a number, or {self.num_envs} consecutive numbers")
             seed = first
@@ -160,8 +161,9 @@ class QedgixFleetEnv(gymnasium.Env[Floats, Headings], EzPickle):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         """Starts episode 0 of a new seed, or the next episode. `options` has no effect."""
-        super().reset(seed=seed)
-        return self._result(self._hosted.reset(seed))
+        state = self._hosted.reset(seed)
+        super().reset(seed=None if seed is None else int(seed))
+        return self._result(state)
 
     def step(self, action: Headings) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Moves all UAVs for one slot.

@@ -12,7 +12,8 @@ from ._observer import Observer
 from ._render import render
 from ._sync.client import Client
 from ._sync.environments import Environment
-from .errors import FailedPrecondition, NotFound, invalid
+from ._values import instance, mapping, whole
+from .errors import FailedPrecondition, NotFound, invalid, out_of_order
 from .results import EnvironmentState
 
 MAX_SEED = 2**53 - 1
@@ -42,7 +43,7 @@ class Hosted:
         auto_reset: bool,
         own_position: bool,
     ) -> None:
-        config = dict(environment or {})
+        config = {} if environment is None else dict(mapping("environment", environment))
         if max_cycles is not None:
             given = config.pop("K", config.get("slots", max_cycles))
             if given != max_cycles:
@@ -50,8 +51,8 @@ class Hosted:
             config["slots"] = max_cycles
         self._environment_config, self._count, self._auto_reset = config, count, auto_reset
         self._own_client = isinstance(server, str)
-        self.client = Client(server) if isinstance(server, str) else server
-        self.seed = random_seed() if seed is None else seed
+        self.seed = random_seed() if seed is None else whole("seed", seed, 0, MAX_SEED)
+        self.client = Client(server) if isinstance(server, str) else instance("server", server, Client)
         self._next_episode = 0
         try:
             self._environment = self._create()
@@ -71,7 +72,7 @@ class Hosted:
     def reset(self, seed: int | None) -> EnvironmentState:
         """Starts episode 0 of a new seed, or the next episode. An environment that has expired is made again."""
         if seed is not None:
-            self.seed, self._next_episode = seed, 0
+            self.seed, self._next_episode = whole("seed", seed, 0, MAX_SEED), 0
         try:
             state = self._environment.reset(seed=self.seed, episode=self._next_episode)
         except (NotFound, FailedPrecondition) as error:
@@ -94,10 +95,10 @@ class Hosted:
         """The state after the last reset or step.
 
         Raises:
-            RuntimeError: there was no reset.
+            FailedPrecondition: there was no reset.
         """
         if self.state is None:
-            raise RuntimeError("reset the environment first")
+            raise out_of_order("reset the environment first")
         return self.state
 
     def picture(self, copy: int = 0) -> NDArray[np.uint8]:

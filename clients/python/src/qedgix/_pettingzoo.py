@@ -97,7 +97,7 @@ class QedgixParallelEnv(ParallelEnv, EzPickle):
         missing = [agent for agent in self.agents if agent not in actions]
         if missing:
             raise invalid(f"actions[{missing[0]}]", "nothing", "a heading")
-        state = self._hosted.step([[int(actions[agent]) for agent in self.agents]])
+        state = self._hosted.step([[_heading(agent, actions[agent]) for agent in self.agents]])
         agents, truncated = self.agents, bool(state.truncated[0])
         if truncated:
             self.agents = []
@@ -132,3 +132,10 @@ class QedgixParallelEnv(ParallelEnv, EzPickle):
     def close(self) -> None:
         """Deletes the environment on the server."""
         self._hosted.close()
+
+
+def _heading(agent: str, action: Any) -> int:
+    try:
+        return int(action)
+    except (TypeError, ValueError):
+        raise invalid(f"actions[{agent}]", repr(action), "a heading") from None

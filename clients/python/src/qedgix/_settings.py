@@ -6,11 +6,12 @@ import random
 import ssl
 from dataclasses import dataclass
 from pathlib import Path
+from time import monotonic
 from urllib.parse import urlsplit
 
 import grpc
 
-from .errors import DeadlineExceeded, QedgixError, ResourceExhausted, Unavailable
+from .errors import DeadlineExceeded, QedgixError, ResourceExhausted, Unavailable, invalid
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,33 @@ class Settings:
     def metadata(self) -> tuple[tuple[str, str], ...]:
         """Metadata of every gRPC call; headers of every REST request."""
         return (("authorization", f"Bearer {self.api_key}"),) if self.api_key else ()
+
+    @property
+    def grpc_peer(self) -> str:
+        """Where gRPC goes, for messages."""
+        return f"gRPC at {self.target} (`grpc` of the client)"
+
+    @property
+    def http_peer(self) -> str:
+        """Where REST goes, for messages."""
+        return f"REST at {self.http_target} (`http` of the client)"
+
+    @property
+    def http_target(self) -> str:
+        """HOST:PORT of REST, for messages."""
+        return urlsplit(self.http_url).netloc.rpartition("@")[2]
+
+    def deadline(self, timeout: float | None) -> float:
+        """When a call with this timeout (None: that of the client) ends, as `monotonic` counts.
+
+        Raises:
+            InvalidArgument: the timeout is no number.
+        """
+        seconds = self.timeout if timeout is None else timeout
+        try:
+            return monotonic() + seconds
+        except TypeError:
+            raise invalid("timeout", repr(seconds), "a number of seconds, or None") from None
 
     @property
     def target(self) -> str:

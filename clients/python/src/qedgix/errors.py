@@ -103,8 +103,12 @@ class AlreadyExists(QedgixError):
     """Something with this name exists and differs from what was asked for."""
 
 
-class FailedPrecondition(QedgixError):
-    """The state of the resource does not allow the operation: `wrong_step`, `session_expired`, `episode_over`, and others."""
+class FailedPrecondition(QedgixError, RuntimeError):
+    """The state of the resource does not allow the operation: `wrong_step`, `session_expired`, `episode_over`, and others.
+
+    The client itself raises it before a request, with the code `not_open`: the session or the environment was never opened; or
+    `failed_precondition`: the calls of a stream or an environment have another order.
+    """
 
 
 class ResourceExhausted(QedgixError):
@@ -199,8 +203,8 @@ def family(code: str, status: int = 13) -> type[QedgixError]:
     return known or (Internal if status == 13 else _GRPC.get(status, (Internal, ""))[0])
 
 
-def from_grpc(error: grpc.RpcError) -> QedgixError:
-    """The exception of a call that failed."""
+def from_grpc(error: grpc.RpcError, peer: str) -> QedgixError:
+    """The exception of a call that failed. `peer` says in an error that no server has sent where the call went."""
     # Every error of a call is also the call, which has these methods.
     call: Any = error
     status: int = call.code().value[0]
@@ -210,7 +214,7 @@ def from_grpc(error: grpc.RpcError) -> QedgixError:
     details: dict[str, Any] = {"request_id": metadata.get("x-request-id", "")}
     if not code:
         kind, code = _GRPC.get(status, (Internal, "internal"))
-        return kind(message, code=code, **details)
+        return kind(f"{peer}: {message}", code=code, **details)
     for key, value in call.trailing_metadata() or ():
         if key == "grpc-status-details-bin":
             details.update(_details(value))
@@ -266,6 +270,11 @@ def from_http(response: httpx.Response) -> QedgixError:
         request_id=request_id,
         **{name: problem.get(name) for name in names},
     )
+
+
+def out_of_order(message: str, code: str = "failed_precondition") -> FailedPrecondition:
+    """A call that cannot be made yet."""
+    return FailedPrecondition(message, code=code)
 
 
 def invalid(field: str, value: object, expected: str) -> InvalidArgument:

@@ -8,6 +8,7 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ._values import mapping, several, whole
 from .errors import invalid
 from .v1 import policy_pb2 as pb
 
@@ -58,6 +59,8 @@ class Scene:
 
     def fill(self, scene: pb.Scene) -> None:
         """Writes the scene to a message."""
+        # A scene without nodes is one, too.
+        scene.SetInParent()
         add_uav, add_user = scene.uavs.add, scene.users.add
         for name, (x, y) in zip(self._uav_ids, self._uavs):
             add_uav(id=name, x=x, y=y)
@@ -111,9 +114,13 @@ class Graph:
         endurance: Mapping[str, float] | None = None,
     ) -> None:
         message = pb.Graph()
-        users = {} if aoi is None else dict(aoi)
-        _texts("graph.uavs", detections)
+        _texts("graph.uavs", mapping("graph.detections", detections))
+        users = {} if aoi is None else dict(mapping("graph.aoi", aoi))
         _texts("graph.users", users)
+        for field, of_uavs in (("positions", positions), ("speeds", speeds), ("endurance", endurance)):
+            for name in () if of_uavs is None else mapping(f"graph.{field}", of_uavs):
+                if name not in detections:
+                    raise invalid(f"graph.{field}[{name}]", name, "a UAV of `detections`")
         for name, targets in detections.items():
             node = message.nodes.add(id=name, kind=pb.NODE_KIND_UAV)
             if positions is not None:
@@ -122,7 +129,7 @@ class Graph:
                 node.speed = _number(f"graph.speeds[{name}]", speeds[name])
             if endurance is not None and name in endurance:
                 node.endurance_seconds = _number(f"graph.endurance[{name}]", endurance[name])
-            _texts(f"graph.detections[{name}]", targets)
+            _texts(f"graph.detections[{name}]", mapping(f"graph.detections[{name}]", targets))
             for target, seen in targets.items():
                 field = f"graph.detections[{name}][{target}]"
                 if target in detections:
@@ -161,10 +168,13 @@ class Graph:
             user_ids: default user-0, user-1, ...
 
         Raises:
-            InvalidArgument: an array has another shape, or an index is out of range.
+            InvalidArgument: an array has another shape, an index is no whole number or out of range, or an edge is there twice.
         """
         places = None if positions is None else _rows("graph.positions", positions)
-        given = uavs if uavs is not None else len(places) if places is not None else len(uav_ids or ())
+        if uavs is not None:
+            given = whole("uavs", uavs, 0, 2**32 - 1)
+        else:
+            given = len(places) if places is not None else len(uav_ids or ())
         names = _ids("graph.uavs", uav_ids, given, "uav")
         if places is not None and len(places) != given:
             raise invalid("graph.positions", len(places), f"{given} rows, one per UAV")
@@ -179,13 +189,14 @@ class Graph:
         if len(index) != len(relative):
             raise invalid("graph.edge_relative", len(relative), f"{len(index)} rows, one per row of edge_index")
         detections: dict[str, dict[str, list[float]]] = {name: {} for name in names}
-        for (source, target), pair in zip(index, relative):
-            source, target = int(source), int(target)
-            if not 0 <= source < given:
-                raise invalid("graph.edge_index", source, f"the index of a UAV, 0 to {given - 1}")
-            if not 0 <= target < len(ids):
-                raise invalid("graph.edge_index", target, f"the index of a node, 0 to {len(ids) - 1}")
-            detections[ids[source]][ids[target]] = pair
+        for e, (edge, pair) in enumerate(zip(index, relative)):
+            field = f"graph.edge_index[{e}]"
+            source = _index(field, edge[0], given, "the index of a UAV")
+            target = _index(field, edge[1], len(ids), "the index of a node")
+            seen = detections[ids[source]]
+            if ids[target] in seen:
+                raise invalid(field, f"({source}, {target})", "each edge once")
+            seen[ids[target]] = pair
         return cls(
             detections,
             dict(zip(users, ages)),
@@ -258,9 +269,10 @@ def _default_ids(prefix: str, count: int) -> tuple[str, ...]:
 def _ids(field: str, given: Sequence[str] | None, count: int, prefix: str) -> Sequence[str]:
     if given is None:
         return _default_ids(prefix, count)
-    if len(given) != count:
-        raise invalid(f"{field}.ids", len(given), f"{count} ids")
-    return _texts(field, given)
+    ids = several(f"{field}.ids", given)
+    if len(ids) != count:
+        raise invalid(f"{field}.ids", len(ids), f"{count} ids")
+    return _texts(field, ids)
 
 
 def _texts(field: str, ids: Iterable[str]) -> Sequence[str]:
@@ -283,10 +295,20 @@ def _array(values: ArrayLike, field: str) -> NDArray[Any]:
 def _rows(field: str, points: ArrayLike) -> list[list[float]]:
     """The rows of an array (n, 2)."""
     array = _array(points, field)
+    # No points are an array without a second dimension.
+    if array.shape == (0,):
+        return []
     if array.ndim != 2 or array.shape[1] != 2:
         raise invalid(field, array.shape, "shape (n, 2)")
     rows: list[list[float]] = array.tolist()
     return rows
+
+
+def _index(field: str, number: float, count: int, expected: str) -> int:
+    # Numbers that are not finite are not within the range.
+    if not 0 <= number < count or number != int(number):
+        raise invalid(field, number, f"{expected}, 0 to {count - 1}")
+    return int(number)
 
 
 def _column(field: str, numbers: ArrayLike, count: int | None) -> list[float]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ._values import instance
 from .errors import QedgixError, invalid
 from .v1 import policy_pb2 as pb
 
@@ -161,11 +162,11 @@ class Surroundings:
     def put(self, request: Any) -> None:
         """Writes what is set to a request."""
         if self.frame is not None:
-            request.frame.CopyFrom(self.frame.message())
+            request.frame.CopyFrom(instance("frame", self.frame, Frame).message())
         if self.world is not None:
-            request.world.CopyFrom(self.world.message())
+            request.world.CopyFrom(instance("world", self.world, World).message())
         if self.constraints is not None:
-            request.constraints.CopyFrom(self.constraints.message())
+            request.constraints.CopyFrom(instance("constraints", self.constraints, Constraints).message())
         if not self.symmetric:
             request.symmetric = False
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from .._client import BaseClient
 from .._settings import Settings
+from .._values import made, several, text, texts
 from ..errors import QedgixError
 from ..observations import Observation
 from ..results import Decision, SessionInfo
@@ -65,7 +66,8 @@ class AsyncClient(BaseClient):
             constraints: what no heading may break.
             symmetric: whether, where only one of two nodes of a graph reports the other, both detect each other. Default: True.
         """
-        request = pb.OpenSessionRequest(policy=policy, session_id=session_id or uuid.uuid4().hex, run_id=run_id, seed=seed)
+        name = session_id or uuid.uuid4().hex
+        request = made(pb.OpenSessionRequest, policy=policy, session_id=name, run_id=run_id, seed=seed)
         Surroundings(frame, world, constraints, symmetric).put(request)
         return AsyncSession(self._transport, request)
 
@@ -101,7 +103,7 @@ class AsyncClient(BaseClient):
         Raises:
             NotFound, FailedPrecondition: the session is closed or has expired.
         """
-        found = await self._transport.call(sessions.GET, pb.GetSessionRequest(session_id=session_id))
+        found = await self._transport.call(sessions.GET, made(pb.GetSessionRequest, session_id=session_id))
         session = AsyncSession(self._transport, pb.OpenSessionRequest(session_id=session_id))
         session.info = SessionInfo.of(found)
         session.step = found.steps
@@ -142,7 +144,9 @@ class AsyncClient(BaseClient):
             recurrent_state: that of an earlier object, to continue its episode.
             step: that of the earlier object.
         """
-        common = pb.ActRequest(policy=policy)
+        # What slot 0 and later slots send is checked here, where the caller gives it.
+        made(pb.ActRequest, seed=seed, recurrent_state=recurrent_state, step=step)
+        common = made(pb.ActRequest, policy=policy)
         Surroundings(frame, world, constraints, symmetric).put(common)
         session = AsyncLocalSession(self._transport, common, seed, recurrent_state)
         session.step = step
@@ -173,9 +177,11 @@ class AsyncClient(BaseClient):
             world: as for `session`.
             state: that of an earlier object, to continue.
         """
-        first = pb.EncodeRequest(policy=policy, uav_ids=uav_ids, user_ids=user_ids, seed=seed)
+        made(pb.EncodeRequest, state=state)
+        uavs, users = texts("uav_ids", uav_ids), texts("user_ids", user_ids)
+        first = made(pb.EncodeRequest, policy=policy, uav_ids=uavs, user_ids=users, seed=seed)
         Surroundings(frame, world).put(first)
-        return AsyncUav(self._transport, first, uav_id, state)
+        return AsyncUav(self._transport, first, text("uav_id", uav_id), state)
 
     async def act(
         self,
@@ -222,7 +228,7 @@ class AsyncClient(BaseClient):
         Raises:
             QedgixError: the whole call failed.
         """
-        return await sessions.act_batch(self._transport, list(slots), q_values, timeout)
+        return await sessions.act_batch(self._transport, several("slots", slots), q_values, timeout)
 
     def stream(self) -> AsyncActStream:
         """A stream for `async with`: slots of many fleets without a call for each."""

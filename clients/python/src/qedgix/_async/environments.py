@@ -10,7 +10,8 @@ import numpy as np
 from google.protobuf.json_format import MessageToDict, ParseDict, ParseError
 from numpy.typing import ArrayLike
 
-from ..errors import NotFound, QedgixError, invalid
+from .._values import made, plain
+from ..errors import NotFound, QedgixError, invalid, out_of_order
 from ..results import EnvironmentState
 from ..v1 import environment_pb2 as pb
 from .transport import AsyncTransport, Method
@@ -29,13 +30,13 @@ def create_request(
     environment_id: str, environment: Mapping[str, Any] | None, count: int, seed: int, auto_reset: bool
 ) -> pb.CreateEnvironmentRequest:
     """The request that creates an environment."""
-    request = pb.CreateEnvironmentRequest(auto_reset=auto_reset, environment_id=environment_id)
+    request = made(pb.CreateEnvironmentRequest, auto_reset=auto_reset, environment_id=environment_id, count=count, seed=seed)
     try:
-        request.count = count
-        request.seed = seed
-        ParseDict(dict(environment or {}), request.environment)
+        ParseDict(plain("environment", dict(environment or {})), request.environment)
     except (ParseError, TypeError, ValueError) as error:
-        raise invalid("environment", error, "a dict that JSON can hold, count from 1, seed from 0") from None
+        if isinstance(error, QedgixError):
+            raise
+        raise invalid("environment", error, "a dict that JSON can hold") from None
     return request
 
 
@@ -64,7 +65,9 @@ class AsyncEnvironment:
     @property
     def _message(self) -> pb.Environment:
         if self._created is None:
-            raise RuntimeError("the environment is not created")
+            raise out_of_order(
+                "the environment is not open; use `async with client.environment(...)`, or `create` it", "not_open"
+            )
         return self._created
 
     @property
@@ -107,9 +110,10 @@ class AsyncEnvironment:
 
         Raises:
             NotFound, FailedPrecondition: the server does not have the environment any more (`not_found`,
-                `environment_expired`); create another one.
+                `environment_expired`); create another one. `not_open`: it was never created.
         """
-        request = pb.ResetRequest(environment_id=self.id, seed=seed, episode=episode, return_graph=graphs)
+        name = self._message.environment_id
+        request = made(pb.ResetRequest, environment_id=name, seed=seed, episode=episode, return_graph=graphs)
         state = EnvironmentState(await self._transport.call(RESET, request, timeout))
         self._step = state.step
         return state
@@ -124,21 +128,26 @@ class AsyncEnvironment:
 
         Raises:
             InvalidArgument: `headings` has another shape, or a value that is no heading.
-            FailedPrecondition: `episode_over`: reset first, or create it with `auto_reset`; `environment_expired`.
+            FailedPrecondition: `episode_over`: reset first, or create it with `auto_reset`; `environment_expired`; `not_open`:
+                it was never created.
             NotFound: the server does not have the environment any more.
         """
-        array = np.asarray(headings)
+        count = self.count
+        try:
+            array = np.asarray(headings)
+        except ValueError:
+            raise invalid("headings", headings, f"rows of one length, ({count}, M)") from None
         if array.ndim == 1:
             array = array[None]
         if array.ndim != 2 or array.dtype.kind not in "iu" or (array.size and array.min() < 0):
             raise invalid(
                 "headings",
                 f"{array.dtype} {array.shape}",
-                f"non-negative integers of shape ({self.count}, M)",
+                f"non-negative integers of shape ({count}, M)",
             )
         request = pb.StepRequest(
             environment_id=self.id,
-            actions=[pb.Headings(headings=row) for row in array.tolist()],
+            actions=[made(pb.Headings, headings=row) for row in array.tolist()],
             step=self._step,
             return_graph=graphs,
         )

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import builtins
 import json
 import os
 import uuid
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from time import monotonic
@@ -13,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from .._files import replace_file
 from .._progress import JobBar
-from ..errors import DeadlineExceeded, JobEnded, NotFound, QedgixError, Unavailable, from_http
+from .._values import instance, mapping, text, texts
+from ..errors import DeadlineExceeded, JobEnded, NotFound, QedgixError, from_http, invalid
 from ..results import Attempt, Checkpoint, JobEvent, Metric, Metrics, given_instant, instant
 from ._platform import sleep
 from .transport import AsyncTransport
@@ -141,6 +143,22 @@ class AsyncJob:
         """
         return await self._change("retry", ())
 
+    async def continue_(self, steps: int, *, idempotency_key: str | None = None) -> AsyncJob:
+        """Trains further than a training job that has ended, in a new job with the same configuration, name and labels. The new
+        job begins with the snapshot of this one if that is kept, or else with its last weights.
+
+        Args:
+            steps: environment steps to train further.
+            idempotency_key: a second call with this key returns the same job. Default: a random key.
+
+        Raises:
+            FailedPrecondition: `wrong_state`: the job has not ended.
+        """
+        headers = _key(idempotency_key)
+        body = {"steps": steps}
+        document = await self._transport.json("POST", f"{self._path}/continue", json=body, headers=headers)
+        return AsyncJob(self._transport, document)
+
     async def edit(self, **fields: Any) -> Self:
         """Changes `name`, `labels`, `priority` or `notes` of the job. None: the default; a label that is None is removed.
 
@@ -217,7 +235,7 @@ class AsyncJob:
                             kind = data = event_id = ""
                             yield event
             except (httpx.TransportError, OSError) as error:
-                failure = Unavailable(str(error) or type(error).__name__, code="unavailable")
+                failure = await self._transport.http_failure(error)
             except QedgixError as error:
                 failure = error
             if deadline is not None and monotonic() >= deadline:
@@ -256,7 +274,7 @@ class AsyncJob:
             DeadlineExceeded: it has not ended within `timeout`. It goes on; wait again.
             Unavailable: there was no server for `patience` seconds.
         """
-        deadline = None if timeout is None else monotonic() + timeout
+        deadline = None if timeout is None else self._transport.settings.deadline(timeout)
         with JobBar(self.name or self.id, self.steps, enabled=progress) as bar:
             async for event in self._follow(0, patience, deadline):
                 bar.show(event)
@@ -365,8 +383,8 @@ class AsyncJobs:
             **more,
         }
         body = {field: value for field, value in fields.items() if value is not None}
-        headers = {"idempotency-key": idempotency_key or uuid.uuid4().hex}
-        return AsyncJob(self._transport, await self._transport.json("POST", "/v1/jobs", json=body, headers=headers))
+        document = await self._transport.json("POST", "/v1/jobs", json=body, headers=_key(idempotency_key))
+        return AsyncJob(self._transport, document)
 
     async def get(self, job_id: str) -> AsyncJob:
         """A job.
@@ -376,7 +394,67 @@ class AsyncJobs:
         """
         return await AsyncJob(self._transport, {"id": job_id}).refresh()
 
-    async def list(self, state: str | None = None) -> list[AsyncJob]:
-        """All jobs, or those in a state, newest first. `config` of a listed job lacks environment and training."""
-        rows = await self._transport.pages("/v1/jobs", "jobs", state=state)
+    async def list(
+        self,
+        state: str | None = None,
+        *,
+        kind: str | None = None,
+        algorithm: str | None = None,
+        name: str | None = None,
+        labels: Mapping[str, str | None] | None = None,
+        parent: str | None = None,
+        created_after: datetime | None = None,
+        created_before: datetime | None = None,
+        sort: str | None = None,
+        metrics: Sequence[str] = (),
+        limit: int | None = None,
+    ) -> builtins.list[AsyncJob]:
+        """All jobs to which every given filter applies. `config` of a listed job lacks environment and training.
+
+        Args:
+            state: queued, running, paused, cancelled, succeeded or failed.
+            kind: train, evaluate, sweep or experiment.
+            algorithm: qmix, vdn, iql, qedgix, agggnn or rgcn.
+            name: a name; with `*` at the end, the beginning of names.
+            labels: labels that a job has, with their values; None: any value.
+            parent: id of the job that has made the jobs, such as a sweep.
+            created_after: when jobs were submitted at the earliest. A time without a zone is that of this machine.
+            created_before: before when they were submitted.
+            sort: `created`, `name`, `best:METRIC` or `last:METRIC`, after `-` in descending order. Default: `-created`.
+            metrics: at most 16 metrics whose best and last values `document["metrics"]` of each job has.
+            limit: maximum number of jobs. Default: all.
+
+        Raises:
+            InvalidArgument: a filter is not accepted.
+        """
+        filters = {
+            "state": state,
+            "kind": kind,
+            "algorithm": algorithm,
+            "name": name,
+            "labels": None if labels is None else _labels(labels),
+            "parent": parent,
+            "created_after": None if created_after is None else _instant("created_after", created_after),
+            "created_before": None if created_before is None else _instant("created_before", created_before),
+            "sort": sort,
+            "metrics": ",".join(texts("metrics", metrics)) or None,
+        }
+        rows = await self._transport.pages("/v1/jobs", "jobs", limit=limit, **filters)
         return [AsyncJob(self._transport, row) for row in rows]
+
+
+def _key(idempotency_key: str | None) -> dict[str, str]:
+    """The header that names a submission."""
+    key = text("idempotency_key", idempotency_key or uuid.uuid4().hex)
+    if not (key.isascii() and key.isprintable()):
+        raise invalid("idempotency_key", repr(key), "printable characters of ASCII")
+    return {"idempotency-key": key}
+
+
+def _labels(labels: Mapping[str, str | None]) -> str:
+    """The filter for jobs with all of these labels."""
+    return ",".join(name if value is None else f"{name}={value}" for name, value in mapping("labels", labels).items())
+
+
+def _instant(field: str, time: datetime) -> str:
+    return instance(field, time, datetime).astimezone().isoformat()

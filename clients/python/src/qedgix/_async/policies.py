@@ -10,9 +10,10 @@ from urllib.parse import quote
 
 from .._files import replace_file
 from .._progress import UploadBar
+from .._values import text
+from ..errors import invalid
 from ..results import AliasMove, Policy, PolicyRef, PolicyVersion, given_instant
 from .transport import AsyncTransport
-
 
 # Bytes that are sent at once.
 _PART = 64 * 1024
@@ -63,6 +64,8 @@ class AsyncPolicies:
             InvalidArgument: it is no checkpoint.
             TooLarge: it is larger than the server accepts.
         """
+        if not isinstance(checkpoint, (bytes, str, os.PathLike)):
+            raise invalid("checkpoint", type(checkpoint).__name__, "bytes, or the path of a file")
         content = checkpoint if isinstance(checkpoint, bytes) else Path(checkpoint).read_bytes()
         with UploadBar(name, len(content), enabled=progress) as bar:
             document = await self._transport.json(
@@ -155,4 +158,4 @@ async def _parts(content: bytes, bar: UploadBar) -> AsyncIterator[bytes]:
 
 
 def _path(*parts: str) -> str:
-    return "/v1/policies/" + "/".join(quote(part, safe="@:") for part in parts)
+    return "/v1/policies/" + "/".join(quote(text("policy", part), safe="@:") for part in parts)

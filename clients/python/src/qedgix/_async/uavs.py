@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
+from .._values import made, mapping, number, several, text
 from ..errors import invalid
 from ..results import Decision
 from ..v1 import policy_pb2 as pb
@@ -67,8 +68,9 @@ class AsyncUav:
         if position is not None:
             node.position.x, node.position.y = _numbers("position", position, (2,))
         if speed is not None:
-            node.speed = speed
-        for target, seen in detections.items():
+            node.speed = number("speed", speed)
+        for target, seen in mapping("detections", detections).items():
+            text("detections", target)
             x, y, *aoi = _numbers(f"detections[{target}]", seen, (2, 3))
             node.detections.add(target_id=target, rel_x=x, rel_y=y, aoi=aoi[0] if aoi else None)
         response = await self._transport.call(ENCODE, request, timeout)
@@ -97,10 +99,11 @@ class AsyncUav:
         Raises:
             QedgixError: as `act` of a session. The state has not changed.
         """
-        request = pb.DecideRequest(
+        request = made(
+            pb.DecideRequest,
             policy=self._first.policy,
             state=self.state,
-            messages=messages,
+            messages=several("messages", messages),
             return_q_values=q_values,
             return_velocity=motion,
             return_waypoint=motion,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import grpc
 
+from .._values import made
 from ..errors import (
     DeadlineExceeded,
     InvalidArgument,
@@ -18,7 +19,8 @@ from ..errors import (
     QedgixError,
     Unavailable,
     from_act_error,
-    from_grpc,
+    invalid,
+    out_of_order,
 )
 from ..observations import Observation, put
 from ..results import Decision, PolicyRef, SessionInfo, SessionWarning
@@ -73,12 +75,12 @@ class Fleet:
 
         Raises:
             InvalidArgument: `field` says what is not accepted.
-            FailedPrecondition: `session_expired` and others: the session cannot go on.
+            FailedPrecondition: `not_open`: the session was never opened; `session_expired` and others: it cannot go on.
             NotFound: there is no such session or policy; a server that was restarted has no sessions.
             Unavailable, ResourceExhausted, DeadlineExceeded: no answer within the deadline.
         """
         request = self.request(observation, q_values=q_values, motion=motion)
-        request.explain = explain
+        request.explain = bool(explain)
         response = self._transport.call(ACT, request, timeout)
         return self.accept(response)
 
@@ -122,22 +124,23 @@ class Session(Fleet):
         """The policy version of the session. It never changes.
 
         Raises:
-            RuntimeError: the session is not open yet.
+            FailedPrecondition: `not_open`: the session is not open yet.
         """
-        if self.info is None:
-            raise RuntimeError("the session is not open")
-        return self.info.policy
+        return self._opened().policy
 
     @property
     def warnings(self) -> tuple[SessionWarning, ...]:
         """How the world of the session differs from the one of the policy.
 
         Raises:
-            RuntimeError: the session is not open yet.
+            FailedPrecondition: `not_open`: the session is not open yet.
         """
+        return self._opened().warnings
+
+    def _opened(self) -> SessionInfo:
         if self.info is None:
-            raise RuntimeError("the session is not open")
-        return self.info.warnings
+            raise out_of_order("the session is not open; use `with client.session(...)`, or `open` it", "not_open")
+        return self.info
 
     def open(self, timeout: float | None = None) -> Self:
         """Opens the session; `with` does this itself.
@@ -152,10 +155,8 @@ class Session(Fleet):
         return self
 
     def _begin(self) -> pb.ActRequest:
-        request = pb.ActRequest(session_id=self.id, step=self.step)
-        if self._run_id is not None:
-            request.run_id = self._run_id
-        return request
+        self._opened()
+        return made(pb.ActRequest, session_id=self.id, step=self.step, run_id=self._run_id)
 
     def restart(self, run_id: str | None = None) -> None:
         """Starts again at slot 0, for example when the simulator is reset. The next `act` tells the server.
@@ -208,11 +209,9 @@ class LocalSession(Fleet):
         """The memory of the fleet after the last slot; empty before slot 0."""
 
     def _begin(self) -> pb.ActRequest:
-        request = pb.ActRequest()
-        request.CopyFrom(self._common)
-        request.recurrent_state = self.recurrent_state
-        if not self.recurrent_state and self.seed is not None:
-            request.seed = self.seed
+        seed = None if self.recurrent_state else self.seed
+        request = made(pb.ActRequest, recurrent_state=self.recurrent_state, seed=seed)
+        request.MergeFrom(self._common)
         return request
 
     def accept(self, response: pb.ActResponse) -> Decision:
@@ -271,10 +270,10 @@ class ActStream:
         """Sends one slot and returns its answer. As `act` of the fleet.
 
         Raises:
-            RuntimeError: other requests wait for their answers.
+            FailedPrecondition: other requests wait for their answers.
         """
         if self._pending:
-            raise RuntimeError("requests wait for their answers; receive them first")
+            raise out_of_order("requests wait for their answers; receive them first")
         self.send(fleet, observation, q_values=q_values, motion=motion)
         return self.receive()
 
@@ -282,10 +281,10 @@ class ActStream:
         """Sends the slot of a fleet without waiting for the answer.
 
         Raises:
-            RuntimeError: the fleet waits for an answer.
+            FailedPrecondition: the fleet waits for an answer, or is a session that was never opened.
         """
         if any(waiting is fleet for waiting, _ in self._pending):
-            raise RuntimeError(f"{fleet!r} waits for an answer; receive it first")
+            raise out_of_order(f"{fleet!r} waits for an answer; receive it first")
         request = fleet.request(observation, q_values=q_values, motion=motion)
         self._pending.append((fleet, request))
         if self._raw is None:
@@ -299,14 +298,14 @@ class ActStream:
             timeout: seconds for all attempts. Default: that of the client.
 
         Raises:
-            RuntimeError: there is no request without an answer.
+            FailedPrecondition: there is no request without an answer.
             QedgixError: as `act` of the fleet. The stream goes on with the next request. After DeadlineExceeded, Unavailable
                 or ResourceExhausted the fleet is still in its slot.
         """
         if not self._pending:
-            raise RuntimeError("there is no request without an answer")
+            raise out_of_order("there is no request without an answer")
         settings = self._transport.settings
-        deadline = monotonic() + (settings.timeout if timeout is None else timeout)
+        deadline = settings.deadline(timeout)
         attempt = 1
         while True:
             failure: QedgixError
@@ -317,11 +316,11 @@ class ActStream:
                 assert self._raw is not None
                 result = self._raw.read(settings.retry.limit(deadline - monotonic()))
             except TimeoutError:
-                failure = DeadlineExceeded("no answer in time", code="deadline_exceeded")
+                failure = DeadlineExceeded(f"{settings.grpc_peer}: no answer in time", code="deadline_exceeded")
             except EOFError:
-                failure = Unavailable("the stream has ended", code="unavailable")
+                failure = Unavailable(f"{settings.grpc_peer}: the stream has ended", code="unavailable")
             except grpc.RpcError as error:
-                failure = from_grpc(error)
+                failure = self._transport.failure(error)
             else:
                 if result.WhichOneof("result") == "response":
                     fleet, _ = self._pending.popleft()
@@ -368,9 +367,12 @@ def act_batch(
     timeout: float | None,
 ) -> list[Decision | QedgixError]:
     """See `Client.act_batch`."""
+    for i, slot in enumerate(slots):
+        if not isinstance(slot, (tuple, list)) or len(slot) != 2 or not isinstance(slot[0], Fleet):
+            raise invalid(f"slots[{i}]", repr(slot), "a session and what its fleet observes")
     if len({id(fleet) for fleet, _ in slots}) < len(slots):
         raise InvalidArgument("a fleet has several slots in one batch", code="invalid_argument", field="slots")
-    deadline = monotonic() + (transport.settings.timeout if timeout is None else timeout)
+    deadline = transport.settings.deadline(timeout)
     requests = [fleet.request(observation, q_values=q_values) for fleet, observation in slots]
     results: list[Decision | QedgixError | None] = [None] * len(slots)
     open_slots = list(range(len(slots)))

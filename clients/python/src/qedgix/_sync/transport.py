@@ -5,13 +5,15 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator, Callable, Mapping
+from dataclasses import replace
 from time import monotonic
 from typing import TYPE_CHECKING, Any, cast
 
 import grpc
 
 from .._settings import Retry, Settings
-from ..errors import DeadlineExceeded, NotFound, QedgixError, Unavailable, from_grpc, from_http
+from .._values import plain, whole
+from ..errors import DeadlineExceeded, NotFound, QedgixError, Unavailable, from_grpc, from_http, invalid
 from ._platform import Channel, HttpClient, RawStream, open_channel, sleep
 
 if TYPE_CHECKING:
@@ -54,16 +56,16 @@ class Transport:
             QedgixError: the last failure.
         """
         call = self._calls.get(method) or self._bind(method)
-        deadline = monotonic() + (self.settings.timeout if timeout is None else timeout)
+        deadline = self.settings.deadline(timeout)
         attempt = 1
         while True:
             remaining = deadline - monotonic()
             if remaining <= 0:
-                raise DeadlineExceeded("the deadline has passed", code="deadline_exceeded")
+                raise DeadlineExceeded(f"{self.settings.grpc_peer}: the deadline has passed", code="deadline_exceeded")
             try:
                 return call(request, timeout=self._retry.limit(remaining), metadata=self._metadata)
             except grpc.RpcError as error:
-                failure = from_grpc(error)
+                failure = self.failure(error)
             if attempt > 1 and gone and isinstance(failure, gone):
                 return None
             wait = self._retry.wait(failure, attempt, deadline - monotonic())
@@ -71,6 +73,55 @@ class Transport:
                 raise failure
             sleep(wait)
             attempt += 1
+
+    def failure(self, error: grpc.RpcError) -> QedgixError:
+        """The exception of a call that failed."""
+        failure = from_grpc(error, self.settings.grpc_peer)
+        # There was no connection of HTTP/2; a server of REST has one of HTTP/1.1.
+        if "failed to connect to all addresses" in failure.message and self._is_rest():
+            expected = "the address of gRPC (`--grpc-addr` of `qedgix serve`); this is that of REST"
+            return invalid("grpc", self.settings.target, expected)
+        return failure
+
+    def _is_rest(self) -> bool:
+        """Whether the address of gRPC is that of REST."""
+        import httpx
+
+        url = self.settings.grpc_url
+        tls = self.settings.tls() if url.startswith("https:") else False
+        try:
+            with HttpClient(base_url=url, verify=tls, timeout=3.0, trust_env=False) as http:
+                response = http.get("/livez")
+        except (httpx.TransportError, OSError):
+            return False
+        return bool(response.is_success)
+
+    def _is_grpc(self) -> bool:
+        """Whether the address of REST is that of gRPC."""
+        channel = open_channel(replace(self.settings, grpc_url=self.settings.http_url))
+        check: Any = channel.unary_unary("/grpc.health.v1.Health/Check")
+        try:
+            check(b"", timeout=3.0, metadata=self._metadata)
+        except grpc.RpcError as error:
+            # A server that requires a key may say so.
+            return from_grpc(error, "").code == "unauthenticated"
+        finally:
+            channel.close()
+        return True
+
+    def http_failure(self, error: Exception) -> QedgixError:
+        """The exception of a request of REST to which there was no response."""
+        import httpx
+
+        if isinstance(error, httpx.TimeoutException):
+            message = f"{self.settings.http_peer}: {str(error) or 'no answer in time'}"
+            return DeadlineExceeded(message, code="deadline_exceeded")
+        # The first line of a response of HTTP/2 is none of HTTP/1.1, as that of TLS.
+        illegal = isinstance(error, httpx.RemoteProtocolError) and "illegal" in str(error)
+        if illegal and self._is_grpc():
+            expected = "the address of REST (`--http-addr` of `qedgix serve`); this is that of gRPC"
+            return invalid("http", self.settings.http_target, expected)
+        return Unavailable(f"{self.settings.http_peer}: {str(error) or type(error).__name__}", code="unavailable")
 
     def _bind(self, method: Method) -> Any:
         call = self._open_channel().unary_unary(
@@ -131,7 +182,8 @@ class Transport:
         """
         import httpx
 
-        deadline = monotonic() + (self.settings.timeout if timeout is None else timeout)
+        deadline = self.settings.deadline(timeout)
+        body = plain("", json)
         given = {name: value for name, value in (params or {}).items() if value is not None}
         attempt = 1
         while True:
@@ -144,15 +196,15 @@ class Transport:
                     path,
                     params=given,
                     headers=headers,
-                    json=json,
+                    json=body,
                     content=content() if content else None,
                     timeout=max(limit, 0.001),
                 )
             except httpx.TimeoutException as error:
-                failure = DeadlineExceeded(str(error) or "no answer in time", code="deadline_exceeded")
+                failure = self.http_failure(error)
                 again = repeatable or isinstance(error, httpx.ConnectTimeout)
             except (httpx.TransportError, OSError) as error:
-                failure = Unavailable(str(error) or type(error).__name__, code="unavailable")
+                failure = self.http_failure(error)
                 again = repeatable or isinstance(error, httpx.ConnectError)
             else:
                 if response.is_success or (attempt > 1 and method == "DELETE" and response.status_code == 404):
@@ -170,16 +222,19 @@ class Transport:
         response = self.request(method, path, **options)
         return cast("dict[str, Any]", response.json())
 
-    def pages(self, path: str, items: str, **params: Any) -> list[dict[str, Any]]:
-        """All items of a list, page by page."""
+    def pages(self, path: str, items: str, *, limit: int | None = None, **params: Any) -> list[dict[str, Any]]:
+        """All items of a list, or the first `limit` (from 1), page by page."""
+        if limit is not None:
+            limit = whole("limit", limit, 1, 2**63 - 1)
+            params["page_size"] = min(limit, 1000)
         found: list[dict[str, Any]] = []
         token = None
         while True:
             page = self.json("GET", path, params={**params, "page_token": token})
             found += page[items]
             token = page["next_page_token"]
-            if not token:
-                return found
+            if not token or (limit is not None and len(found) >= limit):
+                return found[:limit]
 
     def close(self) -> None:
         """Closes the connections."""
