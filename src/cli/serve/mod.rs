@@ -263,13 +263,15 @@ fn print_start(config: &Config, endpoints: Endpoints) -> Result<(), OutputError>
 /// Maximum time to send the last spans to the collector.
 const SPAN_FLUSH_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Reloads certificates on SIGHUP. Without TLS, SIGHUP keeps its default action and ends the process.
+/// Reloads certificates on SIGHUP. Without TLS, SIGHUP changes nothing; its default action would end the process without a drain.
 fn reload_on_hangup(tls: Option<Arc<Tls>>) -> std::io::Result<()> {
-    let Some(tls) = tls else { return Ok(()) };
     let mut hangup = signal(SignalKind::hangup())?;
     tokio::spawn(async move {
         while hangup.recv().await.is_some() {
-            tls.reload();
+            match &tls {
+                Some(tls) => tls.reload(),
+                None => tracing::info!("SIGHUP: no certificate to reload"),
+            }
         }
     });
     Ok(())
@@ -399,6 +401,14 @@ mod tests {
                 assert!(error.contains(flag.as_str()), "{flag}={time}: {error}");
             }
         }
+    }
+
+    #[test]
+    fn the_addresses_of_grpc_and_rest_differ() {
+        let addr = "127.0.0.1:50051";
+        let error = config(&["--grpc-addr", addr, "--http-addr", addr]).unwrap_err();
+        assert!(error.starts_with("--http-addr: got 127.0.0.1:50051") && error.contains("--grpc-addr"), "{error}");
+        assert!(config(&["--grpc-addr", "127.0.0.1:0", "--http-addr", "127.0.0.1:0"]).is_ok());
     }
 
     #[test]
