@@ -2,6 +2,7 @@
 
 mod executor;
 mod follow;
+mod open_files;
 
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::path::PathBuf;
@@ -219,8 +220,9 @@ pub async fn run(args: ServeArgs) -> anyhow::Result<()> {
     let logs = LogConfig { json: matches!(args.log_format, LogFormat::Json), access: args.access_log };
     telemetry::init_logs(logs, traces.as_ref());
     refuse_huge_pages();
-    let config = Config { follow: args.follow.config()?, ..args.config() };
+    let mut config = Config { follow: args.follow.config()?, ..args.config() };
     config.validate()?;
+    config.max_connections = open_files::make_room(config.max_connections);
     let data = DataDir::lock(&config.data_dir)?;
     let listeners = Listeners::bind(&config).await?;
     // Signal handlers exist before the server announces its addresses.
