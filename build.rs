@@ -21,6 +21,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let descriptors = protox::compile(files, ["proto/third_party", "proto"])?;
     let out = std::env::var("OUT_DIR")?;
     std::fs::write(Path::new(&out).join("descriptors.bin"), prost::Message::encode_to_vec(&descriptors))?;
-    tonic_prost_build::configure().bytes(".").compile_fds(descriptors)?;
+    let mut names = prost_build::Config::new();
+    // The codec finds the sizes of a message by the name of its type.
+    names.enable_type_names();
+    let services = tonic_prost_build::configure().bytes(".").codec_path("crate::wire::codec::BoundedCodec");
+    services.compile_fds_with_config(descriptors, names)?;
     Ok(())
 }

@@ -203,6 +203,9 @@ impl Config {
     /// # Errors
     /// [`Invalid`] for the first setting that is not.
     pub fn validate(&self) -> Result<(), Invalid> {
+        if self.http_addr == self.grpc_addr && self.http_addr.port() != 0 {
+            return Err(Invalid::new("--http-addr", self.http_addr, "another address than that of --grpc-addr"));
+        }
         in_range("--cpu-budget", self.cpu_budget, 1..=MAX_CPU_BUDGET)?;
         in_range("--max-attempts", self.max_attempts, 1..=1000)?;
         in_seconds("--snapshot-every", self.snapshot_every, 0.0..=1e9)?;

@@ -34,7 +34,7 @@ use crate::clock::Clock;
 
 /// Pause after `accept` failed for lack of resources, such as too many open files.
 const ACCEPT_RETRY: Duration = Duration::from_millis(500);
-/// Maximum memory for the head of an HTTP/1 request, in bytes.
+/// Memory for the head of an HTTP/1 request in bytes, beyond which hyper reads no further. What it has read until then may be more.
 const HTTP1_BUFFER: usize = 64 << 10;
 /// Limits of the life of a connection from the reserve, which has one request.
 const RESERVED_LIFE: Duration = Duration::from_secs(2);

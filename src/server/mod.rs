@@ -72,8 +72,10 @@ pub enum Error {
     #[error("{0} is in use by another qedgix server; stop it, or choose another --data-dir")]
     InUse(PathBuf),
     /// The address is in use, or does not belong to this machine.
-    #[error("cannot listen on {addr}: {cause}")]
+    #[error("{flag}: cannot listen on {addr}: {cause}")]
     Bind {
+        /// The flag that sets the address.
+        flag: &'static str,
         /// The address.
         addr: SocketAddr,
         /// Error of the operating system.
@@ -132,11 +134,13 @@ impl Listeners {
     /// # Errors
     /// [`Error::Config`] when a TLS file cannot be used, [`Error::Bind`] when an address cannot be bound.
     pub async fn bind(config: &Config) -> Result<Self, Error> {
-        let bind = async |addr| TcpListener::bind(addr).await.map_err(|cause| Error::Bind { addr, cause });
+        let bind = async |flag, addr| TcpListener::bind(addr).await.map_err(|cause| Error::Bind { flag, addr, cause });
         let tls = config.tls.clone().map(Tls::open).transpose()?.map(Arc::new);
         let loopback = (Ipv4Addr::LOCALHOST, 0).into();
-        let workers = bind(config.worker_addr.as_ref().map_or(loopback, |worker| worker.addr)).await?;
-        Ok(Self { grpc: bind(config.grpc_addr).await?, http: bind(config.http_addr).await?, workers, tls })
+        let workers = bind("--worker-addr", config.worker_addr.as_ref().map_or(loopback, |worker| worker.addr)).await?;
+        let grpc = bind("--grpc-addr", config.grpc_addr).await?;
+        let http = bind("--http-addr", config.http_addr).await?;
+        Ok(Self { grpc, http, workers, tls })
     }
 
     /// The TLS configuration, if TLS is on.
@@ -336,6 +340,9 @@ async fn serve(
         _ => listeners.workers.local_addr().map_err(Error::Listener)?.to_string(),
     };
     telemetry::install_metrics();
+    if let Some(tls) = &listeners.tls {
+        tls.report_expiry();
+    }
     let stop = CancellationToken::new();
     let health = grpc::Health::new(app.draining.clone(), stop.clone());
     health.report(operations::server_health(&app).await);

@@ -75,6 +75,10 @@ impl App {
 /// Metrics of the server's present load.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ServerMetrics {
+    /// Whether the server is ready.
+    pub ready: bool,
+    /// Whether the database can be written.
+    pub database_writable: bool,
     /// Open sessions.
     pub sessions: usize,
     /// Bytes that sessions take.
@@ -105,7 +109,8 @@ pub struct ServerMetrics {
 
 /// Collects the metrics. Never fails, because metrics are most needed when the database does not answer.
 pub async fn server_metrics(app: &App) -> ServerMetrics {
-    let jobs = match tokio::time::timeout(DATABASE_TIMEOUT, app.store.job_counts()).await {
+    let (ready, jobs) = tokio::join!(app.ready(), tokio::time::timeout(DATABASE_TIMEOUT, app.store.job_counts()));
+    let jobs = match jobs {
         Ok(Ok(jobs)) => jobs,
         Ok(Err(e)) => {
             tracing::warn!(error = %e, "cannot count jobs");
@@ -114,6 +119,8 @@ pub async fn server_metrics(app: &App) -> ServerMetrics {
         Err(_) => Vec::new(),
     };
     ServerMetrics {
+        ready: ready.is_ok(),
+        database_writable: app.store.write_failure().is_none(),
         sessions: app.sessions.len(),
         session_memory: app.sessions.memory_used(),
         environments: app.environments.table().len(),

@@ -49,6 +49,40 @@ async fn raw(server: &Server, path: &'static str, message: Bytes) -> (Code, Stri
     refused(client.unary(Request::new(message), path.parse().unwrap(), Raw).await)
 }
 
+/// Fields with a number below 16, empty.
+fn empties(number: u8, count: usize) -> Vec<u8> {
+    [number << 3 | 2, 0].repeat(count)
+}
+
+#[tokio::test]
+async fn requests_that_would_take_far_more_memory_than_their_size_are_refused() {
+    let server = Server::start().await;
+    let count = 2_000_000;
+    let nested = |number: u8, inner: Vec<u8>| {
+        let mut bytes = vec![number << 3 | 2];
+        prost::encoding::encode_varint(inner.len() as u64, &mut bytes);
+        [bytes, inner].concat()
+    };
+    for (method, field, message) in [
+        ("/qedgix.v1.PolicyService/ActBatch", "requests", empties(1, count)),
+        ("/qedgix.v1.PolicyService/Act", "graph.nodes", nested(2, empties(1, count))),
+        ("/qedgix.v1.PolicyService/Act", "scene.users", nested(3, empties(2, count))),
+        ("/qedgix.v1.PolicyService/ActStream", "graph.nodes", nested(2, empties(1, count))),
+        ("/inference.GRPCInferenceService/ModelInfer", "inputs", empties(5, count)),
+        ("/inference.GRPCInferenceService/ModelStreamInfer", "raw_input_contents", empties(7, 4 * count)),
+    ] {
+        let mut client = tonic::client::Grpc::new(server.channel().await);
+        client.ready().await.unwrap();
+        let path = method.parse().unwrap();
+        let status = client.unary(Request::new(Bytes::from(message)), path, Raw).await.map(drop).unwrap_err();
+        assert!(status.message().starts_with(&format!("{field}: too many elements")), "{method}: {status:?}");
+        assert_eq!(refused::<()>(Err(status)).1, "too_large", "{method}");
+    }
+    // Small ones are decoded, and refused as before.
+    let few = raw(&server, "/qedgix.v1.PolicyService/ActBatch", empties(1, 1025).into()).await;
+    assert_eq!(few, (Code::InvalidArgument, "invalid_argument".into(), "requests".into()));
+}
+
 #[tokio::test]
 async fn malformed_and_oversized_messages_are_refused() {
     let server = Server::start().await;

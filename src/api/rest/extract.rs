@@ -117,10 +117,15 @@ async fn read_encoded(request: Request, limit: usize) -> Result<Bytes, Error> {
     let too_large =
         || Error::TooLarge { message: format!("the body is larger than the limit of {limit} bytes"), limit: Some(limit as u64) };
     let announced = announced_size(request.headers());
+    // A caller that asks first sends nothing after the refusal.
+    let asks = request.headers().contains_key(header::EXPECT);
     let exchange = request.extensions().get::<Arc<Exchange>>().cloned();
     let mut body = request.into_body().into_data_stream();
     if announced > limit as u64 {
-        discard(body).await;
+        // More than is discarded breaks the connection in any case.
+        if !asks && announced <= DISCARDED as u64 {
+            discard(body).await;
+        }
         return Err(too_large());
     }
     // The buffer grows with what arrives, not with what is announced.

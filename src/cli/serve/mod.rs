@@ -2,6 +2,7 @@
 
 mod executor;
 mod follow;
+mod open_files;
 
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::path::PathBuf;
@@ -217,10 +218,12 @@ enum LogFormat {
 pub async fn run(args: ServeArgs) -> anyhow::Result<()> {
     let traces = args.otlp_endpoint.as_deref().map(TraceExporter::start).transpose()?;
     let logs = LogConfig { json: matches!(args.log_format, LogFormat::Json), access: args.access_log };
-    telemetry::init_logs(logs, traces.as_ref());
+    // Until the end, and not longer: what is printed about an error comes after the log.
+    let _logs = telemetry::init_logs(logs, traces.as_ref())?;
     refuse_huge_pages();
-    let config = Config { follow: args.follow.config()?, ..args.config() };
+    let mut config = Config { follow: args.follow.config()?, ..args.config() };
     config.validate()?;
+    config.max_connections = open_files::make_room(config.max_connections);
     let data = DataDir::lock(&config.data_dir)?;
     let listeners = Listeners::bind(&config).await?;
     // Signal handlers exist before the server announces its addresses.
@@ -263,17 +266,22 @@ fn print_start(config: &Config, endpoints: Endpoints) -> Result<(), OutputError>
 /// Maximum time to send the last spans to the collector.
 const SPAN_FLUSH_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Reloads certificates on SIGHUP. Without TLS, SIGHUP keeps its default action and ends the process.
+/// Reloads certificates on SIGHUP. Without TLS, SIGHUP changes nothing; its default action would end the process without a drain.
 fn reload_on_hangup(tls: Option<Arc<Tls>>) -> std::io::Result<()> {
-    let Some(tls) = tls else { return Ok(()) };
     let mut hangup = signal(SignalKind::hangup())?;
     tokio::spawn(async move {
         while hangup.recv().await.is_some() {
-            tls.reload();
+            match &tls {
+                Some(tls) => tls.reload(),
+                None => tracing::info!("SIGHUP: no certificate to reload"),
+            }
         }
     });
     Ok(())
 }
+
+/// Time for the last log line.
+const LAST_LINE: Duration = Duration::from_millis(50);
 
 /// Resolves on the first ctrl-c or SIGTERM. The second signal ends the process at once. No acknowledged change is lost, because
 /// it is committed to the database; workers end with the server.
@@ -284,6 +292,7 @@ fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
         tokio::spawn(async move {
             let code = signals.next().await;
             tracing::warn!("second stop signal: ending at once");
+            tokio::time::sleep(LAST_LINE).await;
             std::process::exit(code.into());
         });
     })
@@ -399,6 +408,14 @@ mod tests {
                 assert!(error.contains(flag.as_str()), "{flag}={time}: {error}");
             }
         }
+    }
+
+    #[test]
+    fn the_addresses_of_grpc_and_rest_differ() {
+        let addr = "127.0.0.1:50051";
+        let error = config(&["--grpc-addr", addr, "--http-addr", addr]).unwrap_err();
+        assert!(error.starts_with("--http-addr: got 127.0.0.1:50051") && error.contains("--grpc-addr"), "{error}");
+        assert!(config(&["--grpc-addr", "127.0.0.1:0", "--http-addr", "127.0.0.1:0"]).is_ok());
     }
 
     #[test]

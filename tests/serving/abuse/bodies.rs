@@ -34,6 +34,23 @@ async fn send(stream: &mut SendStream<Bytes>, mut bytes: usize) {
 }
 
 #[tokio::test]
+async fn a_body_that_is_announced_as_far_too_large_is_refused_by_its_header() {
+    let server = Server::with(|config| config.read_timeout = Duration::from_secs(3600)).await;
+    for (length, expect) in
+        [("10000000000", ""), ("10000000000", "expect: 100-continue\r\n"), ("20000000", "expect: 100-continue\r\n")]
+    {
+        let mut socket = TcpStream::connect(server.endpoints.http).await.unwrap();
+        let head = format!(
+            "POST /v1/act HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n{expect}content-length: {length}\r\n\r\n"
+        );
+        socket.write_all(head.as_bytes()).await.unwrap();
+        let mut answer = [0; 12];
+        with_timeout(socket.read_exact(&mut answer)).await.unwrap();
+        assert_eq!(&answer, b"HTTP/1.1 413", "{length} {expect:?}");
+    }
+}
+
+#[tokio::test]
 async fn the_budget_of_bytes_in_flight_covers_both_transports_and_is_given_back() {
     let server = Server::with(|config| config.max_inflight_bytes = 4 << 20).await;
     // Not JSON, which is found when the whole body is there.

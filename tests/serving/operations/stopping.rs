@@ -112,6 +112,15 @@ async fn a_second_signal_ends_the_process_at_once() {
 }
 
 #[tokio::test]
+async fn sighup_without_tls_changes_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let binary = Binary::start(dir.path(), &[]).await;
+    binary.signal("HUP");
+    binary.says("SIGHUP: no certificate to reload").await;
+    assert_eq!(reqwest::get(format!("{}/readyz", binary.http)).await.unwrap().status(), 200);
+}
+
+#[tokio::test]
 async fn requests_are_closed_after_the_drain_timeout() {
     let dir = tempfile::tempdir().unwrap();
     let binary = Binary::start(dir.path(), &["--max-batch-delay", "10s", "--drain-timeout", "50ms"]).await;

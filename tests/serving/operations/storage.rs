@@ -36,6 +36,13 @@ async fn submit(server: &Server) -> (StatusCode, String) {
     (status, body["code"].as_str().unwrap_or_default().to_owned())
 }
 
+/// The metrics of readiness and of the database.
+async fn gauges(server: &Server) -> [Option<String>; 2] {
+    let text = reqwest::get(server.url("/metrics")).await.unwrap().text().await.unwrap();
+    ["qedgix_ready ", "qedgix_database_writable "]
+        .map(|name| text.lines().find_map(|line| line.strip_prefix(name)).map(str::to_owned))
+}
+
 /// A server whose jobs stay in the queue.
 async fn server() -> Server {
     let server = Server::with(|config| config.worker = Some("/bin/false".into())).await;
@@ -46,6 +53,7 @@ async fn server() -> Server {
 /// Waits until the server is ready again, and checks that it stores jobs.
 async fn recovers(server: &Server) {
     with_timeout(async { while get(server, "/readyz").await != StatusCode::OK {} }).await;
+    with_timeout(async { while gauges(server).await != ["1", "1"].map(|value| Some(value.to_owned())) {} }).await;
     assert_eq!(submit(server).await.0, StatusCode::CREATED);
 }
 
@@ -59,6 +67,8 @@ async fn refuses_writes(server: &Server, code: &str, grpc: Code) {
     for ready in ["/readyz", "/v2/health/ready"] {
         assert_eq!(get(server, ready).await, StatusCode::SERVICE_UNAVAILABLE, "{ready}");
     }
+    // The servers of other tests in this process share the recorder.
+    with_timeout(async { while gauges(server).await != ["0", "0"].map(|value| Some(value.to_owned())) {} }).await;
     let mut health = HealthClient::new(server.channel().await);
     let mut watch = health.watch(HealthCheckRequest { service: "qedgix.v1.JobService".into() }).await.unwrap().into_inner();
     with_timeout(async { while watch.message().await.unwrap().unwrap().status() != ServingStatus::NotServing {} }).await;
