@@ -166,7 +166,7 @@ fn shorten_numbers(text: String) -> String {
     while !rest.is_empty() {
         let (digits, after) = rest.split_at(rest.find(|c| !is_digit(c)).unwrap_or(rest.len()));
         match digits.parse::<f64>() {
-            Ok(number) if digits.len() > MAX_DIGITS && number.is_finite() => short.push_str(&format!("{number:e}")),
+            Ok(number) if digits.len() > MAX_DIGITS && number.is_finite() => short.extend([format!("{number:e}")]),
             _ => short += digits,
         }
         let (between, after) = after.split_at(after.find(is_digit).unwrap_or(after.len()));

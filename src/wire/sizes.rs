@@ -7,7 +7,7 @@ use std::collections::HashMap;
 
 use prost::Message as _;
 use prost_types::field_descriptor_proto::{Label, Type};
-use prost_types::{DescriptorProto, FieldDescriptorProto, FileDescriptorSet};
+use prost_types::{DescriptorProto, FieldDescriptorProto, FileDescriptorSet, MessageOptions, MethodDescriptorProto};
 
 /// Nesting beyond which a message is refused. prost permits 100.
 const MAX_DEPTH: usize = 128;
@@ -85,7 +85,12 @@ impl Sizes {
                 messages[number].fields[at] = Some(field);
             }
         }
-        let inputs = set.file.iter().flat_map(|file| &file.service).flat_map(|service| &service.method).map(|m| m.input_type());
+        let inputs = set
+            .file
+            .iter()
+            .flat_map(|file| &file.service)
+            .flat_map(|service| &service.method)
+            .map(MethodDescriptorProto::input_type);
         let requests = inputs.map(|name| (name.trim_start_matches('.').to_owned(), types.numbers[name])).collect();
         Self { messages, requests }
     }
@@ -116,7 +121,7 @@ impl<'a> Types<'a> {
 
     fn is_map(&self, field: &FieldDescriptorProto) -> bool {
         field.r#type() == Type::Message
-            && self.all[self.numbers[field.type_name()]].options.as_ref().is_some_and(|o| o.map_entry())
+            && self.all[self.numbers[field.type_name()]].options.as_ref().is_some_and(MessageOptions::map_entry)
     }
 
     /// Bytes of a value of the message type. `open`: the types that contain it, in which it is boxed.
@@ -222,7 +227,7 @@ impl Reader<'_> {
                     let inner_end = self.at + length;
                     self.message(inner, inner_end, depth + 1).map_err(|refusal| match refusal {
                         Refusal::Large(path) => Refusal::Large(format!("{}.{path}", field.name)),
-                        malformed => malformed,
+                        Refusal::Malformed(what) => Refusal::Malformed(what),
                     })?;
                     if self.at != inner_end {
                         return Err(TRUNCATED);

@@ -271,9 +271,10 @@ fn reload_on_hangup(tls: Option<Arc<Tls>>) -> std::io::Result<()> {
     let mut hangup = signal(SignalKind::hangup())?;
     tokio::spawn(async move {
         while hangup.recv().await.is_some() {
-            match &tls {
-                Some(tls) => tls.reload(),
-                None => tracing::info!("SIGHUP: no certificate to reload"),
+            if let Some(tls) = &tls {
+                tls.reload();
+            } else {
+                tracing::info!("SIGHUP: no certificate to reload");
             }
         }
     });
