@@ -182,7 +182,7 @@ def test_a_stream_keeps_the_order_and_goes_on_after_an_error(client):
             for fleet in [*fleets, nobody]:
                 stream.send(fleet, Fleet(step).scene())
             assert stream.pending == 4
-            with pytest.raises(RuntimeError):
+            with pytest.raises(qedgix.FailedPrecondition):
                 stream.send(fleets[0], Fleet(step).scene())
             for seed in range(3):
                 assert stream.receive().headings.tolist() == wanted[seed][step]
@@ -190,7 +190,7 @@ def test_a_stream_keeps_the_order_and_goes_on_after_an_error(client):
                 stream.receive()
         with client.session("qedgix", seed=0) as session:
             assert fly(lambda scene: stream.act(session, scene)) == wanted[0]
-        with pytest.raises(RuntimeError):
+        with pytest.raises(qedgix.FailedPrecondition):
             stream.receive()
 
 
