@@ -340,6 +340,9 @@ async fn serve(
         _ => listeners.workers.local_addr().map_err(Error::Listener)?.to_string(),
     };
     telemetry::install_metrics();
+    if let Some(tls) = &listeners.tls {
+        tls.report_expiry();
+    }
     let stop = CancellationToken::new();
     let health = grpc::Health::new(app.draining.clone(), stop.clone());
     health.report(operations::server_health(&app).await);

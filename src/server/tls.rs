@@ -3,6 +3,7 @@
 use std::path::Path;
 use std::sync::{Arc, PoisonError, RwLock};
 
+use jiff::Timestamp;
 use rustls::crypto::ring;
 use rustls::pki_types::pem::{self, PemObject};
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
@@ -27,7 +28,12 @@ pub struct Tls {
 pub(super) struct Configs {
     pub(super) grpc: Arc<ServerConfig>,
     pub(super) http: Arc<ServerConfig>,
+    /// When the certificate expires, if it says so in a way that is understood.
+    expires: Option<Timestamp>,
 }
+
+/// Days before a certificate expires from which a start or reload warns.
+const WARN_DAYS: i64 = 14;
 
 impl Tls {
     /// Reads the files.
@@ -46,8 +52,18 @@ impl Tls {
             Ok(new) => {
                 *self.current.write().unwrap_or_else(PoisonError::into_inner) = new;
                 tracing::info!(cert = %self.files.cert.display(), "TLS certificates reloaded");
+                self.report_expiry();
             }
             Err(error) => tracing::error!(%error, "cannot reload TLS certificates; the previous ones stay in use"),
+        }
+    }
+
+    /// Sets the metric of the expiry of the certificate, and logs a warning if it is near or past.
+    pub(super) fn report_expiry(&self) {
+        let Some(expires) = self.current().expires else { return };
+        metrics::gauge!("qedgix_tls_certificate_expiry_timestamp_seconds").set(expires.as_second() as f64);
+        if let Some(state) = expiry_warning(expires, Timestamp::now()) {
+            tracing::warn!(cert = %self.files.cert.display(), %expires, "the TLS certificate {state}");
         }
     }
 
@@ -77,12 +93,27 @@ fn read(files: &TlsFiles) -> Result<Configs, Invalid> {
             builder.with_client_cert_verifier(verifier.map_err(|e| invalid_file(FLAG, path, e, expected))?)
         }
     };
+    let expires = certs.first().and_then(|cert| expiry(cert));
     let grpc = builder.with_single_cert(certs, key);
     let mut grpc = grpc.map_err(|e| invalid_file("--tls-key", &files.key, e, "the key of the certificate in --tls-cert"))?;
     let mut http = grpc.clone();
     grpc.alpn_protocols = vec![H2.to_vec()];
     http.alpn_protocols = vec![H2.to_vec(), b"http/1.1".to_vec()];
-    Ok(Configs { grpc: Arc::new(grpc), http: Arc::new(http) })
+    Ok(Configs { grpc: Arc::new(grpc), http: Arc::new(http), expires })
+}
+
+/// When a certificate expires.
+fn expiry(cert: &[u8]) -> Option<Timestamp> {
+    let (_, cert) = x509_parser::parse_x509_certificate(cert).ok()?;
+    Timestamp::from_second(cert.validity().not_after.timestamp()).ok()
+}
+
+/// What to warn of at the time `now`.
+fn expiry_warning(expires: Timestamp, now: Timestamp) -> Option<&'static str> {
+    if expires <= now {
+        return Some("has expired: clients refuse it");
+    }
+    (expires.as_second() - now.as_second() < WARN_DAYS * 86_400).then_some("expires within 14 days")
 }
 
 /// The certificates of a PEM file, at least one.
@@ -107,4 +138,28 @@ fn pem_problem(error: pem::Error) -> String {
 
 fn invalid_file(flag: &str, path: &Path, problem: impl std::fmt::Display, expected: &str) -> Invalid {
     Invalid::new(flag, path.display(), format!("{expected} ({problem})"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_certificate_that_expires_soon_is_warned_of() {
+        let now = Timestamp::from_second(1_800_000_000).unwrap();
+        let in_days = |days: i64| expiry_warning(Timestamp::from_second(now.as_second() + days * 86_400).unwrap(), now);
+        assert_eq!([in_days(14), in_days(400)], [None, None]);
+        assert_eq!(in_days(13), Some("expires within 14 days"));
+        assert_eq!([in_days(0), in_days(-1)], [Some("has expired: clients refuse it"); 2]);
+    }
+
+    #[test]
+    fn the_expiry_of_a_certificate_is_read() {
+        let key = rcgen::KeyPair::generate().unwrap();
+        let mut params = rcgen::CertificateParams::new(["localhost".to_owned()]).unwrap();
+        params.not_after = rcgen::date_time_ymd(2031, 2, 3);
+        let cert = params.self_signed(&key).unwrap();
+        assert_eq!(expiry(cert.der()), Some("2031-02-03T00:00:00Z".parse().unwrap()));
+        assert_eq!(expiry(b"nothing"), None);
+    }
 }

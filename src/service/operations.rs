@@ -75,6 +75,10 @@ impl App {
 /// Metrics of the server's present load.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ServerMetrics {
+    /// Whether the server is ready.
+    pub ready: bool,
+    /// Whether the database can be written.
+    pub database_writable: bool,
     /// Open sessions.
     pub sessions: usize,
     /// Bytes that sessions take.
@@ -105,6 +109,8 @@ pub struct ServerMetrics {
 
 /// Collects the metrics. Never fails, because metrics are most needed when the database does not answer.
 pub async fn server_metrics(app: &App) -> ServerMetrics {
+    // One after the other, so that a scrape needs one connection to the database.
+    let ready = app.ready().await.is_ok();
     let jobs = match tokio::time::timeout(DATABASE_TIMEOUT, app.store.job_counts()).await {
         Ok(Ok(jobs)) => jobs,
         Ok(Err(e)) => {
@@ -114,6 +120,8 @@ pub async fn server_metrics(app: &App) -> ServerMetrics {
         Err(_) => Vec::new(),
     };
     ServerMetrics {
+        ready,
+        database_writable: app.store.write_failure().is_none(),
         sessions: app.sessions.len(),
         session_memory: app.sessions.memory_used(),
         environments: app.environments.table().len(),

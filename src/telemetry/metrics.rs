@@ -75,6 +75,9 @@ fn describe() {
     describe_gauge!("qedgix_job_watchers", "Open streams of job events.");
     describe_gauge!("qedgix_training_threads_busy", "Threads used by running jobs.");
     describe_gauge!("qedgix_training_threads", "CPU budget: threads that all running jobs may use together.");
+    describe_gauge!("qedgix_ready", "Whether the server is ready, as /readyz says: 1 or 0.");
+    describe_gauge!("qedgix_database_writable", "Whether the database can be written: 1 or 0.");
+    describe_gauge!("qedgix_tls_certificate_expiry_timestamp_seconds", "When the TLS certificate in use expires, as Unix time.");
     describe_gauge!("qedgix_build_info", "Always 1; the label holds the version.");
 }
 

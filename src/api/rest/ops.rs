@@ -111,6 +111,8 @@ async fn metrics(State(app): State<Arc<App>>, Extension(render): Extension<fn() 
     // Gauges are computed at scrape time.
     let metrics = operations::server_metrics(&app).await;
     for (name, value) in [
+        ("qedgix_ready", usize::from(metrics.ready)),
+        ("qedgix_database_writable", usize::from(metrics.database_writable)),
         ("qedgix_sessions", metrics.sessions),
         ("qedgix_session_memory_bytes", metrics.session_memory),
         ("qedgix_environments", metrics.environments),
