@@ -36,7 +36,7 @@ pub fn run(args: &WorkerArgs) -> anyhow::Result<()> {
     if args.tethered {
         worker::exit_with_stdin()?;
     }
-    telemetry::init_logs(telemetry::LogConfig::default(), None);
+    let _logs = telemetry::init_logs(telemetry::LogConfig::default(), None)?;
     let assignment = match &args.assignment {
         Some(file) => from_file(file)?,
         None => from_environment()?,

@@ -19,6 +19,8 @@ pub(super) async fn run(app: Arc<App>, ttl: Duration, budget: Arc<Budget>) {
 /// Expires idle sessions and environments, and maintains metrics.
 async fn expire(app: &App, ttl: Duration, budget: &Budget) {
     let inflight = metrics::gauge!("qedgix_inflight_bytes");
+    let dropped_lines = metrics::counter!("qedgix_log_lines_dropped_total");
+    let mut reported = telemetry::dropped_log_lines();
     let mut sweep = tokio::time::interval((ttl / 4).clamp(Duration::from_secs(1), Duration::from_secs(30)));
     // Recorded durations stay in memory until this moves them into their histogram buckets.
     let mut upkeep = tokio::time::interval(Duration::from_secs(5));
@@ -31,6 +33,11 @@ async fn expire(app: &App, ttl: Duration, budget: &Budget) {
             _ = upkeep.tick() => {
                 telemetry::install_metrics().run_upkeep();
                 inflight.set(budget.used() as f64);
+                let dropped = telemetry::dropped_log_lines();
+                dropped_lines.absolute(dropped);
+                if std::mem::replace(&mut reported, dropped) != dropped {
+                    tracing::warn!(lines = dropped, "log lines were dropped since the start, because standard error was not read");
+                }
             }
         }
     }

@@ -78,6 +78,7 @@ fn describe() {
     describe_gauge!("qedgix_ready", "Whether the server is ready, as /readyz says: 1 or 0.");
     describe_gauge!("qedgix_database_writable", "Whether the database can be written: 1 or 0.");
     describe_gauge!("qedgix_tls_certificate_expiry_timestamp_seconds", "When the TLS certificate in use expires, as Unix time.");
+    describe_counter!("qedgix_log_lines_dropped_total", "Log lines that were dropped because standard error was not read.");
     describe_gauge!("qedgix_build_info", "Always 1; the label holds the version.");
 }
 

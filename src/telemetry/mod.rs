@@ -1,5 +1,7 @@
 //! Logs, traces and metrics of the process. Each is set up once per process, even with several servers in it.
 
+mod filter;
+mod lines;
 mod metrics;
 mod text_format;
 mod traces;
@@ -10,8 +12,10 @@ use tracing::{Level, Metadata};
 use tracing_subscriber::filter::{LevelFilter, filter_fn};
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
-use tracing_subscriber::{EnvFilter, Layer, Registry, fmt};
+use tracing_subscriber::{Layer, Registry, fmt};
 
+pub use self::filter::InvalidFilter;
+pub use self::lines::{LogGuard, dropped_log_lines};
 pub use self::metrics::{install_metrics, render_metrics};
 pub use self::traces::{InvalidEndpoint, TraceExporter};
 
@@ -34,13 +38,17 @@ fn coloured() -> bool {
 
 /// Writes logs to standard error, filtered by `QEDGIX_LOG` (default: `info`), and request spans to `traces`.
 /// Further calls have no effect.
-pub fn init_logs(config: LogConfig, traces: Option<&TraceExporter>) {
-    let filter = EnvFilter::try_from_env("QEDGIX_LOG").unwrap_or_else(|_| EnvFilter::new("info"));
+///
+/// # Errors
+/// The filter is not understood.
+pub fn init_logs(config: LogConfig, traces: Option<&TraceExporter>) -> Result<LogGuard, InvalidFilter> {
+    let filter = filter::from_env()?;
     // Target of the access log.
     let access = if config.access { "qedgix::access=info" } else { "qedgix::access=off" };
     let filter = filter.add_directive(access.parse().expect("the directive is valid"));
     // Log lines that cannot be written are lost; the default reports them with `eprintln!`, which would panic.
-    let lines = fmt::layer().with_writer(std::io::stderr).log_internal_errors(false);
+    let (queue, guard) = lines::queue();
+    let lines = fmt::layer().with_writer(queue).log_internal_errors(false);
     let lines: Box<dyn Layer<Registry> + Send + Sync> = if config.json {
         lines.json().with_span_list(false).boxed()
     } else {
@@ -58,4 +66,5 @@ pub fn init_logs(config: LogConfig, traces: Option<&TraceExporter>) {
     };
     // Fails when a program that embeds this library has its own subscriber, which then stays.
     let _ = installed;
+    Ok(guard)
 }

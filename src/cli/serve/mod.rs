@@ -218,7 +218,8 @@ enum LogFormat {
 pub async fn run(args: ServeArgs) -> anyhow::Result<()> {
     let traces = args.otlp_endpoint.as_deref().map(TraceExporter::start).transpose()?;
     let logs = LogConfig { json: matches!(args.log_format, LogFormat::Json), access: args.access_log };
-    telemetry::init_logs(logs, traces.as_ref());
+    // Until the end, and not longer: what is printed about an error comes after the log.
+    let _logs = telemetry::init_logs(logs, traces.as_ref())?;
     refuse_huge_pages();
     let mut config = Config { follow: args.follow.config()?, ..args.config() };
     config.validate()?;
@@ -279,6 +280,9 @@ fn reload_on_hangup(tls: Option<Arc<Tls>>) -> std::io::Result<()> {
     Ok(())
 }
 
+/// Time for the last log line.
+const LAST_LINE: Duration = Duration::from_millis(50);
+
 /// Resolves on the first ctrl-c or SIGTERM. The second signal ends the process at once. No acknowledged change is lost, because
 /// it is committed to the database; workers end with the server.
 fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
@@ -288,6 +292,7 @@ fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
         tokio::spawn(async move {
             let code = signals.next().await;
             tracing::warn!("second stop signal: ending at once");
+            tokio::time::sleep(LAST_LINE).await;
             std::process::exit(code.into());
         });
     })

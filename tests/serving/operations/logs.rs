@@ -1,5 +1,7 @@
 //! Logs: formats, levels, and request ids.
 
+use std::process::{Command, Stdio};
+
 use qedgix::wire::v1::ListJobsRequest;
 use reqwest::{Client, StatusCode};
 use serde_json::{Value, json};
@@ -117,4 +119,121 @@ async fn text_logs_have_one_line_per_event_for_any_input() {
         found[0].contains("method=POST /v1/jobs") && found[0].contains("code=\"422\"") && !found[0].contains("otel."),
         "{found:?}"
     );
+}
+
+/// `qedgix serve` on free ports.
+fn serve(dir: &std::path::Path) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_qedgix"));
+    command.args(["serve", "--grpc-addr", "127.0.0.1:0", "--http-addr", "127.0.0.1:0", "--data-dir"]).arg(dir);
+    command
+}
+
+#[tokio::test]
+async fn a_log_that_nobody_reads_does_not_stop_the_server() {
+    install_tls_provider();
+    for signals in [1, 2] {
+        let dir = tempfile::tempdir().unwrap();
+        let mut command = serve(dir.path());
+        command.args(["--access-log", "--drain-timeout", "0s"]).env("QEDGIX_LOG", "debug");
+        // The pipe is never read.
+        let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+        let url = with_timeout(async {
+            loop {
+                if let Ok(text) = std::fs::read_to_string(dir.path().join(qedgix::server::ENDPOINTS)) {
+                    let endpoints: Value = serde_json::from_str(&text).unwrap();
+                    break format!("http://{}", endpoints["http"].as_str().unwrap());
+                }
+                tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+            }
+        })
+        .await;
+        let client = Client::new();
+        // Until the queue is full, too.
+        with_timeout(async {
+            loop {
+                for _ in 0..1000 {
+                    assert_eq!(client.get(format!("{url}/livez")).send().await.unwrap().status(), 200);
+                }
+                let metrics = client.get(format!("{url}/metrics")).send().await.unwrap().text().await.unwrap();
+                let dropped =
+                    metrics.lines().find_map(|line| line.strip_prefix("qedgix_log_lines_dropped_total ")).unwrap_or("0");
+                if dropped != "0" {
+                    break;
+                }
+            }
+        })
+        .await;
+        let ended = with_timeout(async {
+            for _ in 0..signals {
+                let sent = Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();
+                assert!(sent.success());
+            }
+            loop {
+                if let Some(status) = child.try_wait().unwrap() {
+                    break status.code();
+                }
+                tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+            }
+        });
+        // The second signal may find the process ended.
+        let code = ended.await;
+        assert!(code == Some(0) || signals == 2 && code == Some(143), "{code:?}");
+    }
+}
+
+#[test]
+fn a_start_that_fails_names_the_setting() {
+    let dir = tempfile::tempdir().unwrap();
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let addr = taken.local_addr().unwrap().to_string();
+    let failed = |flags: &[&str], filter: &str| {
+        let output = Command::new(env!("CARGO_BIN_EXE_qedgix"))
+            .args(["serve", "--data-dir"])
+            .arg(dir.path())
+            .args(flags)
+            .env("QEDGIX_LOG", filter)
+            .output()
+            .unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        String::from_utf8(output.stderr).unwrap()
+    };
+    let misspelled = failed(&[], "inf");
+    assert!(misspelled.starts_with("error: QEDGIX_LOG: got \"inf\"") && misspelled.contains("debug"), "{misspelled}");
+    let free = "127.0.0.1:0";
+    for (flags, flag) in [
+        (["--grpc-addr", &addr, "--http-addr", free], "--grpc-addr"),
+        (["--grpc-addr", free, "--http-addr", &addr], "--http-addr"),
+    ] {
+        let error = failed(&flags, "");
+        // After the log.
+        let last = error.lines().last().unwrap();
+        assert!(last.starts_with(&format!("error: {flag}: cannot listen on {addr}")), "{error}");
+    }
+}
+
+#[cfg(target_os = "linux")]
+#[tokio::test]
+async fn the_limit_of_open_files_is_raised_or_connections_are_limited() {
+    install_tls_provider();
+    for (soft, hard, warned) in [(200, 4000, false), (400, 400, true)] {
+        let dir = tempfile::tempdir().unwrap();
+        let limits = format!("ulimit -Sn {soft} && ulimit -Hn {hard} && exec \"$0\" \"$@\"");
+        let inner = serve(dir.path());
+        let mut command = Command::new("sh");
+        command.args(["-c", &limits]).arg(inner.get_program()).args(inner.get_args()).args(["--max-connections", "300"]);
+        let mut child = command.env_remove("QEDGIX_LOG").stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+        with_timeout(async {
+            while !dir.path().join(qedgix::server::ENDPOINTS).exists() {
+                assert!(child.try_wait().unwrap().is_none());
+                tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+            }
+        })
+        .await;
+        let limits = std::fs::read_to_string(format!("/proc/{}/limits", child.id())).unwrap();
+        let files = limits.lines().find(|line| line.starts_with("Max open files")).unwrap();
+        assert_eq!(files.split_whitespace().nth(3), Some(hard.to_string().as_str()), "{limits}");
+        assert!(Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap().success());
+        let log = String::from_utf8(child.wait_with_output().unwrap().stderr).unwrap();
+        assert_eq!(log.contains("fewer connections are accepted limit=400 wanted=300 connections=200"), warned, "{log}");
+    }
 }
