@@ -109,8 +109,9 @@ pub struct ServerMetrics {
 
 /// Collects the metrics. Never fails, because metrics are most needed when the database does not answer.
 pub async fn server_metrics(app: &App) -> ServerMetrics {
-    let (ready, jobs) = tokio::join!(app.ready(), tokio::time::timeout(DATABASE_TIMEOUT, app.store.job_counts()));
-    let jobs = match jobs {
+    // One after the other, so that a scrape needs one connection to the database.
+    let ready = app.ready().await.is_ok();
+    let jobs = match tokio::time::timeout(DATABASE_TIMEOUT, app.store.job_counts()).await {
         Ok(Ok(jobs)) => jobs,
         Ok(Err(e)) => {
             tracing::warn!(error = %e, "cannot count jobs");
@@ -119,7 +120,7 @@ pub async fn server_metrics(app: &App) -> ServerMetrics {
         Err(_) => Vec::new(),
     };
     ServerMetrics {
-        ready: ready.is_ok(),
+        ready,
         database_writable: app.store.write_failure().is_none(),
         sessions: app.sessions.len(),
         session_memory: app.sessions.memory_used(),
