@@ -26,6 +26,8 @@ pub enum WriteFailure {
     Locked,
     /// The file, or its write-ahead log, was deleted or replaced. What is written to it would be lost.
     Lost,
+    /// The process has as many files and connections open as it may.
+    TooManyFiles,
     /// The disk or the file system reports another error, or does not answer.
     Failed,
 }
@@ -38,6 +40,7 @@ impl WriteFailure {
             Self::ReadOnly => "the database file or its file system is read-only",
             Self::Locked => "another process holds the lock of the database",
             Self::Lost => "the database file or its write-ahead log was deleted or replaced",
+            Self::TooManyFiles => "too many files and connections are open; raise the limit (ulimit -n, LimitNOFILE=)",
             Self::Failed => "the disk of the database reports an error or does not answer",
         }
     }
@@ -45,7 +48,11 @@ impl WriteFailure {
     /// The failure that an error means; `None` if it is about something else, such as a constraint.
     pub(super) fn of(error: &sqlx::Error) -> Option<Self> {
         match error {
-            sqlx::Error::Database(error) => Self::of_code(error.code()?.parse().ok()?),
+            sqlx::Error::Database(error) => {
+                let code = error.code()?.parse().ok()?;
+                // CANTOPEN has many causes. SQLite keeps that of the operating system for itself.
+                if code & 0xff == 14 && no_file_can_be_opened() { Some(Self::TooManyFiles) } else { Self::of_code(code) }
+            }
             sqlx::Error::PoolTimedOut | sqlx::Error::WorkerCrashed | sqlx::Error::Io(_) => Some(Self::Failed),
             _ => None,
         }
@@ -66,6 +73,13 @@ impl WriteFailure {
             _ => None,
         }
     }
+}
+
+/// Whether this process, or the system, has reached its limit of open files.
+fn no_file_can_be_opened() -> bool {
+    let limits = [rustix::io::Errno::MFILE, rustix::io::Errno::NFILE].map(rustix::io::Errno::raw_os_error);
+    let opened = std::fs::File::open("/");
+    opened.is_err_and(|error| error.raw_os_error().is_some_and(|code| limits.contains(&code)))
 }
 
 /// Device and inode of a file: another file at the same path has others.
