@@ -32,6 +32,9 @@ mod tests {
         let inner = layer("the disk is gone", None);
         let repeated = layer("read failed: the disk is gone", Some(Box::new(inner)));
         let plain = layer("cannot start", Some(Box::new(repeated)));
-        assert_eq!(text(&layer("internal error", Some(Box::new(plain)))), "internal error: cannot start: read failed: the disk is gone");
+        assert_eq!(
+            text(&layer("internal error", Some(Box::new(plain)))),
+            "internal error: cannot start: read failed: the disk is gone"
+        );
     }
 }

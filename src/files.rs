@@ -143,7 +143,9 @@ pub fn give_to_owner_of_directory(path: &Path) {
 /// It is something else.
 pub fn check_replaceable(path: &Path) -> io::Result<()> {
     match fs::metadata(path) {
-        Ok(found) if !found.is_file() => Err(io::Error::other("it exists and is not a file; nothing else than a file is replaced")),
+        Ok(found) if !found.is_file() => {
+            Err(io::Error::other("it exists and is not a file; nothing else than a file is replaced"))
+        }
         _ => Ok(()),
     }
 }

@@ -10,11 +10,13 @@ use crate::service::backup::{self, Backup, Restore};
 
 /// Flags of `backup`.
 #[derive(Args, Debug)]
-#[command(after_help = "The server may run meanwhile. The backup has jobs, policies and API keys as they were at one moment. If a
+#[command(
+    after_help = "The server may run meanwhile. The backup has jobs, policies and API keys as they were at one moment. If a
 policy in the database is damaged, the backup is written all the same, and a warning names the policy.
 
 Example:
-  qedgix backup /backups/qedgix-$(date +%F).sqlite --data-dir /var/lib/qedgix")]
+  qedgix backup /backups/qedgix-$(date +%F).sqlite --data-dir /var/lib/qedgix"
+)]
 pub struct BackupArgs {
     /// File to write; an existing one is replaced when the new one is complete, and nothing else than a file is replaced. Only its owner
     /// can read it

@@ -133,7 +133,9 @@ pub enum Error {
         reason: String,
     },
     /// The file is the database of another program.
-    #[error("{path} is not a database of qedgix: it has the table {table:?} and no list of migrations; choose another --data-dir")]
+    #[error(
+        "{path} is not a database of qedgix: it has the table {table:?} and no list of migrations; choose another --data-dir"
+    )]
     Foreign {
         /// The file.
         path: PathBuf,
@@ -144,7 +146,9 @@ pub enum Error {
     #[error(transparent)]
     Denied(#[from] files::Denied),
     /// A part of the data cannot be read on a read-only file system.
-    #[error("{0} exists and cannot be read on a read-only file system: a server runs, or was killed; make the file system writable")]
+    #[error(
+        "{0} exists and cannot be read on a read-only file system: a server runs, or was killed; make the file system writable"
+    )]
     Unmerged(PathBuf),
     /// The database cannot be written at present, so nothing was tried.
     #[error("{}; nothing was stored", .0.reason())]

@@ -53,6 +53,7 @@ impl WriteFailure {
                 // CANTOPEN has many causes. SQLite keeps that of the operating system for itself.
                 if code & 0xff == 14 && no_file_can_be_opened() { Some(Self::TooManyFiles) } else { Self::of_code(code) }
             }
+            sqlx::Error::Io(error) if is_limit_of_files(error) => Some(Self::TooManyFiles),
             sqlx::Error::PoolTimedOut | sqlx::Error::WorkerCrashed | sqlx::Error::Io(_) => Some(Self::Failed),
             _ => None,
         }
@@ -75,11 +76,16 @@ impl WriteFailure {
     }
 }
 
-/// Whether this process, or the system, has reached its limit of open files.
-fn no_file_can_be_opened() -> bool {
+/// Whether the process, or the system, has as many files open as it may.
+fn is_limit_of_files(error: &std::io::Error) -> bool {
     let limits = [rustix::io::Errno::MFILE, rustix::io::Errno::NFILE].map(rustix::io::Errno::raw_os_error);
-    let opened = std::fs::File::open("/");
-    opened.is_err_and(|error| error.raw_os_error().is_some_and(|code| limits.contains(&code)))
+    error.raw_os_error().is_some_and(|code| limits.contains(&code))
+}
+
+/// Whether there are too few file descriptors left for the files that SQLite opens for one connection.
+fn no_file_can_be_opened() -> bool {
+    let opened: std::io::Result<Vec<_>> = (0..4).map(|_| std::fs::File::open("/")).collect();
+    opened.is_err_and(|error| is_limit_of_files(&error))
 }
 
 /// Device and inode of a file: another file at the same path has others.
