@@ -3,8 +3,11 @@
 
 use std::fs::{self, DirBuilder, File, OpenOptions, Permissions};
 use std::io::{self, Write};
-use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt, PermissionsExt};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt, chown};
 use std::path::{Path, PathBuf};
+
+use rustix::fs::Access;
+use rustix::process::geteuid;
 
 /// The file beside `path` that [`write_atomic`] writes first. It is left behind when the process is killed during a write.
 pub fn partial_path(path: &Path) -> PathBuf {
@@ -86,13 +89,75 @@ pub fn make_private(path: &Path) -> io::Result<bool> {
     fs::set_permissions(path, Permissions::from_mode(mode & 0o700)).map(|()| true)
 }
 
+/// The user of this process may not read or write a file.
+#[derive(Debug, thiserror::Error)]
+#[error("permission denied: {path} (this process runs as {user})")]
+pub struct Denied {
+    /// The file.
+    pub path: PathBuf,
+    /// Name of the user, or its number.
+    pub user: String,
+}
+
+/// Checks that the user of this process may read the file, and with `write` also write it. A file that is missing is no error. The
+/// file is not opened: closing it would release the locks that SQLite holds on it.
+///
+/// # Errors
+/// [`Denied`].
+pub fn check_access(path: &Path, write: bool) -> Result<(), Denied> {
+    let access = if write { Access::READ_OK | Access::WRITE_OK } else { Access::READ_OK };
+    match rustix::fs::access(path, access) {
+        Err(rustix::io::Errno::ACCESS) => Err(Denied { path: path.to_owned(), user: user() }),
+        _ => Ok(()),
+    }
+}
+
+/// The user of this process.
+fn user() -> String {
+    let id = geteuid().as_raw().to_string();
+    let users = fs::read_to_string("/etc/passwd").unwrap_or_default();
+    let of_id = |line: &str| {
+        let mut fields = line.split(':');
+        let name = fields.next()?;
+        (fields.nth(1) == Some(id.as_str())).then(|| name.to_owned())
+    };
+    users.lines().find_map(of_id).unwrap_or_else(|| format!("user {id}"))
+}
+
+/// Gives a file that root has created to the owner of its directory, who could not open it otherwise. Other users cannot give files
+/// away.
+pub fn give_to_owner_of_directory(path: &Path) {
+    if !geteuid().is_root() {
+        return;
+    }
+    let given = fs::metadata(directory_of(path)).and_then(|owner| chown(path, Some(owner.uid()), Some(owner.gid())));
+    if let Err(error) = given {
+        // In some containers root may not do this either.
+        tracing::warn!(path = %path.display(), %error, "the file belongs to root, and not to the owner of its directory");
+    }
+}
+
+/// Checks that `path` is a file or missing: directories, devices and pipes are not replaced.
+///
+/// # Errors
+/// It is something else.
+pub fn check_replaceable(path: &Path) -> io::Result<()> {
+    match fs::metadata(path) {
+        Ok(found) if !found.is_file() => {
+            Err(io::Error::other("it exists and is not a file; nothing else than a file is replaced"))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// The directory of `path`.
+pub fn directory_of(path: &Path) -> &Path {
+    path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
 /// Waits until the directory entry of `path` is on disk.
 fn sync_directory_of(path: &Path) -> io::Result<()> {
-    let directory = match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent,
-        _ => Path::new("."),
-    };
-    if cfg!(unix) { File::open(directory)?.sync_all() } else { Ok(()) }
+    if cfg!(unix) { File::open(directory_of(path))?.sync_all() } else { Ok(()) }
 }
 
 #[cfg(test)]
@@ -143,6 +208,33 @@ mod tests {
         fs::create_dir(&other).unwrap();
         assert!(write_atomic(&other, b"new").is_err());
         assert!(!partial_path(&other).exists());
+    }
+
+    #[test]
+    fn files_of_root_belong_to_the_owner_of_the_directory() {
+        if !geteuid().is_root() {
+            println!("skipped: needs root");
+            return;
+        }
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("a");
+        chown(directory.path(), Some(12345), Some(54321)).unwrap();
+        fs::write(&path, "").unwrap();
+        give_to_owner_of_directory(&path);
+        let metadata = fs::metadata(&path).unwrap();
+        assert_eq!((metadata.uid(), metadata.gid()), (12345, 54321));
+    }
+
+    #[test]
+    fn only_files_are_replaceable() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("a");
+        check_replaceable(&path).unwrap();
+        fs::write(&path, "").unwrap();
+        check_replaceable(&path).unwrap();
+        for other in [directory.path(), Path::new("/dev/null")] {
+            assert!(check_replaceable(other).is_err(), "{}", other.display());
+        }
     }
 
     #[test]

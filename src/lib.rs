@@ -19,11 +19,12 @@
 //! | [`plot`] | numbers to SVG |
 //! | [`nn`], [`env`] | neural network layers; the simulated environment |
 //! | [`clock`], [`draining`], [`inflight`] | wall and monotonic time; the shutdown flag; the budget of bytes in flight |
-//! | [`invalid`], [`error_code`], [`rng`], [`files`], [`threads`] | errors of invalid input; error codes; seeded random streams; atomic writes of files; loops on several threads |
+//! | [`invalid`], [`error_code`], [`causes`], [`rng`], [`files`], [`threads`] | errors of invalid input; error codes; errors with their causes; seeded random streams; atomic writes of files; loops on several threads |
 //!
 //! Reading order: `env`, `policy`, `learner`; then `service` and the layers that it calls.
 
 pub mod api;
+pub mod causes;
 pub mod checkpoint;
 pub mod cli;
 pub mod clock;

@@ -12,6 +12,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("inflight", &[]),
     ("invalid", &[]),
     ("error_code", &[]),
+    ("causes", &[]),
     ("rng", &[]),
     ("files", &[]),
     ("wire", &[]),
@@ -49,6 +50,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     (
         "service",
         &[
+            "causes",
             "clock",
             "draining",
             "inflight",
@@ -70,6 +72,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     (
         "api",
         &[
+            "causes",
             "draining",
             "inflight",
             "service",
@@ -90,6 +93,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     (
         "server",
         &[
+            "causes",
             "clock",
             "draining",
             "inflight",
@@ -107,6 +111,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     (
         "cli",
         &[
+            "causes",
             "clock",
             "server",
             "config",

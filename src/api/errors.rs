@@ -80,8 +80,8 @@ fn primary(error: &Error) -> Option<&str> {
 
 /// Logs an internal error that is not the status of a call: it is part of a response, or ends a stream.
 pub(super) fn log_internal(error: &Error) {
-    if let Error::Internal(cause) = error {
-        tracing::error!(error = %cause, "internal error");
+    if let Error::Internal(_) = error {
+        tracing::error!(error = error.reason(), "internal error");
     }
 }
 
@@ -273,7 +273,7 @@ impl IntoResponse for Problem {
     }
 }
 
-/// Extension of an error response: the text for the log, with the cause of an internal error.
+/// Extension of an error response: the text for the log, with the causes of an internal error.
 #[derive(Clone, Debug)]
 pub(super) struct LogDetail(pub(super) String);
 
@@ -286,11 +286,7 @@ impl IntoResponse for Error {
         if let Self::Unauthenticated(_) = self {
             response.headers_mut().insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer realm=\"qedgix\""));
         }
-        let detail = match &self {
-            Self::Internal(cause) => cause.to_string(),
-            error => error.to_string(),
-        };
-        response.extensions_mut().insert(LogDetail(detail));
+        response.extensions_mut().insert(LogDetail(self.reason()));
         response
     }
 }
@@ -363,6 +359,14 @@ mod tests {
         for code in ErrorCode::ALL {
             assert_eq!(document.matches(&format!("\n| `{code}` |")).count(), 1, "{code}");
         }
+    }
+
+    #[test]
+    fn logs_have_every_cause_of_an_internal_error_once() {
+        let damaged = || Error::internal(std::sync::Arc::new(Error::internal("the checkpoint is damaged")));
+        let detail = damaged().into_response().extensions_mut().remove::<LogDetail>().unwrap().0;
+        assert_eq!(detail, "internal error: the checkpoint is damaged");
+        assert_eq!(damaged().reason(), detail);
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
-use crate::files::partial_path;
+use crate::files::{check_replaceable, partial_path};
 
 /// Checks that [`write_atomic`] can write `path`, without changing it.
 ///
@@ -13,9 +13,7 @@ use crate::files::partial_path;
 /// The directory is missing or cannot be written, or the path is something else than a file.
 pub fn check_writable(path: &Path) -> anyhow::Result<()> {
     let check = || -> anyhow::Result<()> {
-        if fs::metadata(path).is_ok_and(|file| !file.is_file()) {
-            bail!("it exists and is not a file");
-        }
+        check_replaceable(path)?;
         let partial = partial_path(path);
         fs::OpenOptions::new().create(true).append(true).open(&partial)?;
         fs::remove_file(&partial)?;

@@ -10,7 +10,7 @@ use jiff::{Span, SpanRelativeTo, Timestamp};
 use serde_json::json;
 
 use super::output::{errln, outln};
-use crate::service::keys::{self, CreatedKey, KeyInfo, NewKey, Scopes};
+use crate::service::keys::{self, CreatedKey, KeyInfo, NewKey, Purpose, Scopes};
 
 /// Flags of `keys`.
 #[derive(Args, Debug)]
@@ -86,7 +86,12 @@ enum What {
 /// # Errors
 /// The data directory has no database, a value is invalid, or the key is unknown.
 pub async fn run(args: KeysArgs) -> anyhow::Result<()> {
-    let store = keys::open_store(&args.data_dir, matches!(args.what, What::Create { .. })).await?;
+    let purpose = match args.what {
+        What::Create { .. } => Purpose::Create,
+        What::Rotate { .. } | What::Revoke { .. } => Purpose::Change,
+        What::List => Purpose::Read,
+    };
+    let store = keys::open_store(&args.data_dir, purpose).await?;
     let done = async {
         let now = Timestamp::now();
         match args.what {

@@ -7,6 +7,8 @@ use std::fmt::Arguments;
 use std::io::{self, Write};
 use std::process::ExitCode;
 
+use crate::causes;
+
 /// Prints a line to standard output. Returns `Result<(), OutputError>`.
 macro_rules! outln {
     ($($arg:tt)*) => { $crate::cli::output::print_line(::std::format_args!($($arg)*)) };
@@ -73,7 +75,7 @@ pub fn exit_code(result: anyhow::Result<()>) -> ExitCode {
         }
         return ExitCode::from(*code);
     }
-    print_error_line(format_args!("error: {error:#}"));
+    print_error_line(format_args!("error: {}", causes::text(error.as_ref())));
     ExitCode::FAILURE
 }
 

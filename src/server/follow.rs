@@ -11,6 +11,7 @@ use reqwest::redirect::Policy;
 use reqwest::{Client, Response, StatusCode};
 use serde::Deserialize;
 
+use crate::causes;
 use crate::config::FollowConfig;
 use crate::service::policies::{self, Manifest, MissingVersion};
 use crate::service::{App, Error as ServiceError};
@@ -33,7 +34,7 @@ const MAX_DESCRIPTION: usize = 4 << 20;
 #[derive(Debug, thiserror::Error)]
 enum FollowError {
     /// The primary does not answer.
-    #[error("{}", describe(.0))]
+    #[error("{}", causes::text(.0))]
     Request(#[from] reqwest::Error),
     /// The primary refuses the request.
     #[error("{path}: {status}; {hint}")]
@@ -44,12 +45,6 @@ enum FollowError {
     /// The answer cannot be taken over.
     #[error("{}", .0.reason())]
     Service(#[from] ServiceError),
-}
-
-/// An error with its causes.
-fn describe(error: &reqwest::Error) -> String {
-    let causes = std::iter::successors(Some(error as &dyn std::error::Error), |error| error.source());
-    causes.map(ToString::to_string).collect::<Vec<_>>().join(": ")
 }
 
 impl FollowError {

@@ -1,6 +1,5 @@
 //! Background task that keeps the API keys of a running server in step with the database.
 
-use std::error::Error;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -17,7 +16,7 @@ pub(super) async fn follow(app: Arc<App>) {
     for refresh in 1_u64.. {
         tokio::time::sleep(REFRESH_INTERVAL).await;
         if let Err(error) = app.keys.refresh(&app.store).await {
-            tracing::warn!(error = &error as &dyn Error, "cannot refresh API keys");
+            tracing::warn!(error = error.reason(), "cannot refresh API keys");
         }
         if refresh % REFRESHES_PER_SAVE == 0 {
             save_last_used(&app).await;
@@ -28,6 +27,6 @@ pub(super) async fn follow(app: Arc<App>) {
 /// Saves when keys were last used.
 pub(super) async fn save_last_used(app: &App) {
     if let Err(error) = app.keys.save_last_used(&app.store).await {
-        tracing::warn!(error = &error as &dyn Error, "cannot save when API keys were last used");
+        tracing::warn!(error = error.reason(), "cannot save when API keys were last used");
     }
 }

@@ -85,11 +85,21 @@ pub enum Error {
     #[error(transparent)]
     Store(#[from] store::Error),
     /// API keys cannot be read.
-    #[error("cannot read API keys: {0}")]
-    Keys(#[source] crate::service::Error),
+    #[error("cannot read API keys: {path}: {}", cause.reason())]
+    Keys {
+        /// The database.
+        path: PathBuf,
+        /// What the service says.
+        cause: crate::service::Error,
+    },
     /// Policies cannot be loaded.
-    #[error("cannot load policies: {0}")]
-    Policies(#[source] crate::service::Error),
+    #[error("cannot load policies: {path}: {}", cause.reason())]
+    Policies {
+        /// The database.
+        path: PathBuf,
+        /// What the service says.
+        cause: crate::service::Error,
+    },
     /// The path of this program is unknown, so workers cannot be started.
     #[error("cannot find the program of workers: {0}")]
     Worker(#[source] std::io::Error),
@@ -201,6 +211,7 @@ impl DataDir {
         }
         let file = path.join("lock");
         let lock = files::private_file().truncate(false).open(&file).map_err(failed(&file))?;
+        files::give_to_owner_of_directory(&file);
         match lock_patiently(&lock) {
             Ok(()) => Ok(Self { path: path.to_owned(), _locks: [directory, lock] }),
             Err(TryLockError::WouldBlock) => Err(Error::InUse(path.to_owned())),
@@ -263,7 +274,7 @@ async fn open_app(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         ..SchedulerConfig::new(config.cpu_budget)
     };
     let keys = Keyring::new(config.key_rate.map(|rate| Rate::new(rate, config.key_burst)));
-    keys.refresh(&store).await.map_err(Error::Keys)?;
+    keys.refresh(&store).await.map_err(|cause| Error::Keys { path: data.path.join(store::FILE), cause })?;
     config.validate_exposure(keys.required())?;
     if config.tls.is_none() && config.validate_exposure(false).is_err() {
         tracing::warn!("this server accepts remote connections without TLS: API keys travel unencrypted (see --tls-cert)");
@@ -292,7 +303,7 @@ async fn open_app(config: &Config, data: &DataDir, clock: Clock) -> Result<Arc<A
         max_message_size: config.max_message_size,
         draining,
     };
-    policies::fill_registry(&app).await.map_err(Error::Policies)?;
+    policies::fill_registry(&app).await.map_err(|cause| Error::Policies { path: data.path.join(store::FILE), cause })?;
     Ok(Arc::new(app))
 }
 

@@ -3,20 +3,22 @@
 use std::path::Path;
 
 use crate::store;
-pub use crate::store::BackupError;
+pub use crate::store::{Backup, BackupError, Restore};
 
-/// Copies the database in `data_dir`, which a server may use meanwhile, to `target`. Returns the size of the copy in bytes.
+/// Copies the database in `data_dir`, which a server may use meanwhile, to `target`. A damaged database is copied as far as it
+/// can be read completely.
 ///
 /// # Errors
 /// [`BackupError`]. `target` is then as it was.
-pub async fn backup(data_dir: &Path, target: &Path) -> Result<u64, BackupError> {
+pub async fn backup(data_dir: &Path, target: &Path) -> Result<Backup, BackupError> {
     store::backup(data_dir, target).await
 }
 
-/// Makes the backup `source` the database in `data_dir`, which no server may use. With `force`, it replaces another one.
+/// Makes the backup `source` the database in `data_dir`, which no server may use. Returns the damage that was
+/// accepted.
 ///
 /// # Errors
 /// [`BackupError`]. The database is then as it was.
-pub async fn restore(source: &Path, data_dir: &Path, force: bool) -> Result<(), BackupError> {
-    store::restore(source, data_dir, force).await
+pub async fn restore(source: &Path, data_dir: &Path, options: Restore) -> Result<Vec<String>, BackupError> {
+    store::restore(source, data_dir, options).await
 }

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use crate::causes;
 use crate::error_code::ErrorCode;
 use crate::inflight::Exhausted;
 use crate::invalid::Invalid;
@@ -123,9 +124,9 @@ impl Error {
         }
     }
 
-    /// Why the server failed, or the message of another error. For logs only.
+    /// Why the server failed, with all causes, or the message of another error. For logs only.
     pub fn reason(&self) -> String {
-        std::error::Error::source(self).map_or_else(|| self.to_string(), ToString::to_string)
+        std::error::Error::source(self).map_or_else(|| self.to_string(), causes::text)
     }
 
     /// The field that is not accepted, if the error is about one.

@@ -21,6 +21,7 @@ mod aliases;
 mod attempts;
 mod backup;
 mod checkpoints;
+mod damage;
 mod events;
 mod followed;
 mod job_changes;
@@ -33,6 +34,7 @@ mod metric_summaries;
 mod metrics;
 mod named_enum;
 mod old_jobs;
+mod partial;
 mod policies;
 #[cfg(test)]
 mod query_plans;
@@ -49,7 +51,7 @@ mod writes;
 
 pub use aliases::{AliasHistoryEntry, AliasHistoryFilter, AliasMove, PolicyAlias};
 pub use attempts::{Attempt, AttemptOutcome, EndedAttempt, Lease, LeaseRecord, WorkerResult};
-pub use backup::{BackupError, backup, restore};
+pub use backup::{Backup, BackupError, Restore, backup, restore};
 pub use checkpoints::{Checkpoint, CheckpointKind, NewCheckpoint};
 pub use events::{JobEvent, JobEventKind};
 pub use followed::FollowedVersion;
@@ -75,7 +77,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 use sqlx::migrate::{MigrateError, Migration, MigrationType, Migrator};
 use sqlx::sqlite::{SqliteAutoVacuum, SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
-use sqlx::{Connection, SqlSafeStr, SqliteConnection, SqlitePool};
+use sqlx::{ConnectOptions, Connection, SqlSafeStr, SqliteConnection, SqlitePool};
 
 use crate::files;
 
@@ -120,8 +122,34 @@ const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(10);
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// SQLite or the disk failed.
-    #[error("database: {0}")]
+    #[error("{}", describe(.0))]
     Sqlx(#[from] sqlx::Error),
+    /// The file is damaged, or not a database.
+    #[error("{path} is damaged ({reason}): stop the server and restore a backup (qedgix restore)")]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What SQLite says.
+        reason: String,
+    },
+    /// The file is the database of another program.
+    #[error(
+        "{path} is not a database of qedgix: it has the table {table:?} and no list of migrations; choose another --data-dir"
+    )]
+    Foreign {
+        /// The file.
+        path: PathBuf,
+        /// One of its tables.
+        table: String,
+    },
+    /// The user of this process may not read or write a file.
+    #[error(transparent)]
+    Denied(#[from] files::Denied),
+    /// A part of the data cannot be read on a read-only file system.
+    #[error(
+        "{0} exists and cannot be read on a read-only file system: a server runs, or was killed; make the file system writable"
+    )]
+    Unmerged(PathBuf),
     /// The database cannot be written at present, so nothing was tried.
     #[error("{}; nothing was stored", .0.reason())]
     Write(WriteFailure),
@@ -158,8 +186,45 @@ impl Error {
             Self::Sqlx(error) | Self::Migrate(MigrateError::Execute(error) | MigrateError::ExecuteMigration(error, _)) => {
                 WriteFailure::of(error)
             }
-            Self::Migrate(_) | Self::Newer { .. } | Self::Corrupt { .. } => None,
+            _ => None,
         }
+    }
+
+    /// Says more about an error of opening the database `path`.
+    fn of_opening(self, path: &Path) -> Self {
+        let directory = files::directory_of(path);
+        match &self {
+            Self::Sqlx(cause) | Self::Migrate(MigrateError::Execute(cause) | MigrateError::ExecuteMigration(cause, _))
+                if damage::is_damage(cause) =>
+            {
+                return Self::Damaged { path: path.to_owned(), reason: cause.to_string() };
+            }
+            _ => {}
+        }
+        match self.write_failure() {
+            Some(failure @ (WriteFailure::Failed | WriteFailure::ReadOnly)) => {
+                let access = files::check_access(directory, true).and_then(|()| files::check_access(path, true));
+                if let Err(denied) = access {
+                    return denied.into();
+                }
+                if failure == WriteFailure::ReadOnly {
+                    return Self::Write(failure);
+                }
+                // SQLite reports some effects of a full disk as errors of the disk.
+                upkeep::examine_file_system(directory).map_or(self, Self::Write)
+            }
+            Some(failure) => Self::Write(failure),
+            None => self,
+        }
+    }
+}
+
+/// An error of SQLite, with what to do about damage.
+fn describe(error: &sqlx::Error) -> String {
+    if damage::is_damage(error) {
+        format!("the database is damaged ({error}): stop the server and restore a backup (qedgix restore)")
+    } else {
+        format!("database: {error}")
     }
 }
 
@@ -178,15 +243,33 @@ impl Store {
     /// Opens the database in the existing directory `data_dir`. Creates and migrates it when needed.
     ///
     /// # Errors
-    /// [`Error::Sqlx`] when the file cannot be opened; [`Error::Newer`] when a newer version has written it.
+    /// [`Error::Sqlx`] when the file cannot be opened; [`Error::Damaged`], [`Error::Denied`]; [`Error::Foreign`] when another
+    /// program, [`Error::Newer`] when a newer version has written it.
     pub async fn open(data_dir: &Path) -> Result<Self, Error> {
         let path = data_dir.join(FILE);
-        Self::open_file(&path).await.map_err(|error| match error.write_failure() {
-            // SQLite reports some effects of a full disk as errors of the disk.
-            Some(WriteFailure::Failed) => upkeep::examine_file_system(data_dir).map_or(error, Error::Write),
-            Some(failure) => Error::Write(failure),
-            None => error,
-        })
+        Self::open_file(&path).await.map_err(|error| error.of_opening(&path))
+    }
+
+    /// Opens an existing database for a caller that only reads. Unlike [`Self::open`], this works on a read-only file system.
+    ///
+    /// # Errors
+    /// As [`Self::open`]; [`Error::Unmerged`].
+    pub async fn open_to_read(data_dir: &Path) -> Result<Self, Error> {
+        let path = data_dir.join(FILE);
+        if upkeep::examine_file_system(data_dir) != Some(WriteFailure::ReadOnly) {
+            return Self::open(data_dir).await;
+        }
+        Self::open_immutable(&path).await.map_err(|error| error.of_opening(&path))
+    }
+
+    async fn open_immutable(path: &Path) -> Result<Self, Error> {
+        let options = on_read_only_file_system(path)?;
+        let pool = SqlitePoolOptions::new().acquire_timeout(ACQUIRE_TIMEOUT);
+        let read = pool.clone().connect_with(options.clone()).await?;
+        check_version(&mut *read.acquire().await?).await?;
+        let condition = Arc::new(writes::Condition::of(path));
+        condition.set(Some(WriteFailure::ReadOnly));
+        Ok(Self { read, write: pool.connect_lazy_with(options), condition, notifier: Arc::new(events::Notifier::new()) })
     }
 
     async fn open_file(path: &Path) -> Result<Self, Error> {
@@ -200,11 +283,17 @@ impl Store {
             .busy_timeout(BUSY_TIMEOUT);
         let mut create = options.clone().create_if_missing(true);
         // SQLite gives the other files of the database the permissions of this one.
-        match files::private_file().create_new(true).open(path) {
-            // In an old file the setting has no effect before `rewrite`, and it would be a write at every start.
-            Ok(_) => create = create.auto_vacuum(SqliteAutoVacuum::Incremental),
-            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
+        let is_new = match files::private_file().create_new(true).open(path) {
+            Ok(_) => {
+                files::give_to_owner_of_directory(path);
+                true
+            }
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => !has_content(path).await?,
             Err(error) => return Err(sqlx::Error::Io(error).into()),
+        };
+        // In an old file the setting has no effect before `rewrite`, and it would be a write at every start.
+        if is_new {
+            create = create.auto_vacuum(SqliteAutoVacuum::Incremental);
         }
         SqliteConnection::connect_with(&create).await?.close().await?;
         // From here on a missing file is an error: a new, empty one would hide that the data is lost. Connections do not age,
@@ -228,6 +317,43 @@ fn with_suffix(database: &Path, suffix: &str) -> PathBuf {
     name.into()
 }
 
+/// How a database is read where nothing can be written.
+fn on_read_only_file_system(path: &Path) -> Result<SqliteConnectOptions> {
+    let log = with_suffix(path, "-wal");
+    // Reading the log takes a file of shared memory, which cannot be created.
+    if log.exists() { Err(Error::Unmerged(log)) } else { Ok(immutable(path)) }
+}
+
+/// How a file is read that nobody writes: without creating files beside it.
+fn immutable(path: &Path) -> SqliteConnectOptions {
+    SqliteConnectOptions::new().filename(path).read_only(true).immutable(true)
+}
+
+/// Whether an existing file is not empty. Checks, before anything is written to it, that it is not the database of another program.
+/// One without tables is left by a first start that was interrupted.
+async fn has_content(path: &Path) -> Result<bool> {
+    if std::fs::metadata(path).is_ok_and(|file| file.len() == 0) {
+        tracing::warn!(path = %path.display(), "the database file was empty; a new database begins");
+        return Ok(false);
+    }
+    let mut database = SqliteConnectOptions::new().filename(path).busy_timeout(BUSY_TIMEOUT).connect().await?;
+    let foreign = foreign_table(&mut database).await;
+    database.close().await?;
+    match foreign? {
+        Some(table) => Err(Error::Foreign { path: path.to_owned(), table }),
+        None => Ok(true),
+    }
+}
+
+/// A table of a database that is not one of this program.
+async fn foreign_table(database: &mut SqliteConnection) -> Result<Option<String>> {
+    if has_table(database, "_sqlx_migrations").await? {
+        return Ok(None);
+    }
+    let sql = "SELECT name FROM sqlite_schema WHERE type = 'table' LIMIT 1";
+    Ok(sqlx::query_scalar(sql).fetch_optional(database).await?)
+}
+
 /// Checks that no newer version has written the database.
 async fn check_version(database: &mut SqliteConnection) -> Result<()> {
     if !has_table(database, "_sqlx_migrations").await? {
@@ -241,7 +367,7 @@ async fn check_version(database: &mut SqliteConnection) -> Result<()> {
     Err(Error::Newer { migration, written_by: written_by.unwrap_or_else(|| "of an unknown version".into()) })
 }
 
-async fn has_table(database: &mut SqliteConnection, name: &str) -> Result<bool> {
+async fn has_table(database: &mut SqliteConnection, name: &str) -> sqlx::Result<bool> {
     let sql = "SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = ?";
     Ok(sqlx::query(sql).bind(name).fetch_optional(database).await?.is_some())
 }
@@ -351,5 +477,49 @@ mod tests {
         let refused = Store::open(dir.path()).await.unwrap_err();
         let Error::Newer { migration, written_by } = refused else { panic!("{refused}") };
         assert_eq!((migration, written_by.as_str()), (9999, "99.1.0"));
+    }
+
+    #[tokio::test]
+    async fn the_database_of_another_program_is_refused_and_not_changed() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut other = raw(dir.path()).await;
+        sqlx::query("CREATE TABLE t (a)").execute(&mut other).await.unwrap();
+        other.close().await.unwrap();
+        let before = std::fs::read(dir.path().join(FILE)).unwrap();
+        let refused = Store::open(dir.path()).await.unwrap_err();
+        assert!(matches!(&refused, Error::Foreign { table, .. } if table == "t"), "{refused:?}");
+        assert_eq!(std::fs::read(dir.path().join(FILE)).unwrap(), before);
+    }
+
+    #[tokio::test]
+    async fn a_first_start_that_was_interrupted_is_continued() {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join(FILE), "").unwrap();
+        let store = Store::open(dir.path()).await.unwrap();
+        assert!(store.can_give_back().await.unwrap(), "the file is not taken for that of an older version");
+        store.close().await;
+        // The header is written before the first table.
+        let dir = tempfile::tempdir().unwrap();
+        let mut headed = raw(dir.path()).await;
+        sqlx::query("PRAGMA user_version = 1").execute(&mut headed).await.unwrap();
+        headed.close().await.unwrap();
+        assert!(std::fs::metadata(dir.path().join(FILE)).unwrap().len() > 0);
+        Store::open(dir.path()).await.unwrap().close().await;
+    }
+
+    #[tokio::test]
+    async fn a_damaged_database_is_named_with_the_remedy() {
+        let dir = tempfile::tempdir().unwrap();
+        Store::open(dir.path()).await.unwrap().close().await;
+        let path = dir.path().join(FILE);
+        let whole = std::fs::read(&path).unwrap();
+        let mut overwritten = whole.clone();
+        overwritten[100..4096].fill(0x55);
+        for bytes in [overwritten, whole[..8192].to_vec(), b"no database".repeat(1000)] {
+            std::fs::write(&path, bytes).unwrap();
+            let text = crate::causes::text(&Store::open(dir.path()).await.unwrap_err());
+            assert!(text.starts_with(&format!("{} is damaged", path.display())) && text.contains("qedgix restore"), "{text}");
+            assert_eq!(text.matches("(code: ").count(), 1, "{text}");
+        }
     }
 }

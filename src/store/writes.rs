@@ -26,6 +26,8 @@ pub enum WriteFailure {
     Locked,
     /// The file, or its write-ahead log, was deleted or replaced. What is written to it would be lost.
     Lost,
+    /// The process has as many files and connections open as it may.
+    TooManyFiles,
     /// The disk or the file system reports another error, or does not answer.
     Failed,
 }
@@ -38,6 +40,7 @@ impl WriteFailure {
             Self::ReadOnly => "the database file or its file system is read-only",
             Self::Locked => "another process holds the lock of the database",
             Self::Lost => "the database file or its write-ahead log was deleted or replaced",
+            Self::TooManyFiles => "too many files and connections are open; raise the limit (ulimit -n, LimitNOFILE=)",
             Self::Failed => "the disk of the database reports an error or does not answer",
         }
     }
@@ -45,7 +48,12 @@ impl WriteFailure {
     /// The failure that an error means; `None` if it is about something else, such as a constraint.
     pub(super) fn of(error: &sqlx::Error) -> Option<Self> {
         match error {
-            sqlx::Error::Database(error) => Self::of_code(error.code()?.parse().ok()?),
+            sqlx::Error::Database(error) => {
+                let code = error.code()?.parse().ok()?;
+                // CANTOPEN has many causes. SQLite keeps that of the operating system for itself.
+                if code & 0xff == 14 && no_file_can_be_opened() { Some(Self::TooManyFiles) } else { Self::of_code(code) }
+            }
+            sqlx::Error::Io(error) if is_limit_of_files(error) => Some(Self::TooManyFiles),
             sqlx::Error::PoolTimedOut | sqlx::Error::WorkerCrashed | sqlx::Error::Io(_) => Some(Self::Failed),
             _ => None,
         }
@@ -66,6 +74,18 @@ impl WriteFailure {
             _ => None,
         }
     }
+}
+
+/// Whether the process, or the system, has as many files open as it may.
+fn is_limit_of_files(error: &std::io::Error) -> bool {
+    let limits = [rustix::io::Errno::MFILE, rustix::io::Errno::NFILE].map(rustix::io::Errno::raw_os_error);
+    error.raw_os_error().is_some_and(|code| limits.contains(&code))
+}
+
+/// Whether there are too few file descriptors left for the files that SQLite opens for one connection.
+fn no_file_can_be_opened() -> bool {
+    let opened: std::io::Result<Vec<_>> = (0..4).map(|_| std::fs::File::open("/")).collect();
+    opened.is_err_and(|error| is_limit_of_files(&error))
 }
 
 /// Device and inode of a file: another file at the same path has others.

@@ -9,6 +9,8 @@ use qedgix::serving::{FleetInput, PolicyRef};
 use qedgix::train_config::{Algorithm, Preset, TrainConfig, Training};
 use qedgix::wire::v1;
 use rand::RngExt;
+use sqlx::Connection;
+use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 
 use super::harness::*;
 
@@ -138,4 +140,21 @@ async fn a_learned_policy_flies_like_all_others() {
     let (code, _, message) = refused(client.act(held("paper", Bytes::new(), scene(4, 5, 0))).await);
     assert_eq!(code, tonic::Code::InvalidArgument, "{message}");
     client.act(held("practical", Bytes::new(), scene(4, 9, 0))).await.unwrap();
+}
+
+#[tokio::test]
+async fn the_reason_of_a_damaged_checkpoint_names_the_version() {
+    let mut server = Server::start().await;
+    publish(&server, "mine", &checkpoint(Algorithm::Vdn, Preset::Practical, 1)).await;
+    policies::unload_policy(&server.app, "mine").await.unwrap();
+    // After a restart, the version is not in memory.
+    server.begin_stop();
+    let server = with_timeout(server.restarted()).await;
+    let file = server.dir.path().join(qedgix::store::FILE);
+    let mut database = SqliteConnection::connect_with(&SqliteConnectOptions::new().filename(file)).await.unwrap();
+    let sql = "UPDATE policy_versions SET checkpoint = substr(checkpoint, 2) WHERE name = 'mine'";
+    sqlx::query(sql).execute(&mut database).await.unwrap();
+    let error = policies::load_policy(&server.app, "mine").await.unwrap_err();
+    assert_eq!(error.to_string(), "internal error", "callers do not see the cause");
+    assert_eq!(error.reason(), "the checkpoint of mine:1 is damaged: its digest has changed");
 }

@@ -28,6 +28,7 @@ use crate::api::body::{Exchange, IncomingBody};
 use crate::api::compression::Encoding;
 use crate::api::is_probe;
 use crate::api::request_log::{LogLimiter, REQUEST_ID, RequestIds, span};
+use crate::causes;
 use crate::inflight::Exhausted;
 use crate::service::Error;
 
@@ -167,7 +168,7 @@ fn respond(response: Response<Body>, call: &mut Option<Call>, exchange: &Arc<Exc
     let replaced = status.as_ref().and_then(with_code);
     if let Some(status) = replaced.as_ref().or(status.as_ref()) {
         match status.source() {
-            Some(cause) => call.end(status.code(), &cause),
+            Some(cause) => call.end(status.code(), &causes::text(cause)),
             None => call.end(status.code(), &status.message()),
         }
     }

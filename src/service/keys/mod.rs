@@ -76,18 +76,46 @@ pub struct CreatedKey {
     pub key: String,
 }
 
-/// Opens the database in `data_dir`, for a process other than its server. With `create`, a missing database is created.
+/// What a process other than the server opens the database for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Purpose {
+    /// Reading, also on a read-only file system.
+    Read,
+    /// Changing a database that exists.
+    Change,
+    /// Changing; a missing database is created.
+    Create,
+}
+
+/// Why the database was not opened.
+#[derive(Debug, thiserror::Error)]
+pub enum OpenError {
+    /// There is no database, or the directory cannot be created.
+    #[error(transparent)]
+    Invalid(#[from] Invalid),
+    /// The user of this process may not read it.
+    #[error(transparent)]
+    Denied(#[from] files::Denied),
+    /// It cannot be opened.
+    #[error(transparent)]
+    Store(#[from] store::Error),
+}
+
+/// Opens the database in `data_dir`, for a process other than its server.
 ///
 /// # Errors
-/// [`Error::Invalid`] when the database is missing and `create` is false, [`Error::Internal`] when it cannot be read.
-pub async fn open_store(data_dir: &Path, create: bool) -> Result<Store, Error> {
-    if create {
+/// [`OpenError`].
+pub async fn open_store(data_dir: &Path, purpose: Purpose) -> Result<Store, OpenError> {
+    let database = data_dir.join(store::FILE);
+    if purpose == Purpose::Create {
         files::create_private_dir(data_dir)
             .map_err(|e| Invalid::new("--data-dir", data_dir.display(), format!("a directory that can be created ({e})")))?;
-    } else if !data_dir.join(store::FILE).exists() {
+    }
+    files::check_access(&database, false)?;
+    if purpose != Purpose::Create && !database.exists() {
         return Err(Invalid::new("--data-dir", data_dir.display(), "a data directory of a server").into());
     }
-    Ok(Store::open(data_dir).await?)
+    Ok(if purpose == Purpose::Read { Store::open_to_read(data_dir).await? } else { Store::open(data_dir).await? })
 }
 
 /// Creates a key.

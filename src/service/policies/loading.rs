@@ -103,7 +103,7 @@ async fn load(app: &App, reference: PolicyRef) -> Result<Arc<LoadedPolicy>, Erro
         Error::Busy { message, retry_after } => Error::Busy { message: message.clone(), retry_after: *retry_after },
         // It was deleted meanwhile.
         Error::NotFound { what, id, near } => Error::NotFound { what, id: id.clone(), near: near.clone() },
-        _ => Error::internal(error),
+        _ => Error::internal(error.reason()),
     })
 }
 

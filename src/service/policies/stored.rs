@@ -123,7 +123,8 @@ impl StoredVersion {
     async fn parse(self) -> Result<(PolicyRef, ParsedCheckpoint), Error> {
         let (reference, bytes) = self.checkpoint()?;
         // The checkpoint was readable when it was published, so the caller has made no mistake.
-        let parsed = ParsedCheckpoint::parse(CheckpointBytes { bytes, _permit: None }).await.map_err(Error::internal)?;
+        let parsed = ParsedCheckpoint::parse(CheckpointBytes { bytes, _permit: None }).await;
+        let parsed = parsed.map_err(|error| Error::internal(format!("the checkpoint of {reference}: {}", error.reason())))?;
         Ok((reference, parsed))
     }
 }

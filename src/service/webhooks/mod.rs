@@ -16,6 +16,7 @@ use rustls::{ClientConfig, RootCertStore};
 
 use self::address::AllowedReceivers;
 use super::App;
+use crate::causes;
 use crate::invalid::Invalid;
 use crate::store::{self, Webhook, WebhookMessage};
 
@@ -72,7 +73,7 @@ impl Webhooks {
     }
 
     fn client(&self) -> Result<&reqwest::Client, String> {
-        self.client.get_or_init(|| client(self.allowed.clone()).map_err(|e| describe(&*e))).as_ref().map_err(Clone::clone)
+        self.client.get_or_init(|| client(self.allowed.clone()).map_err(|e| causes::text(&*e))).as_ref().map_err(Clone::clone)
     }
 
     /// Sends a message once. An error says why it was not accepted, and whether another try can succeed.
@@ -92,7 +93,7 @@ impl Webhooks {
         };
         // The body of the response is not read.
         let sent = request.body(message.body.clone()).send().await;
-        let status = sent.map_err(|e| again(describe(&e.without_url())))?.status();
+        let status = sent.map_err(|e| again(causes::text(&e.without_url())))?.status();
         match status {
             _ if status.is_success() => Ok(()),
             StatusCode::GONE => Err((format!("the receiver answered {status}"), false)),
@@ -120,12 +121,6 @@ fn client(allowed: AllowedReceivers) -> Result<reqwest::Client, Box<dyn std::err
         .timeout(TIMEOUT)
         .user_agent(concat!("qedgix/", env!("CARGO_PKG_VERSION")));
     Ok(client.build()?)
-}
-
-/// An error with its causes.
-fn describe(error: &dyn std::error::Error) -> String {
-    let causes = std::iter::successors(Some(error), |error| error.source());
-    causes.map(ToString::to_string).collect::<Vec<_>>().join(": ")
 }
 
 /// Sends messages as they become due. Those that wait when the server starts are due at once. Runs until it is dropped.

@@ -1,6 +1,8 @@
 //! The binary: `qedgix keys` next to a running server, commands with keys and certificates, SIGHUP, and logs without secrets.
 
 use std::io::{BufRead, BufReader};
+use std::os::unix::fs::PermissionsExt;
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::mpsc::{Receiver, channel};
@@ -330,4 +332,61 @@ async fn sighup_reloads_certificates() {
     tls::policies(open).await.unwrap();
     let log = process.end();
     assert!(!log.contains("PRIVATE KEY") && !log.contains(fresh.key.lines().nth(1).unwrap()));
+}
+
+/// What a command that must fail prints.
+fn refused(command: &mut Command) -> String {
+    let output = command.output().unwrap();
+    assert!(!output.status.success(), "{output:?}");
+    String::from_utf8(output.stderr).unwrap()
+}
+
+#[tokio::test]
+async fn missing_permissions_are_named_with_the_user() {
+    let (dir, program) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let data = dir.path().join("data");
+    std::fs::create_dir(&data).unwrap();
+    qedgix::store::Store::open(&data).await.unwrap().close().await;
+    // Other users may not search the directory of the build.
+    let copy = program.path().join("qedgix");
+    std::fs::copy(PROGRAM, &copy).unwrap();
+    for (path, mode) in [(dir.path(), 0o755), (program.path(), 0o755), (data.as_path(), 0o700)] {
+        std::fs::set_permissions(path, std::fs::Permissions::from_mode(mode)).unwrap();
+    }
+    let as_other = |words: &[&str]| {
+        let mut command = Command::new(&copy);
+        command.args(words).arg("--data-dir").arg(&data).current_dir("/").uid(4_000_000).gid(4_000_000);
+        command
+    };
+    if as_other(&["--version"]).output().is_err() {
+        println!("skipped: needs root");
+        return;
+    }
+    let expected = format!("permission denied: {} (this process runs as user 4000000)", data.join("qedgix.sqlite").display());
+    let commands: [&[&str]; 3] =
+        [&["keys", "list"], &["keys", "create", "--name", "k", "--scopes", "read"], &["backup", "/tmp/b"]];
+    for words in commands {
+        for mode in [0o700, 0o755] {
+            std::fs::set_permissions(&data, std::fs::Permissions::from_mode(mode)).unwrap();
+            let text = refused(&mut as_other(words));
+            assert!(text.contains(&expected), "{words:?}, {mode:o}: {text}");
+        }
+    }
+}
+
+#[tokio::test]
+async fn the_limit_of_open_files_is_no_error_of_the_disk() {
+    let dir = tempfile::tempdir().unwrap();
+    qedgix::store::Store::open(dir.path()).await.unwrap().close().await;
+    let mut named = 0;
+    // The runtime needs some files, and SQLite a few more.
+    for files in 3..40 {
+        let mut command = Command::new("sh");
+        command.args(["-c", &format!("ulimit -n {files}; exec \"$0\" keys list --data-dir \"$1\""), PROGRAM]).arg(dir.path());
+        let text = String::from_utf8_lossy(&command.output().unwrap().stderr).into_owned();
+        assert!(!text.contains("error of the disk") && !text.contains("the disk of the database"), "{files}: {text}");
+        assert!(!text.contains("code: 14"), "{files}: {text}");
+        named += usize::from(text.contains("too many files and connections are open"));
+    }
+    assert!(named > 0);
 }

@@ -74,7 +74,7 @@ async fn a_running_server_notices_new_and_revoked_keys() {
     let server = Server::start().await;
     assert_eq!(ask(&server, "").await.0, 200, "no key is required while none exists");
     // A second connection to the database, as another process has it.
-    let store = keys::open_store(server.dir.path(), false).await.unwrap();
+    let store = keys::open_store(server.dir.path(), keys::Purpose::Change).await.unwrap();
     let new =
         keys::NewKey { name: "k".into(), scopes: "read".parse().unwrap(), owner: None, lifetime: None, rate: None, burst: None };
     let created = keys::create(&store, new, server.app.clock.now()).await.unwrap();
