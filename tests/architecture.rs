@@ -66,7 +66,6 @@ const LAYERS: &[(&str, &[&str])] = &[
             "env",
             "invalid",
             "error_code",
-            "rng",
         ],
     ),
     (

@@ -143,7 +143,7 @@ async fn an_alias_moves_only_to_a_policy_that_is_better_than_the_rival_of_that_m
     for (publish, field) in [
         (json!({"policy": "uav", "if": {"better_than": "uav@live"}}), "publish.alias"),
         (json!({"policy": "uav", "alias": "li ve"}), "publish.alias"),
-        (json!({"policy": "tour", "alias": "live"}), "name"),
+        (json!({"policy": "tour", "alias": "live"}), "publish.policy"),
         (json!({"policy": "uav", "alias": "live", "if": {"better_than": "uva@live"}}), "publish.if.better_than"),
     ] {
         let request = server.request(Method::POST, "/v1/jobs").json(&with(&json!({"publish": publish})));
