@@ -45,6 +45,7 @@ pub enum Error {
 pub fn not_found_message(what: &str, id: &str, near: Option<&str>) -> String {
     match (what, id.split_once([':', '@'])) {
         ("policy version", Some((name, version))) => format!("policy {name} has no version {version}"),
+        ("model version", Some((name, version))) => format!("model {name} has no version {version}"),
         ("policy alias", Some((name, alias))) => format!("policy {name} has no alias {alias}"),
         _ => format!("no {what} {id:?}{}", near.map_or_else(String::new, |near| format!("; did you mean {near}?"))),
     }

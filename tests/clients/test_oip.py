@@ -263,7 +263,7 @@ def test_what_is_wrong_is_named(way):
         ("qedgix", {**good, "uav_positions": good["uav_positions"].astype(np.int32)}, {}, "uav_positions.datatype: "),
         ("qedgix", good, {"outputs": ["headings"]}, r"outputs\[0\].name: "),
         ("qedgix", good, {"parameters": {"stop": 1}}, "parameters: "),
-        ("qedgix", good, {"model_version": "9"}, 'no model "qedgix:9"'),
+        ("qedgix", good, {"model_version": "9"}, "model qedgix has no version 9"),
     ]
     for model, tensors, more, message in cases:
         with pytest.raises(InferenceServerException, match=message):
@@ -345,8 +345,8 @@ def test_statistics_count_what_was_computed(client):
     everything = statistics(client)
     assert everything["max-aoi", 1]["inference_count"] >= after["inference_count"]
     assert ("qedgix", 1) in everything
-    for unknown in (("nobody",), ("max-aoi", "9")):
-        with pytest.raises(InferenceServerException, match="no model"):
+    for unknown, message in (("nobody",), 'no model "nobody"'), (("max-aoi", "9"), "model max-aoi has no version 9"):
+        with pytest.raises(InferenceServerException, match=message):
             client.get_inference_statistics(*unknown)
     way.close()
 

@@ -49,6 +49,7 @@ pub(super) fn policy_spec(name: &str, version: &str) -> Result<PolicySpec, Inval
 pub(super) fn model_error(error: Error) -> Error {
     match error {
         Error::NotFound { what: "policy", id, near } => Error::NotFound { what: "model", id, near },
+        Error::NotFound { what: "policy version", id, near } => Error::NotFound { what: "model version", id, near },
         Error::Invalid(e) if e.field == "policy" => Invalid { field: "model_name".into(), ..e }.into(),
         other => other,
     }
@@ -177,6 +178,7 @@ fn check_repository(name: &str) -> Result<(), Invalid> {
 fn repository_error(error: Error) -> Error {
     match error {
         Error::NotFound { what: "policy", id, near } => Error::NotFound { what: "model", id, near },
+        Error::NotFound { what: "policy version", id, near } => Error::NotFound { what: "model version", id, near },
         other => other,
     }
 }
