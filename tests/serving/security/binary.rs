@@ -13,7 +13,7 @@ use qedgix::wire::v1::policy_service_client::PolicyServiceClient;
 use serde_json::Value;
 
 use super::super::harness::*;
-use super::{signed, tls};
+use super::{misspelled, signed, tls};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_qedgix");
 
@@ -158,7 +158,7 @@ async fn secrets_appear_in_no_log_response_or_error() {
     let dir = tempfile::tempdir().unwrap();
     let create = |scopes| printed(&["keys", "create", "--name", "k", "--scopes", scopes, "--data-dir", text(dir.path())], None);
     let (admin, limited) = (create("admin"), create("jobs"));
-    let wrong = format!("{}x", &admin[..admin.len() - 1]);
+    let wrong = misspelled(&admin);
     let process = Process::start(dir, &[]);
     let (http, grpc) = (process.address("http").to_owned(), process.address("grpc").to_owned());
     let mut output = String::new();

@@ -8,7 +8,7 @@ use qedgix::wire::v1;
 use tonic::Code;
 
 use super::super::harness::*;
-use super::{key, make, refresh, signed};
+use super::{key, make, misspelled, refresh, signed};
 
 /// Status and error code of `GET /v1/policies`.
 async fn ask(server: &Server, key: &str) -> (u16, String) {
@@ -51,13 +51,12 @@ async fn malformed_keys_are_refused() {
     let server = Server::start().await;
     let (good, other) = (key(&server, "read").await, key(&server, "read").await);
     let (head, secret) = good.rsplit_once('_').unwrap();
-    let last = if good.ends_with('x') { 'y' } else { 'x' };
     for wrong in [
         String::new(),
         secret.to_owned(),
         format!("{head}_"),
         format!("{good}x"),
-        format!("{}{last}", &good[..good.len() - 1]),
+        misspelled(&good),
         good.to_uppercase(),
         // The id of one key with the secret of another.
         format!("{head}_{}", other.rsplit_once('_').unwrap().1),

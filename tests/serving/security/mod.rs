@@ -35,6 +35,12 @@ async fn key(server: &Server, scopes: &str) -> String {
     make(server, scopes, |_| {}).await.key
 }
 
+/// `key` with another last letter: as long, with the same id, and of no key.
+fn misspelled(key: &str) -> String {
+    let last = if key.ends_with('x') { 'y' } else { 'x' };
+    format!("{}{last}", &key[..key.len() - 1])
+}
+
 /// Reloads the keys, which the server does every second.
 async fn refresh(server: &Server) {
     server.app.keys.refresh(&server.app.store).await.unwrap();
