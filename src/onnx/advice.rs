@@ -5,7 +5,7 @@ use super::goals::{distances, headings_toward, owned};
 use super::graph::{Graph, Tensor};
 use super::memory::{Memory, Sight};
 use super::network::Network;
-use super::places;
+use super::sectors;
 use crate::env::Point;
 use crate::policy::EnvParams;
 use crate::policy::memory::GRID;
@@ -28,14 +28,14 @@ pub(super) struct Advice {
 }
 
 impl Network<'_> {
-    /// The advice from what the UAVs remember. `place` (M) are rows of the tables of places, `sectors` (M, 6) the bounds of the UAVs'
+    /// The advice from what the UAVs remember. `sector` (M) are rows of the tables of sectors, `bounds` (M, 6) those of the UAVs'
     /// sectors.
     pub(super) fn advice(
         &mut self,
         memory: &Memory,
         sight: &Sight,
         (positions, slot): (&Tensor, &Tensor),
-        (place, sectors): (&Tensor, &Tensor),
+        (sector, bounds): (&Tensor, &Tensor),
     ) -> Advice {
         let env = self.agent.dims().env;
         let bias = self.constant("agent.advice");
@@ -51,8 +51,8 @@ impl Network<'_> {
 
         let users = g.slice(&memory.users, 2, 1, 3);
         let users = g.cast(&users, DataType::Double);
-        let serving = user_scores(g, &env, (memory, sight), (&users, &known), (positions, slot, sectors));
-        let searching = block_scores(g, &env, (&memory.ground, &unknown), (positions, slot, place));
+        let serving = user_scores(g, &env, (memory, sight), (&users, &known), (positions, slot, bounds));
+        let searching = block_scores(g, &env, (&memory.ground, &unknown), (positions, slot, sector));
         // Of equal scores, the first is the best; a UAV with nothing to do flies to the centre.
         let nothing = g.times(&unknown, 0.0);
         let scores = g.concat(&[&nothing, &serving, &searching], 1);
@@ -115,7 +115,7 @@ fn user_scores(
     env: &EnvParams,
     (memory, sight): (&Memory, &Sight),
     (users, known): (&Tensor, &Tensor),
-    (positions, slot, sectors): (&Tensor, &Tensor, &Tensor),
+    (positions, slot, bounds): (&Tensor, &Tensor, &Tensor),
 ) -> Tensor {
     let collected = g.column(&memory.users, 3);
     let collected = g.cast(&collected, DataType::Double);
@@ -128,7 +128,7 @@ fn user_scores(
     let score = g.with("Div", &age, &time);
     let [mine, nearest] = distances(g, sight, positions, users);
     let nearer = g.with("Less", &nearest, &mine);
-    let foreign = owned(g, users, sectors);
+    let foreign = owned(g, users, bounds);
     let foreign = g.map("Not", &foreign);
     let as_near = g.with("Equal", &nearest, &mine);
     let foreign = g.with("And", &as_near, &foreign);
@@ -146,7 +146,7 @@ fn block_scores(
     g: &mut Graph,
     env: &EnvParams,
     (ground, unknown): (&Tensor, &Tensor),
-    (positions, slot, place): (&Tensor, &Tensor, &Tensor),
+    (positions, slot, sector): (&Tensor, &Tensor, &Tensor),
 ) -> Tensor {
     let side = GRID / BLOCKS;
     let (zero, one) = (g.double(0.0), g.double(1.0));
@@ -161,7 +161,7 @@ fn block_scores(
     let unsearched = g.at_least(&unsearched, 1.0);
     let per_block = g.with("Div", unknown, &unsearched);
 
-    let own = places::owners(g, place, &centres());
+    let own = sectors::owners(g, sector, &centres());
     let foreign = g.double(WEIGHTS.foreign_sector);
     let weights = g.choose(&own, &one, &foreign);
     let weights = g.with("Mul", &shares, &weights);

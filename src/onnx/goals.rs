@@ -27,12 +27,12 @@ pub(super) struct GoalTable {
 }
 
 impl Network<'_> {
-    /// The goals. `sectors` (M, 6) are the bounds of the UAVs' sectors, `last` (M) their last headings, `advised` (M) the advised ones.
+    /// The goals. `bounds` (M, 6) are those of the UAVs' sectors, `last` (M) their last headings, `advised` (M) the advised ones.
     pub(super) fn goals(
         &mut self,
         memory: &Memory,
         sight: &Sight,
-        (positions, slot, sectors): (&Tensor, &Tensor, &Tensor),
+        (positions, slot, bounds): (&Tensor, &Tensor, &Tensor),
         (last, advised): (&Tensor, Option<&Tensor>),
     ) -> GoalTable {
         let env = self.agent.dims().env;
@@ -50,7 +50,7 @@ impl Network<'_> {
         let targets = g.cast(&targets, DataType::Double);
         let own = [
             user_features(g, &env, memory, (&targets, &known), (positions, slot)),
-            ground.features(g, &env, (positions, slot), (&unknown, sectors)),
+            ground.features(g, &env, (positions, slot), (&unknown, bounds)),
         ];
         let targets = g.concat(&[&targets, &ground.centers], 1);
         let valid = g.concat(&[&known, &ground.valid], 1);
@@ -219,7 +219,7 @@ impl Ground {
         g: &mut Graph,
         env: &EnvParams,
         (positions, slot): (&Tensor, &Tensor),
-        (unknown, sectors): (&Tensor, &Tensor),
+        (unknown, bounds): (&Tensor, &Tensor),
     ) -> [Tensor; 7] {
         let range = env.detection_range;
         let offsets = g.difference((&self.centers, &[]), (positions, &[1]));
@@ -238,7 +238,7 @@ impl Ground {
         let age = g.with("Add", slot, &slots);
         let rate = g.with("Mul", &expected, &age);
         let rate = g.with("Div", &rate, &slots);
-        let own = owned(g, &self.centers, sectors);
+        let own = owned(g, &self.centers, bounds);
         let own = g.indicator(&own);
         let zeros = g.times(&slots, 0.0);
         let one = g.double(1.0);
@@ -247,7 +247,7 @@ impl Ground {
 }
 
 /// Whether points (M, B, 2) are in the sectors of the UAVs (M, 6): directions of the middle, of the end and of the start.
-pub(super) fn owned(g: &mut Graph, points: &Tensor, sectors: &Tensor) -> Tensor {
+pub(super) fn owned(g: &mut Graph, points: &Tensor, bounds: &Tensor) -> Tensor {
     let middle = g.double(0.5);
     let points = g.with("Sub", points, &middle);
     let [x, y] = g.xy(&points);
@@ -259,7 +259,7 @@ pub(super) fn owned(g: &mut Graph, points: &Tensor, sectors: &Tensor) -> Tensor 
     // a x b, positive if b is to the left of a.
     let cross = |g: &mut Graph, part: i64| {
         let [dx, dy] = [2 * part, 2 * part + 1].map(|column| {
-            let column = g.column(sectors, column);
+            let column = g.column(bounds, column);
             g.unsqueeze(&column, &[1])
         });
         let (left, right) = (g.with("Mul", &dx, &y), g.with("Mul", &dy, &x));

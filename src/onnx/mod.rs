@@ -1,8 +1,8 @@
 //! Learned policies as ONNX models, which fly without a server (docs/onboard.md): one slot of one fleet, with what UAVs remember as inputs
 //! and outputs.
 //!
-//! `network` has the networks, `memory` what UAVs remember, `goals` their goals, `advice` what they are advised, `places` tables, `graph` and
-//! `expressions` the operators.
+//! `network` has the networks, `memory` what UAVs remember, `goals` their goals, `advice` what they are advised, `sectors` tables of their
+//! sectors, `graph` and `expressions` the operators.
 
 mod advice;
 mod expressions;
@@ -10,7 +10,7 @@ mod goals;
 mod graph;
 mod memory;
 mod network;
-mod places;
+mod sectors;
 
 use prost::Message;
 
@@ -66,8 +66,8 @@ struct Optional {
     position: Option<Tensor>,
     /// Numbers of the UAVs.
     number: Option<Tensor>,
-    /// Rows of the tables of places.
-    place: Option<Tensor>,
+    /// Rows of the tables of sectors.
+    sector: Option<Tensor>,
     token: Option<Tensor>,
     memory: Option<(Tensor, Memory)>,
 }
@@ -152,7 +152,7 @@ fn optional_inputs(n: &mut Network<'_>, config: &AgentConfig) -> Optional {
         let text = "number of each UAV and size of its fleet, as in slot 0";
         let places = n.g.input("place", DataType::Int64, &[UAVS, two], text);
         optional.number = Some(n.g.column(&places, 0));
-        optional.place = Some(places::index(&mut n.g, &places));
+        optional.sector = Some(sectors::row(&mut n.g, &places));
     }
     if config.identity == Identity::Token {
         let text = "four numbers from -1 to 1 per UAV, drawn once";
@@ -174,14 +174,14 @@ fn knowledge(
     (edges, aoi, last): (&Edges, &Tensor, &Tensor),
     optional: &Optional,
 ) -> Option<Knowledge> {
-    let ((slot, before), position, place) = (optional.memory.as_ref()?, optional.position.as_ref()?, optional.place.as_ref()?);
+    let ((slot, before), position, sector) = (optional.memory.as_ref()?, optional.position.as_ref()?, optional.sector.as_ref()?);
     let slot = n.g.cast(slot, DataType::Double);
     let sight = n.sight(edges, position);
     let memory = n.remember(before, &sight, (position, aoi, &slot));
-    let sectors = places::sectors(&mut n.g, place);
-    let advice = (!config.advice.is_none()).then(|| n.advice(&memory, &sight, (position, &slot), (place, &sectors)));
+    let bounds = sectors::bounds(&mut n.g, sector);
+    let advice = (!config.advice.is_none()).then(|| n.advice(&memory, &sight, (position, &slot), (sector, &bounds)));
     let advised = advice.as_ref().map(|advice| &advice.headings);
-    let goals = n.goals(&memory, &sight, (position, &slot, &sectors), (last, advised));
+    let goals = n.goals(&memory, &sight, (position, &slot, &bounds), (last, advised));
     Some(Knowledge { memory, advice, goals })
 }
 
@@ -196,8 +196,8 @@ fn uav_inputs(
     let zero = n.g.list(&[0]);
     let mut parts = vec![n.g.slice_at(observations, 0, &zero, &edges.uavs)];
     parts.push(n.g.one_hot(last, actions));
-    match (config.identity, &optional.place, &optional.number) {
-        (Identity::Phase, Some(place), _) => parts.push(places::phases(&mut n.g, place)),
+    match (config.identity, &optional.sector, &optional.number) {
+        (Identity::Phase, Some(sector), _) => parts.push(sectors::phases(&mut n.g, sector)),
         (Identity::Onehot, _, Some(number)) => parts.push(n.g.one_hot(number, n.agent.dims().uavs)),
         _ => parts.extend(optional.token.clone()),
     }

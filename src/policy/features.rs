@@ -88,7 +88,7 @@ pub(super) fn write_action_identity_position<T: Real>(
         Identity::None => {}
         Identity::Onehot => own[uav] = T::ONE,
         Identity::Phase => {
-            let angle = inputs.geometry.place(fleet, uav).angle;
+            let angle = inputs.geometry.sector(fleet, uav).angle;
             own.copy_from_slice(&[T::from_f64(angle.cos()), T::from_f64(angle.sin())]);
         }
         Identity::Token => {

@@ -6,45 +6,45 @@ use std::f64::consts::{PI, TAU};
 use super::EnvParams;
 use crate::env::Point;
 
-/// The place of a UAV among those of its fleet: a direction around the centre of the square. UAV i of M has the angle 2 pi i / M. When
-/// the fleet changes, every UAV keeps its angle.
+/// The sector of a UAV: its direction around the centre of the square, and what lies nearer to it than to that of a neighbour. UAV i of M
+/// has the angle 2 pi i / M. When the fleet changes, every UAV keeps its angle.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Place {
+pub struct Sector {
     /// In radians.
     pub angle: f64,
     /// Half the angles between this UAV and the neighbouring UAVs, clockwise and counter-clockwise.
     half_gaps: [f64; 2],
 }
 
-impl Place {
-    /// The place of UAV `i` of `uavs` that fly together from slot 0.
+impl Sector {
+    /// The sector of UAV `i` of `uavs` that fly together from slot 0.
     pub fn of(i: usize, uavs: usize) -> Self {
         Self { angle: TAU * i as f64 / uavs as f64, half_gaps: [PI / uavs as f64; 2] }
     }
 
-    /// The places of UAVs with these angles, in radians.
+    /// The sectors of UAVs with these angles, in radians.
     pub fn at_angles(angles: &[f64]) -> Vec<Self> {
         let mut order: Vec<usize> = (0..angles.len()).collect();
         order.sort_by(|&a, &b| angles[a].total_cmp(&angles[b]).then(a.cmp(&b)));
-        let mut places: Vec<Self> = angles.iter().map(|&angle| Self { angle, half_gaps: [PI; 2] }).collect();
+        let mut sectors: Vec<Self> = angles.iter().map(|&angle| Self { angle, half_gaps: [PI; 2] }).collect();
         if order.len() > 1 {
             for (k, &i) in order.iter().enumerate() {
                 let next = order[(k + 1) % order.len()];
                 let half = (angles[next] - angles[i]).rem_euclid(TAU) / 2.0;
-                places[i].half_gaps[1] = half;
-                places[next].half_gaps[0] = half;
+                sectors[i].half_gaps[1] = half;
+                sectors[next].half_gaps[0] = half;
             }
         }
-        places
+        sectors
     }
 
-    /// Whether `p` is in the sector of this UAV: in its direction rather than in that of a neighbour. UAVs that start together search
-    /// different sectors.
+    /// Whether `p` is in this sector: in its direction rather than in that of a neighbour. UAVs that start together search
+    /// different ground.
     pub fn owns(&self, p: Point) -> bool {
         self.owns_direction(direction(p))
     }
 
-    /// As [`Place::owns`] for a point in this [`direction`].
+    /// As [`Sector::owns`] for a point in this [`direction`].
     pub(super) fn owns_direction(&self, direction: f64) -> bool {
         let off = turn(direction - self.angle);
         off <= self.half_gaps[1] || TAU - off <= self.half_gaps[0]
@@ -88,8 +88,8 @@ pub enum UserCount {
 /// How a fleet differs from one of equal UAVs that has not changed since slot 0.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct FleetProfile {
-    /// The place of each UAV. Empty: the UAVs are those of slot 0.
-    pub places: Vec<Place>,
+    /// The sector of each UAV. Empty: the UAVs are those of slot 0.
+    pub sectors: Vec<Sector>,
     /// How many users there are.
     pub users: UserCount,
     /// Speed of each UAV, per slot. Empty: all have that of the environment.
@@ -97,9 +97,9 @@ pub struct FleetProfile {
 }
 
 impl FleetProfile {
-    /// The place of UAV `i` of `uavs`.
-    pub fn place(profile: Option<&Self>, i: usize, uavs: usize) -> Place {
-        profile.and_then(|profile| profile.places.get(i).copied()).unwrap_or_else(|| Place::of(i, uavs))
+    /// The sector of UAV `i` of `uavs`.
+    pub fn sector(profile: Option<&Self>, i: usize, uavs: usize) -> Sector {
+        profile.and_then(|profile| profile.sectors.get(i).copied()).unwrap_or_else(|| Sector::of(i, uavs))
     }
 
     /// The environment of UAV `i`.
@@ -140,17 +140,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn regular_places_are_the_same_in_both_forms() {
+    fn regular_sectors_are_the_same_in_both_forms() {
         for uavs in 1..9 {
-            let angles: Vec<f64> = (0..uavs).map(|i| Place::of(i, uavs).angle).collect();
-            for (i, place) in Place::at_angles(&angles).into_iter().enumerate() {
-                let regular = Place::of(i, uavs);
-                assert_eq!(place.angle.to_bits(), regular.angle.to_bits());
-                assert!(place.half_gaps.iter().all(|half| (half - PI / uavs as f64).abs() < 1e-12));
+            let angles: Vec<f64> = (0..uavs).map(|i| Sector::of(i, uavs).angle).collect();
+            for (i, sector) in Sector::at_angles(&angles).into_iter().enumerate() {
+                let regular = Sector::of(i, uavs);
+                assert_eq!(sector.angle.to_bits(), regular.angle.to_bits());
+                assert!(sector.half_gaps.iter().all(|half| (half - PI / uavs as f64).abs() < 1e-12));
                 for k in 0..97 {
                     let angle = TAU * (f64::from(k) + 0.37) / 97.0;
                     let p = [0.5 + 0.3 * angle.cos(), 0.5 + 0.3 * angle.sin()];
-                    assert_eq!(place.owns(p), regular.owns(p), "{i} of {uavs}, {angle}");
+                    assert_eq!(sector.owns(p), regular.owns(p), "{i} of {uavs}, {angle}");
                 }
             }
         }
@@ -168,12 +168,12 @@ mod tests {
     }
 
     #[test]
-    fn the_sectors_of_irregular_places_cover_everything_once() {
-        let places = Place::at_angles(&[0.1, 5.0, 0.3, 3.0]);
+    fn irregular_sectors_cover_everything_once() {
+        let sectors = Sector::at_angles(&[0.1, 5.0, 0.3, 3.0]);
         for k in 0..360 {
             let angle = f64::from(k).to_radians() + 1e-3;
             let p = [0.5 + 0.3 * angle.cos(), 0.5 + 0.3 * angle.sin()];
-            assert_eq!(places.iter().filter(|place| place.owns(p)).count(), 1, "{k}");
+            assert_eq!(sectors.iter().filter(|sector| sector.owns(p)).count(), 1, "{k}");
         }
     }
 }

@@ -7,7 +7,7 @@
 use super::fleet_graph::FleetGraph;
 use super::hop_search::HopSearch;
 use super::neighbor_search::{Detection, NeighborSearch};
-use super::{Place, Sight};
+use super::{Sector, Sight};
 use crate::env::{Point, Ranges, points};
 use crate::nn::Graph;
 
@@ -29,8 +29,8 @@ pub struct FleetSpan {
     first_node: usize,
     /// Index of the first user among all users.
     first_user: usize,
-    /// Index of the place of the first UAV, if places are not those of slot 0.
-    first_place: Option<usize>,
+    /// Index of the sector of the first UAV, if sectors are not those of slot 0.
+    first_sector: Option<usize>,
 }
 
 /// The node that a row stands for.
@@ -63,8 +63,8 @@ pub struct Geometry {
     detections: Vec<Detection>,
     /// AoI / K of all users.
     aoi_scaled: Vec<f32>,
-    /// Places of the UAVs of fleets that have changed.
-    places: Vec<Place>,
+    /// Sectors of the UAVs of fleets that have changed.
+    sectors: Vec<Sector>,
     rows: Vec<Row>,
     row_of: Vec<u32>,
     graph: Graph,
@@ -103,7 +103,7 @@ impl Geometry {
         self.offsets.push(0);
         self.detections.clear();
         self.aoi_scaled.clear();
-        self.places.clear();
+        self.sectors.clear();
         self.row_of.clear();
     }
 
@@ -111,7 +111,7 @@ impl Geometry {
         let first_uav = self.fleets.last().map_or(0, |f| f.first_uav + f.uavs);
         let (first_node, first_user) = (self.row_of.len(), self.aoi_scaled.len());
         let scale = 1.0 / config.ranges.detection;
-        self.fleets.push(FleetSpan { uavs, users, scale, first_uav, first_node, first_user, first_place: None });
+        self.fleets.push(FleetSpan { uavs, users, scale, first_uav, first_node, first_user, first_sector: None });
         self.row_of.resize(self.row_of.len() + uavs + users, NO_ROW);
     }
 
@@ -147,17 +147,17 @@ impl Geometry {
         self.aoi_scaled.extend(graph.aoi().iter().map(|a| a / config.episode_slots as f32));
     }
 
-    /// Sets the places of the UAVs of the last fleet, one per UAV; none: those of UAVs that fly together from slot 0.
-    pub fn set_places(&mut self, places: &[Place]) {
-        if let Some(fleet) = self.fleets.last_mut().filter(|fleet| fleet.uavs == places.len()) {
-            fleet.first_place = Some(self.places.len());
-            self.places.extend_from_slice(places);
+    /// Sets the sectors of the UAVs of the last fleet, one per UAV; none: those of UAVs that fly together from slot 0.
+    pub fn set_sectors(&mut self, sectors: &[Sector]) {
+        if let Some(fleet) = self.fleets.last_mut().filter(|fleet| fleet.uavs == sectors.len()) {
+            fleet.first_sector = Some(self.sectors.len());
+            self.sectors.extend_from_slice(sectors);
         }
     }
 
-    /// The place of UAV `uav` of `fleet`.
-    pub fn place(&self, fleet: &FleetSpan, uav: usize) -> Place {
-        fleet.first_place.map_or_else(|| Place::of(uav, fleet.uavs), |first| self.places[first + uav])
+    /// The sector of UAV `uav` of `fleet`.
+    pub fn sector(&self, fleet: &FleetSpan, uav: usize) -> Sector {
+        fleet.first_sector.map_or_else(|| Sector::of(uav, fleet.uavs), |first| self.sectors[first + uav])
     }
 
     /// Orders the rows and builds the graph; call it after the last fleet.

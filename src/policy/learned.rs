@@ -252,7 +252,7 @@ impl LearnedPolicy {
         for fleet in fleets.iter_mut() {
             b.geometry.push_graph(&self.agent.geometry_config(&fleet.env), fleet.graph);
             if let Some(profile) = fleet.profile {
-                b.geometry.set_places(&profile.places);
+                b.geometry.set_sectors(&profile.sectors);
             }
             let (memory, remembered) = fleet.memory.split_at_mut(fleet.graph.uavs() * stride);
             for uav in memory.chunks_exact(stride) {

@@ -28,7 +28,7 @@ pub use env_params::EnvParams;
 pub use explain::{DecidedSlot, Influence};
 pub use features::{Inputs, NO_ACTION, SetEncoder, flat_observation, flat_state};
 pub use fleet_graph::FleetGraph;
-pub use fleet_profile::{Carry, FleetProfile, Place, UserCount};
+pub use fleet_profile::{Carry, FleetProfile, Sector, UserCount};
 pub use geometry::{FleetSpan, Geometry, GeometryConfig, NodeView};
 pub use goals::Goals;
 pub use hop_search::HopSearch;

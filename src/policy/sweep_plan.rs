@@ -9,7 +9,7 @@ use std::sync::LazyLock;
 use super::fleet_profile::direction;
 use super::flight::{Headings, distance, travel_slots};
 use super::memory::{GRID, RememberedUser, UavMemory};
-use super::{EnvParams, FleetProfile, Place, Sight, UserCount};
+use super::{EnvParams, FleetProfile, Sector, Sight, UserCount};
 use crate::env::Point;
 use crate::nn::simd;
 use crate::threads;
@@ -46,9 +46,9 @@ pub(super) fn sweep_headings<'a>(
     threads::for_each(headings.chunks_mut(part).enumerate(), |(k, headings)| {
         let first = k * part;
         for ((i, heading), memory) in (first..).zip(headings).zip(memories.clone().skip(first)) {
-            let place = FleetProfile::place(profile, i, sight.uavs());
+            let sector = FleetProfile::sector(profile, i, sight.uavs());
             let own = FleetProfile::env(profile, env, i);
-            let uav = Uav { env: &own, place, at: sight.positions[i], now: slot as f64 };
+            let uav = Uav { env: &own, sector, at: sight.positions[i], now: slot as f64 };
             let serving = uav.best_user(memory.users().flatten(), sight.detected_uavs(i).map(|(_, at)| at));
             let searching = uav.best_block(memory, FleetProfile::users(profile));
             let best = if serving.score >= searching.score { serving } else { searching };
@@ -71,7 +71,7 @@ const NOTHING: Candidate = Candidate { score: 0.0, position: [0.5, 0.5] };
 /// One UAV in one slot.
 struct Uav<'a> {
     env: &'a EnvParams,
-    place: Place,
+    sector: Sector,
     at: Point,
     now: f64,
 }
@@ -85,7 +85,7 @@ impl Uav<'_> {
             let slots = travel_slots(self.env, self.at, to, self.env.transmission_range);
             let age = self.now - f64::from(user.collected) + slots;
             let (own, nearest) = (distance(self.at, to), uavs.clone().map(|r| distance(r, to)).fold(f64::INFINITY, f64::min));
-            let contested = nearest < own || nearest == own && !self.place.owns(to);
+            let contested = nearest < own || nearest == own && !self.sector.owns(to);
             let score = age / time_weight(slots) * if contested { WEIGHTS.contested } else { 1.0 };
             if score > best.score {
                 best = Candidate { score, position: to };
@@ -97,7 +97,7 @@ impl Uav<'_> {
     /// The block with the best score among those that are not searched.
     fn best_block(&self, memory: UavMemory<'_>, count: UserCount) -> Candidate {
         let (unknown, now) = (memory.unknown_users(count), self.now - memory.unknown_since(count));
-        let ground = Ground::new(memory, &self.place);
+        let ground = Ground::new(memory, &self.sector);
         let range = self.env.detection_range;
         let users_per_block = unknown as f64 / ground.unsearched.max(1.0);
         let mut best = NOTHING;
@@ -173,7 +173,7 @@ struct Ground {
 }
 
 impl Ground {
-    fn new(memory: UavMemory<'_>, place: &Place) -> Self {
+    fn new(memory: UavMemory<'_>, sector: &Sector) -> Self {
         let mut ground = Self { cells: [[0; _]; _], weights: [[0.0; _]; _], unsearched: 0.0 };
         let directions = &*DIRECTIONS;
         for row in 0..BLOCKS {
@@ -183,7 +183,7 @@ impl Ground {
                 let left = left.iter().sum::<u8>();
                 if left > 0 {
                     let share = f64::from(left) / (SIDE * SIDE) as f64;
-                    let own = place.owns_direction(directions[row][column]);
+                    let own = sector.owns_direction(directions[row][column]);
                     ground.cells[row][column] = left;
                     ground.weights[row][column] = share * if own { 1.0 } else { WEIGHTS.foreign_sector };
                     ground.unsearched += share;

@@ -1,4 +1,4 @@
-//! Connections of a listener: accepting, their places, TLS handshakes, HTTP, graceful shutdown.
+//! Connections of a listener: accepting, their permits, TLS handshakes, HTTP, graceful shutdown.
 //!
 //! A slow caller never delays another one: each connection has its own task, which includes the TLS handshake, and each stage
 //! has a time limit.
@@ -26,7 +26,7 @@ use tower::{Service, ServiceExt};
 
 use super::http2;
 use super::lifetime::{LifeLimits, Lifetime, Verdict};
-use super::places::{Place, Places};
+use super::permits::{Permit, Permits};
 use super::tls::{H2, Tls};
 use super::write_timeout::WriteTimeout;
 use crate::api::body::{Exchange, IncomingBody, TimeLimits};
@@ -61,7 +61,7 @@ enum Version {
 /// Settings and limits that connections share; cheap to clone.
 #[derive(Clone)]
 pub(super) struct Connections {
-    pub(super) places: Arc<Places>,
+    pub(super) permits: Arc<Permits>,
     pub(super) tls: Option<Arc<Tls>>,
     /// Time limits of requests and responses. The one for reading also applies to a TLS handshake, the HTTP/2 preface and the
     /// head of an HTTP/1 request.
@@ -96,9 +96,9 @@ impl Connections {
                 accepted = listener.accept() => accepted,
             };
             match accepted {
-                Ok((stream, peer)) => match self.places.take(peer.ip()) {
-                    Some(place) => {
-                        tasks.spawn(self.clone().connection(stream, protocol, service.clone(), place));
+                Ok((stream, peer)) => match self.permits.take(peer.ip()) {
+                    Some(permit) => {
+                        tasks.spawn(self.clone().connection(stream, protocol, service.clone(), permit));
                     }
                     // Closing at once lets the caller retry or use another server; waiting would look like a hang.
                     None => refused.increment(1),
@@ -115,14 +115,14 @@ impl Connections {
         while tasks.join_next().await.is_some() {}
     }
 
-    async fn connection<S, B>(mut self, stream: TcpStream, protocol: Protocol, service: S, place: Place)
+    async fn connection<S, B>(mut self, stream: TcpStream, protocol: Protocol, service: S, permit: Permit)
     where
         S: Service<Request<IncomingBody>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
         S::Future: Send,
         B: Body<Data = Bytes> + Send + 'static,
         B::Error: Into<Box<dyn Error + Send + Sync>>,
     {
-        if place.reserved {
+        if permit.reserved {
             self.shorten();
         }
         // Failure costs latency only.
@@ -130,7 +130,7 @@ impl Connections {
         let stream = WriteTimeout::new(stream, self.limits.write);
         let Some(tls) = &self.tls else {
             let version = if protocol == Protocol::Grpc { Version::Http2 { date: false } } else { Version::Http1 };
-            return self.serve_http(stream, version, service, &place).await;
+            return self.serve_http(stream, version, service, &permit).await;
         };
         let configs = tls.current();
         let config = if protocol == Protocol::Grpc { configs.grpc } else { configs.http };
@@ -145,7 +145,7 @@ impl Connections {
                 // Without ALPN, the connection uses the default protocol of the port.
                 let http2 = agreed.map_or(protocol == Protocol::Grpc, |agreed| agreed == H2);
                 let version = if http2 { Version::Http2 { date: protocol == Protocol::Http } } else { Version::Http1 };
-                self.serve_http(stream, version, service, &place).await;
+                self.serve_http(stream, version, service, &permit).await;
             }
             Ok(Err(error)) => tracing::debug!(%error, "TLS handshake failed"),
             Err(_) => tracing::debug!(timeout = ?self.limits.read, "TLS handshake timed out"),
@@ -160,7 +160,7 @@ impl Connections {
         self.limits.write = self.limits.write.min(RESERVED_LIFE);
     }
 
-    async fn serve_http<IO, S, B>(&self, io: IO, version: Version, service: S, place: &Place)
+    async fn serve_http<IO, S, B>(&self, io: IO, version: Version, service: S, permit: &Permit)
     where
         IO: AsyncRead + AsyncWrite + Send + Unpin + 'static,
         S: Service<Request<IncomingBody>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
@@ -172,19 +172,19 @@ impl Connections {
         // Without a random source, all connections have the same age.
         let _ = getrandom::fill(&mut jitter);
         let jitter = f64::from(jitter[0]) / 255.0;
-        let lifetime = Lifetime::new(self.life, self.clock.clone(), self.stop.clone(), place.reserved, jitter);
+        let lifetime = Lifetime::new(self.life, self.clock.clone(), self.stop.clone(), permit.reserved, jitter);
         if let Version::Http2 { date } = version {
-            let (max_streams, limits, purse) = (self.max_streams, self.limits, place.purse.clone());
+            let (max_streams, limits, purse) = (self.max_streams, self.limits, permit.purse.clone());
             let settings = http2::Settings { max_streams, limits, purse, date, background: self.background.clone() };
             if let Err(error) = http2::serve(io, service, &settings, lifetime).await {
                 tracing::debug!(%error, "connection failed");
             }
         } else {
-            self.serve_http1(io, service, lifetime, place).await;
+            self.serve_http1(io, service, lifetime, permit).await;
         }
     }
 
-    async fn serve_http1<IO, S, B>(&self, io: IO, service: S, mut lifetime: Lifetime, place: &Place)
+    async fn serve_http1<IO, S, B>(&self, io: IO, service: S, mut lifetime: Lifetime, permit: &Permit)
     where
         IO: AsyncRead + AsyncWrite + Send + Unpin + 'static,
         S: Service<Request<IncomingBody>, Response = Response<B>, Error = Infallible> + Clone + Send + 'static,
@@ -192,7 +192,7 @@ impl Connections {
         B: Body<Data = Bytes> + Send + 'static,
         B::Error: Into<Box<dyn Error + Send + Sync>>,
     {
-        let (reserved, read, purse) = (place.reserved, self.limits.read, place.purse.clone());
+        let (reserved, read, purse) = (permit.reserved, self.limits.read, permit.purse.clone());
         let service = service_fn(move |request: Request<Incoming>| {
             let exchange = Exchange::http1(purse.clone(), reserved);
             service.clone().oneshot(request.map(|body| IncomingBody::http1(body, exchange, read)))

@@ -10,7 +10,7 @@ mod housekeeping;
 mod http2;
 mod keys;
 mod lifetime;
-mod places;
+mod permits;
 mod tls;
 mod write_timeout;
 
@@ -32,7 +32,7 @@ use self::connections::{Connections, Protocol};
 use self::follow::Follower;
 pub use self::http2::{CONNECTION_WINDOW, KEEPALIVE_INTERVAL, STREAM_WINDOW};
 use self::lifetime::LifeLimits;
-use self::places::Places;
+use self::permits::Permits;
 pub use self::tls::Tls;
 use crate::api::body::{IncomingBody, TimeLimits};
 use crate::api::{AllowedHosts, grpc, rest};
@@ -363,7 +363,7 @@ async fn serve(
     let connections = connections(config, &listeners, &app, (&stop, &background));
     // Workers share nothing with other callers: no caller can keep them out.
     let worker_connections = Connections {
-        places: Places::new(MAX_WORKER_CONNECTIONS, MAX_WORKER_CONNECTIONS, Budget::new(WORKER_INFLIGHT_BYTES)),
+        permits: Permits::new(MAX_WORKER_CONNECTIONS, MAX_WORKER_CONNECTIONS, Budget::new(WORKER_INFLIGHT_BYTES)),
         tls: None,
         life: LifeLimits { idle: Duration::MAX / 4, age: Duration::MAX / 4, ..connections.life },
         ..connections.clone()
@@ -381,7 +381,7 @@ async fn serve(
         Protocol::Grpc,
         grpc::worker_services(&app, config.max_message_size, background.handle(), stop.clone()),
     );
-    let budget = connections.places.budget().clone();
+    let budget = connections.permits.budget().clone();
     let serve_grpc = connections.clone().serve(listeners.grpc, Protocol::Grpc, services);
     let serve_rest = connections.serve(listeners.http, Protocol::Http, router);
 
@@ -441,7 +441,7 @@ fn connections(
         tick: (shortest / 4).clamp(Duration::from_millis(20), Duration::from_secs(5)),
     };
     Connections {
-        places: Places::new(config.max_connections, config.max_connections_per_peer, Budget::new(config.max_inflight_bytes)),
+        permits: Permits::new(config.max_connections, config.max_connections_per_peer, Budget::new(config.max_inflight_bytes)),
         tls: listeners.tls.clone(),
         limits,
         life,

@@ -1,7 +1,7 @@
 //! Who belongs to a fleet while its UAVs and users come and go. The memory of a fleet has a place for every member of its roster: those
 //! of the last slot, in the canonical order of their ids, then those that are missing.
 //!
-//! A member that is missing keeps its memory, and a UAV its angle (`policy::Place`), for a number of slots; then it is forgotten, and
+//! A member that is missing keeps its memory, and a UAV its angle (`policy::Sector`), for a number of slots; then it is forgotten, and
 //! begins afresh if it comes back. A new UAV takes the middle of the largest gap between the angles of the others, which keep theirs.
 //!
 //! A roster holds hashes of ids, so that the state that a caller keeps stays small. A fleet that never changes needs no roster: a session
@@ -16,7 +16,7 @@ use sha2::{Digest, Sha256};
 
 use super::{FleetIds, ListedUsers, LoadedPolicy, MAX_NODES};
 use crate::invalid::Invalid;
-use crate::policy::{Carry, FleetProfile, Place, Policy, UserCount};
+use crate::policy::{Carry, FleetProfile, Policy, Sector, UserCount};
 use crate::rng;
 
 /// Identifies an id.
@@ -56,7 +56,7 @@ impl Turn {
         u64::from(self.numerator) * TURN / u64::from(self.denominator)
     }
 
-    /// In radians. Equal to the angle of [`Place::of`] for UAV i of M.
+    /// In radians. Equal to the angle of [`Sector::of`] for UAV i of M.
     fn angle(self) -> f64 {
         TAU * f64::from(self.numerator) / f64::from(self.denominator)
     }
@@ -193,11 +193,11 @@ impl Roster {
             ListedUsers::Named | ListedUsers::Detected => UserCount::Unknown,
         };
         // Those that are listed share the square among them.
-        let places = if turns.is_empty() && uavs.members.len() == fleet.uavs.len() {
+        let sectors = if turns.is_empty() && uavs.members.len() == fleet.uavs.len() {
             Vec::new()
         } else {
             let turn = |i: usize| turns.get(i).copied().unwrap_or(Turn::of(i, uavs.members.len()));
-            Place::at_angles(&(0..fleet.uavs.len()).map(|i| turn(i).angle()).collect::<Vec<_>>())
+            Sector::at_angles(&(0..fleet.uavs.len()).map(|i| turn(i).angle()).collect::<Vec<_>>())
         };
         let change = FleetChange {
             before: self.size(),
@@ -206,7 +206,7 @@ impl Roster {
             uavs: uavs.kept,
             users: users.kept,
             seed: rng::stream(rules.seed, "joined", step).random(),
-            profile: FleetProfile { places, users: count, speeds: Vec::new() },
+            profile: FleetProfile { sectors, users: count, speeds: Vec::new() },
         };
         (Self { uavs: uavs.members, turns, users: users.members, open }, change)
     }

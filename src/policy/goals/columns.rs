@@ -73,7 +73,7 @@ impl Columns {
         }
         for block in ground.blocks() {
             (x[self.len], y[self.len]) = (ground.centers[0][block], ground.centers[1][block]);
-            last[self.len] = if ground.is_owned(block, &view.place) { 1.0 } else { 0.0 };
+            last[self.len] = if ground.is_owned(block, &view.sector) { 1.0 } else { 0.0 };
             self.len += 1;
         }
     }

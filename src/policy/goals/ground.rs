@@ -2,7 +2,7 @@
 
 use std::sync::LazyLock;
 
-use super::super::fleet_profile::{Place, direction};
+use super::super::fleet_profile::{Sector, direction};
 use super::super::memory::{GRID, UavMemory};
 use super::{BLOCKS, MAX_BLOCKS};
 
@@ -61,8 +61,8 @@ impl Ground {
     }
 
     /// Whether the centre of a block is in the sector of this UAV.
-    pub(super) fn is_owned(&self, block: usize, place: &Place) -> bool {
-        place.owns_direction(self.directions[block])
+    pub(super) fn is_owned(&self, block: usize, sector: &Sector) -> bool {
+        sector.owns_direction(self.directions[block])
     }
 }
 

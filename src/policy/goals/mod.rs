@@ -11,7 +11,7 @@ use columns::Columns;
 use ground::RecentGround;
 
 use super::env_params::EnvParams;
-use super::fleet_profile::{FleetProfile, Place, UserCount};
+use super::fleet_profile::{FleetProfile, Sector, UserCount};
 use super::flight::{Headings, travel_slots};
 use super::memory::{GRID, RememberedUser, UavMemory};
 use super::sight::Sight;
@@ -154,11 +154,11 @@ impl Goals {
     ) {
         for ((i, &last), memory) in (first..).zip(last).zip(memories) {
             let at = sight.positions[i];
-            let place = FleetProfile::place(profile, i, sight.uavs());
+            let sector = FleetProfile::sector(profile, i, sight.uavs());
             let count = FleetProfile::users(profile);
             let own = FleetProfile::env(profile, env, i);
             let headings = Headings::new(&own, at);
-            let view = View { env: &own, place, count, uavs: sight.uavs(), at, headings, slot: slot as f64, last };
+            let view = View { env: &own, sector, count, uavs: sight.uavs(), at, headings, slot: slot as f64, last };
             self.others.clear();
             self.others.extend(sight.detected_uavs(i).map(|(_, at)| at));
             self.push_row(&view, memory);
@@ -209,7 +209,7 @@ fn ln1(x: f64) -> f64 {
 /// One UAV in one slot.
 struct View<'a> {
     env: &'a EnvParams,
-    place: Place,
+    sector: Sector,
     count: UserCount,
     uavs: usize,
     at: Point,

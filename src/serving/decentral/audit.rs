@@ -78,8 +78,8 @@ impl Audit {
 pub fn audit(policy: &dyn Policy, env: &EnvConfig, seeds: &[u64], threads: usize) -> Result<Audit, Invalid> {
     env.validate()?;
     check(policy, (env.uavs, env.users))?;
-    let run = |seed: &u64| Flight::new(policy, env, *seed).and_then(Flight::run);
-    let mut total = Flight::new(policy, env, 0)?.audit;
+    let run = |seed: &u64| Episode::new(policy, env, *seed).and_then(Episode::run);
+    let mut total = Episode::new(policy, env, 0)?.audit;
     let part_len = seeds.len().div_ceil(threads.max(1)).max(1);
     let parts: Vec<Result<Vec<Audit>, Invalid>> = std::thread::scope(|scope| {
         let start = |part: &'_ [u64]| part.iter().map(run).collect::<Result<Vec<_>, _>>();
@@ -93,7 +93,7 @@ pub fn audit(policy: &dyn Policy, env: &EnvConfig, seeds: &[u64], threads: usize
 }
 
 /// One episode.
-struct Flight<'a> {
+struct Episode<'a> {
     policy: &'a dyn Policy,
     params: EnvParams,
     env: BatchEnv,
@@ -106,7 +106,7 @@ struct Flight<'a> {
     alone: Vec<Vec<Vec<f32>>>,
 }
 
-impl<'a> Flight<'a> {
+impl<'a> Episode<'a> {
     fn new(policy: &'a dyn Policy, config: &EnvConfig, seed: u64) -> Result<Self, Invalid> {
         let (params, size) = (EnvParams::from(config), (config.uavs, config.users));
         let mut env = BatchEnv::new(config, 1)?;

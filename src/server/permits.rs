@@ -1,4 +1,4 @@
-//! Places of connections: how many there are in all, from one peer, and in the reserve. A peer also has a share of the budget of
+//! Permits of connections: how many there are in all, from one peer, and in the reserve. A peer also has a share of the budget of
 //! bytes in flight.
 
 use std::collections::HashMap;
@@ -13,9 +13,9 @@ pub(super) const RESERVE: usize = 64;
 /// Connections of the reserve that one peer may have.
 const RESERVE_PER_PEER: usize = 8;
 
-/// The places of all listeners together.
+/// The permits of all listeners together.
 #[derive(Debug)]
-pub(super) struct Places {
+pub(super) struct Permits {
     max: usize,
     max_per_peer: usize,
     budget: Arc<Budget>,
@@ -37,18 +37,18 @@ struct Peer {
     purse: Arc<Purse>,
 }
 
-/// The place of one connection; dropping it gives the place back.
-pub(super) struct Place {
-    places: Arc<Places>,
+/// The permit of one connection; dropping it gives the permit back.
+pub(super) struct Permit {
+    permits: Arc<Permits>,
     peer: IpAddr,
-    /// Whether the place is in the reserve.
+    /// Whether the permit is in the reserve.
     pub(super) reserved: bool,
     /// What the requests of the peer hold.
     pub(super) purse: Arc<Purse>,
     gauge: metrics::Gauge,
 }
 
-impl Places {
+impl Permits {
     pub(super) fn new(max: usize, max_per_peer: usize, budget: Arc<Budget>) -> Arc<Self> {
         Arc::new(Self { max, max_per_peer, budget, taken: Mutex::default() })
     }
@@ -58,8 +58,8 @@ impl Places {
         &self.budget
     }
 
-    /// A place for a connection from `address`, in the reserve if the others are taken; `None` if there is none.
-    pub(super) fn take(self: &Arc<Self>, address: IpAddr) -> Option<Place> {
+    /// A permit for a connection from `address`, in the reserve if the others are taken; `None` if there is none.
+    pub(super) fn take(self: &Arc<Self>, address: IpAddr) -> Option<Permit> {
         let key = peer(address);
         let mut guard = self.taken.lock().unwrap_or_else(PoisonError::into_inner);
         let taken = &mut *guard;
@@ -76,7 +76,7 @@ impl Places {
         drop(guard);
         let gauge = metrics::gauge!("qedgix_connections");
         gauge.increment(1.0);
-        Some(Place { places: self.clone(), peer: key, reserved, purse, gauge })
+        Some(Permit { permits: self.clone(), peer: key, reserved, purse, gauge })
     }
 }
 
@@ -87,9 +87,9 @@ impl Peer {
     }
 }
 
-impl Drop for Place {
+impl Drop for Permit {
     fn drop(&mut self) {
-        let mut guard = self.places.taken.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut guard = self.permits.taken.lock().unwrap_or_else(PoisonError::into_inner);
         let taken = &mut *guard;
         if let Some(peer) = taken.peers.get_mut(&self.peer) {
             let (all, of_peer) = peer.counts(&mut taken.all, &mut taken.reserve, self.reserved);
@@ -117,34 +117,34 @@ fn peer(address: IpAddr) -> IpAddr {
 mod tests {
     use super::*;
 
-    fn fill(places: &Arc<Places>, address: &str) -> Vec<Place> {
-        std::iter::from_fn(|| places.take(address.parse().unwrap())).collect()
+    fn fill(permits: &Arc<Permits>, address: &str) -> Vec<Permit> {
+        std::iter::from_fn(|| permits.take(address.parse().unwrap())).collect()
     }
 
-    fn ordinary(places: &[Place]) -> usize {
-        places.iter().filter(|place| !place.reserved).count()
+    fn ordinary(permits: &[Permit]) -> usize {
+        permits.iter().filter(|permit| !permit.reserved).count()
     }
 
     #[test]
-    fn one_peer_leaves_places_for_others() {
-        let places = Places::new(100, 40, Budget::new(Budget::MIN));
-        let greedy = fill(&places, "10.0.0.1");
+    fn one_peer_leaves_permits_for_others() {
+        let permits = Permits::new(100, 40, Budget::new(Budget::MIN));
+        let greedy = fill(&permits, "10.0.0.1");
         assert_eq!((greedy.len(), ordinary(&greedy)), (40 + RESERVE_PER_PEER, 40));
-        let second = fill(&places, "10.0.0.2");
+        let second = fill(&permits, "10.0.0.2");
         assert_eq!(ordinary(&second), 40);
         drop(greedy);
-        assert_eq!(ordinary(&fill(&places, "10.0.0.3")), 40);
+        assert_eq!(ordinary(&fill(&permits, "10.0.0.3")), 40);
         drop(second);
-        let taken = places.taken.lock().unwrap();
+        let taken = permits.taken.lock().unwrap();
         assert_eq!((taken.all, taken.reserve, taken.peers.len()), (0, 0, 0));
     }
 
     #[test]
-    fn probes_get_in_when_all_places_are_taken() {
-        let places = Places::new(2, 2, Budget::new(Budget::MIN));
-        let greedy = fill(&places, "10.0.0.1");
+    fn probes_get_in_when_all_permits_are_taken() {
+        let permits = Permits::new(2, 2, Budget::new(Budget::MIN));
+        let greedy = fill(&permits, "10.0.0.1");
         assert_eq!(ordinary(&greedy), 2);
-        let probe = places.take("10.0.0.2".parse().unwrap()).unwrap();
+        let probe = permits.take("10.0.0.2".parse().unwrap()).unwrap();
         assert!(probe.reserved);
     }
 
