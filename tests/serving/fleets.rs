@@ -69,7 +69,7 @@ impl Policy for TallyPolicy {
             for (i, row) in turn.memory.chunks_exact_mut(1 + users).enumerate() {
                 row[0] += 1.0;
                 row[1..].iter_mut().zip(turn.graph.aoi()).for_each(|(sum, aoi)| *sum += aoi);
-                let angle = FleetProfile::place(turn.profile, i, uavs).angle as f32;
+                let angle = FleetProfile::sector(turn.profile, i, uavs).angle as f32;
                 if let Some(q) = &mut turn.q_values {
                     q[i * ACTIONS..][..ACTIONS].copy_from_slice(&[row[0], row[1..].iter().sum(), uavs as f32, angle]);
                 }
