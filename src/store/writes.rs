@@ -51,7 +51,7 @@ impl WriteFailure {
             sqlx::Error::Database(error) => {
                 let code = error.code()?.parse().ok()?;
                 // CANTOPEN has many causes. SQLite keeps that of the operating system for itself.
-                if code & 0xff == 14 && no_file_can_be_opened() { Some(Self::TooManyFiles) } else { Self::of_code(code) }
+                if code & 0xff == 14 && few_files_can_be_opened() { Some(Self::TooManyFiles) } else { Self::of_code(code) }
             }
             sqlx::Error::Io(error) if is_limit_of_files(error) => Some(Self::TooManyFiles),
             sqlx::Error::PoolTimedOut | sqlx::Error::WorkerCrashed | sqlx::Error::Io(_) => Some(Self::Failed),
@@ -82,9 +82,10 @@ fn is_limit_of_files(error: &std::io::Error) -> bool {
     error.raw_os_error().is_some_and(|code| limits.contains(&code))
 }
 
-/// Whether there are too few file descriptors left for the files that SQLite opens for one connection.
-fn no_file_can_be_opened() -> bool {
-    let opened: std::io::Result<Vec<_>> = (0..4).map(|_| std::fs::File::open("/")).collect();
+/// Whether few file descriptors are left. SQLite opens up to four for one connection, and those of connections that failed may have been
+/// closed since.
+fn few_files_can_be_opened() -> bool {
+    let opened: std::io::Result<Vec<_>> = (0..16).map(|_| std::fs::File::open("/")).collect();
     opened.is_err_and(|error| is_limit_of_files(&error))
 }
 
