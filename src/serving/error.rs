@@ -43,10 +43,10 @@ pub enum Error {
 
 /// The message about a resource that does not exist.
 pub fn not_found_message(what: &str, id: &str, near: Option<&str>) -> String {
-    match (what, id.split_once([':', '@'])) {
-        ("policy version", Some((name, version))) => format!("policy {name} has no version {version}"),
-        ("model version", Some((name, version))) => format!("model {name} has no version {version}"),
-        ("policy alias", Some((name, alias))) => format!("policy {name} has no alias {alias}"),
+    match (what.split_once(' '), id.split_once([':', '@'])) {
+        (Some((owner @ ("policy" | "model"), part @ ("version" | "alias"))), Some((name, value))) => {
+            format!("{owner} {name} has no {part} {value}")
+        }
         _ => format!("no {what} {id:?}{}", near.map_or_else(String::new, |near| format!("; did you mean {near}?"))),
     }
 }

@@ -48,10 +48,8 @@ pub(super) fn policy_spec(name: &str, version: &str) -> Result<PolicySpec, Inval
 /// The error of a policy as the error of a model.
 pub(super) fn model_error(error: Error) -> Error {
     match error {
-        Error::NotFound { what: "policy", id, near } => Error::NotFound { what: "model", id, near },
-        Error::NotFound { what: "policy version", id, near } => Error::NotFound { what: "model version", id, near },
         Error::Invalid(e) if e.field == "policy" => Invalid { field: "model_name".into(), ..e }.into(),
-        other => other,
+        other => repository_error(other),
     }
 }
 
@@ -175,6 +173,7 @@ fn check_repository(name: &str) -> Result<(), Invalid> {
     }
 }
 
+/// The error of a policy that is not found as that of a model.
 fn repository_error(error: Error) -> Error {
     match error {
         Error::NotFound { what: "policy", id, near } => Error::NotFound { what: "model", id, near },
